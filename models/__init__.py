@@ -1,0 +1,1 @@
+"""Systems of the literature, one a file: source, published numbers, and `problem(**parameters) -> Problem`."""
