@@ -1,0 +1,43 @@
+"""Goddard's rocket: greatest height of a vertical ascent, with full thrust, a singular arc and a coast.
+
+R. H. Goddard, "A method of reaching extreme altitudes", Smithsonian Miscellaneous Collections 71(2), 1919; data in the
+normalised form of A. E. Bryson, Dynamic Optimization, 1999, as in E. D. Dolan, J. J. More and T. S. Munson, COPS 3.0,
+Argonne National Laboratory ANL/MCS-TM-273, 2004, "Goddard rocket". Units: the radius of the earth h0, the initial mass
+m0 and the gravity on the ground g0; hence the time sqrt(h0/g0), 806 s, and the speed sqrt(g0 h0), 7.9 km/s.
+
+    dh/dt = v,   dv/dt = (thrust - D)/m - 1/h^2,   dm/dt = -thrust/c,   D = 310 v^2 exp(-500 (h - 1))
+    h(0) = 1,   v(0) = 0,   m(0) = 1,   m(T) = 0.6,   0 <= thrust <= 3.5,   c = 1/2,   J = -h(T),   T free
+
+Published: J = -1.01283. There is no covariance.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+import covocp as co
+
+DRAG = 310.0  # v_c m0 / (2 g0), v_c = 620: drag at unit speed on the ground
+DENSITY_DECAY = 500.0  # of the air, for one radius of the earth
+EXHAUST_SPEED = 0.5  # c, in sqrt(g0 h0)
+LARGEST_THRUST = 3.5  # in m0 g0
+FINAL_MASS = 0.6  # in m0
+
+
+def problem() -> co.Problem:
+    """Vertical ascent of a rocket to its greatest height, COPS 3.0; normalised units.
+
+    Returns:
+        The problem, with states "h" (from the centre of the earth), "v" (speed) and "m" (mass) and control "thrust".
+    """
+    ocp = co.Problem(duration=co.Free(guess=0.2, lower=0.05, upper=1.0), name="Goddard's rocket")
+    h = ocp.state("h", initial=1.0, lower=1.0, guess=lambda s: 1.0 + 0.01 * s)
+    v = ocp.state("v", initial=0.0, lower=0.0, guess=lambda s: 0.4 * s * (1.0 - s))
+    m = ocp.state("m", initial=1.0, final=FINAL_MASS, lower=FINAL_MASS, upper=1.0, guess=lambda s: 1.0 - 0.4 * s)
+    thrust = ocp.control("thrust", lower=0.0, upper=LARGEST_THRUST, guess=1.0)
+    drag = DRAG * v**2 * ca.exp(-DENSITY_DECAY * (h - 1.0))
+    ocp.dynamics(h, v)
+    ocp.dynamics(v, (thrust - drag) / m - 1.0 / h**2)
+    ocp.dynamics(m, -thrust / EXHAUST_SPEED)
+    ocp.minimize(terminal=-h)
+    return ocp
