@@ -1,0 +1,232 @@
+"""Checks of what a user gives, each with the message that says what is wrong and what to do."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import ProblemError, describe
+from covocp.matrices import Array, pack_symbolic
+
+
+def caller() -> str:
+    """File and line of the user's code that called into covocp."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).split(".")[0] == "covocp":
+        if str(frame.f_globals["__name__"]).startswith("covocp.models"):
+            break
+        frame = frame.f_back
+    return f"{frame.f_code.co_filename}:{frame.f_lineno}"
+
+
+def is_symbolic(value: Any) -> bool:
+    """Whether the value is a CasADi expression (also one that happens to be constant)."""
+    return isinstance(value, ca.MX)
+
+
+def as_number(name: str, what: str, value: Any) -> Array:
+    """The value as an array of floats, or an error that names the symbol."""
+    if isinstance(value, (ca.SX, ca.MX)):
+        raise ProblemError(
+            describe(
+                f"{what} of '{name}' is a symbol.",
+                expected="numbers",
+                received=str(value),
+                remedy="give numbers here; use Problem.parameter for numbers that change from solve to solve",
+            )
+        )
+    try:
+        return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(
+            describe(
+                f"{what} of '{name}' is not a number.",
+                expected="a number or an array of numbers",
+                received=repr(value),
+                remedy=f"check the {what} of '{name}'",
+            )
+        ) from error
+
+
+def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:
+    """The value as a vector of `size` numbers; a scalar is repeated.
+
+    Raises:
+        ProblemError: where the number of entries does not fit, or NaN or inf appears where it means nothing.
+    """
+    numbers = as_number(name, what, value)
+    if numbers.size == 1:
+        numbers = np.full(size, float(numbers.reshape(())))
+    if numbers.size != size or numbers.ndim > 2 or (numbers.ndim == 2 and 1 not in numbers.shape):
+        raise shape_error(name, what, f"a number or {size} numbers", f"shape {numbers.shape}")
+    numbers = numbers.reshape(size)
+    if (not nan and np.isnan(numbers).any()) or (not inf and np.isinf(numbers).any()):
+        raise ProblemError(
+            describe(
+                f"{what} of '{name}' contains NaN or inf.",
+                expected="finite numbers" + (" (NaN: free)" if nan else ""),
+                received=str(numbers),
+                remedy=f"correct the {what} of '{name}'",
+            )
+        )
+    return numbers
+
+
+def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> ca.MX:
+    """Like `column`, but an expression in the parameters of the problem is accepted too."""
+    if is_symbolic(value):
+        if value.shape == (size, 1):
+            return value
+        if value.shape == (1, 1):
+            return ca.repmat(value, size, 1)
+        raise shape_error(name, what, f"shape ({size}, 1)", f"shape {value.shape}")
+    return ca.MX(ca.DM(column(name, what, value, size, nan=nan)))
+
+
+def density_matrix(name: str, what: str, value: Any, size: int) -> ca.MX:
+    """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix.
+
+    Constant data are checked here: finite, symmetric, positive semidefinite.
+    """
+    expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix"
+    if is_symbolic(value):
+        if value.shape == (size, size):
+            return value
+        if value.shape == (1, 1):
+            return value * ca.MX.eye(size)
+        if value.shape == (size, 1):
+            return ca.diag(value)
+        raise shape_error(name, what, expected, f"shape {value.shape}")
+    numbers = as_number(name, what, value)
+    if numbers.size == 1:
+        numbers = float(numbers.reshape(())) * np.eye(size)
+    elif numbers.size == size and (numbers.ndim == 1 or 1 in numbers.shape):
+        numbers = np.diag(numbers.ravel())
+    if numbers.shape != (size, size):
+        raise shape_error(name, what, expected, f"shape {numbers.shape}")
+    check_density(name, what, numbers, definite=False)
+    return ca.MX(ca.DM(numbers))
+
+
+def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite: bool) -> ca.MX:
+    """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
+    matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
+    if not is_symbolic(value):
+        matrix = matrix.reshape(1, 1) if matrix.size == 1 else matrix
+        known = np.nan_to_num(matrix, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        if matrix.shape == (size, size):
+            if not np.isfinite(known).all() or not np.allclose(known, known.T):
+                check_density(name, what, known, definite=False)
+            if semidefinite and not np.isnan(matrix).any():
+                check_density(name, what, known, definite=False)
+        matrix = ca.MX(ca.DM(matrix))
+    if matrix.shape != (size, size):
+        raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
+    return pack_symbolic(matrix)
+
+
+def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:
+    """A numeric density or variance must be finite, symmetric and positive (semi)definite."""
+    problem = None
+    if not np.isfinite(numbers).all():
+        problem = "contains NaN or inf"
+    elif not np.allclose(numbers, numbers.T, rtol=1e-9, atol=1e-12 * float(np.abs(numbers).max(initial=0.0))):
+        problem = "is not symmetric"
+    else:
+        values = np.linalg.eigvalsh(numbers)
+        largest = float(np.abs(values).max(initial=0.0))
+        if values.size and values[0] < -1e-12 * largest:
+            problem = f"is not positive semidefinite (smallest eigenvalue {values[0]:.6g})"
+        elif definite and values.size and values[0] <= 1e-14 * largest:
+            problem = f"is singular (smallest eigenvalue {values[0]:.6g})"
+    if problem:
+        kind = "positive definite" if definite else "positive semidefinite"
+        raise ProblemError(
+            describe(
+                f"{what} of '{name}' {problem}.",
+                expected=f"a symmetric {kind} matrix (or a {'positive' if definite else 'nonnegative'} number)",
+                received=np.array2string(numbers, max_line_width=100, threshold=25),
+                remedy=f"check the {what} given for '{name}'"
+                + (": every measurement needs some noise" if definite else ""),
+            )
+        )
+
+
+def check_bounds(name: str, lower: Array, upper: Array) -> None:
+    """Bounds must not cross."""
+    for i in np.flatnonzero(lower > upper):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"The bounds of {entry} cross.",
+                expected="lower <= upper",
+                received=f"lower = {lower[i]:g}, upper = {upper[i]:g}",
+                remedy="exchange or correct them",
+            )
+        )
+
+
+def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array) -> None:
+    """Given (not NaN) values must lie within the bounds."""
+    margin = 1e-12 * np.maximum(1.0, np.abs(np.nan_to_num(values)))
+    for i in np.flatnonzero((values < lower - margin) | (values > upper + margin)):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"The {what} value of {entry} lies outside its bounds.",
+                expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
+                received=f"{values[i]:g}",
+                remedy=f"move the {what} value or widen the bounds",
+            )
+        )
+
+
+def check_size(name: str, size: Any) -> int:
+    """The shape of a symbol must be a positive whole number."""
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
+        raise shape_error(name, "shape", "a positive whole number", repr(size))
+    return int(size)
+
+
+def check_positive(name: str, value: Any, unit: str = "") -> float:
+    """A positive finite number."""
+    number = as_number(name, "value", value)
+    if number.size != 1 or not math.isfinite(float(number.reshape(()))) or float(number.reshape(())) <= 0:
+        raise ProblemError(
+            describe(
+                f"'{name}' must be positive.",
+                expected=f"a finite number > 0{' ' + unit if unit else ''}",
+                received=repr(value),
+                remedy=f"give a positive {name}" + (", or Free(guess) to leave it free" if name == "duration" else ""),
+            )
+        )
+    return float(number.reshape(()))
+
+
+def check_times(guess: float, lower: float, upper: float) -> None:
+    """The three numbers of a free terminal time must be in order."""
+    if not 0 < lower <= guess <= upper:
+        raise ProblemError(
+            describe(
+                "The free duration is not ordered.",
+                expected="0 < lower <= guess <= upper [s]",
+                received=f"lower = {lower:g}, guess = {guess:g}, upper = {upper:g}",
+                remedy="correct the three numbers of Free(guess, lower, upper)",
+            )
+        )
+
+
+def shape_error(name: str, what: str, expected: str, received: str) -> ProblemError:
+    """The error for a shape that does not fit."""
+    return ProblemError(
+        describe(
+            f"The {what} of '{name}' has the wrong size.",
+            expected=expected,
+            received=received,
+            remedy=f"give the {what} of '{name}' in that shape",
+        )
+    )

@@ -1,0 +1,176 @@
+"""Second-order condition: the smallest eigenvalue of the reduced Hessian of the Lagrangian over the controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import eigh_tridiagonal
+
+from covocp.extremal import Extremal
+from covocp.guess import quadrature_weights
+from covocp.integrators import full_interval, nominal_interval
+from covocp.matrices import Array
+from covocp.shooting import common_columns, matrices_along, repeat
+from covocp.trajectory import Trajectory
+
+# A constraint whose multiplier is above this share of the largest one is active.
+ACTIVE = 1e-8
+LANCZOS_STEPS = 30
+DISPLACEMENT = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curvature:
+    """Extreme eigenvalues of the reduced Hessian in the metric int du' du dt, and the direction of the smallest."""
+
+    value: float
+    largest: float
+    direction: Array
+
+    def displaced(self, extremal: Extremal, sign: float) -> Trajectory:
+        """The trajectory with its control moved along the direction, by the size of the control or of one unit."""
+        u = extremal.trajectory.u
+        size = max(float(np.sqrt(np.mean(u**2))), DISPLACEMENT)
+        moved = u + sign * size * self.direction / np.abs(self.direction).max()
+        t = extremal.trajectory
+        return Trajectory(
+            x=t.x, u=np.clip(moved, *extremal.statement.control_bounds), e=t.e, duration=t.duration
+        )
+
+
+def smallest_curvature(extremal: Extremal) -> Curvature | None:
+    """Extreme eigenvalues of the reduced Hessian with the terminal time held; None where they cannot be computed.
+
+    The controls are the only variables (states and matrices follow from them); the directions keep, to first order,
+    the terminal conditions, the active bounds and the active inequalities.
+    """
+    st, mesh = extremal.statement, extremal.mesh
+    if not st.nu:
+        return None
+    product, jacobian = _functions(extremal)
+    weights = np.tile(quadrature_weights(mesh)[:, None] * extremal.trajectory.duration, (1, st.nu)).ravel()
+    root = np.sqrt(weights)
+    multipliers = extremal.multipliers.controls.ravel()
+    free = np.abs(multipliers) <= ACTIVE * max(1.0, float(np.abs(multipliers).max(initial=0.0)))
+    u = extremal.trajectory.u.ravel()
+    rows = np.asarray(jacobian(u).full())[:, free] / root[free]
+    basis = _null_space(rows)
+    if basis.shape[1] == 0 or not np.isfinite(basis).all():
+        return None
+
+    def apply(v: Array) -> Array:
+        full = np.zeros(u.size)
+        full[free] = (basis @ v) / root[free]
+        return np.asarray(basis.T @ (np.asarray(product(u, full).full()).ravel()[free] / root[free]))
+
+    size = basis.shape[1]
+    if not np.isfinite(apply(np.ones(size))).all():
+        return None
+    values, vectors = lanczos(apply, size)
+    direction = np.zeros(u.size)
+    direction[free] = (basis @ vectors[:, 0]) / root[free]
+    return Curvature(
+        value=float(values[0]), largest=float(np.abs(values).max()), direction=direction.reshape(-1, st.nu)
+    )
+
+
+def lanczos(apply: Callable[[Array], Array], size: int) -> tuple[Array, Array]:
+    """Ritz values (rising) and vectors of a symmetric operator after a few Lanczos steps, fully reorthogonalised.
+
+    An isolated extreme eigenvalue, such as the negative one of a saddle, converges first; inside a cluster the Ritz
+    values lie in it, which is all that is asked here (an iteration to a tolerance would never end there).
+    """
+    steps = min(size, LANCZOS_STEPS)
+    basis = np.zeros((steps, size))
+    diagonal, beside = np.zeros(steps), np.zeros(steps)
+    vector = np.random.default_rng(0).standard_normal(size)
+    vector /= np.linalg.norm(vector)
+    for j in range(steps):
+        basis[j] = vector
+        image = apply(vector)
+        diagonal[j] = image @ vector
+        for _ in range(2):
+            image -= basis[: j + 1].T @ (basis[: j + 1] @ image)
+        beside[j] = np.linalg.norm(image)
+        if beside[j] <= 1e-10 * max(np.abs(diagonal[: j + 1]).max(), 1e-300):
+            steps = j + 1
+            break
+        vector = image / beside[j]
+    values, vectors = eigh_tridiagonal(diagonal[:steps], beside[: steps - 1])
+    return values, basis[:steps].T @ vectors
+
+
+def _null_space(rows: Array) -> Array:
+    """Orthonormal basis of the directions along which no row changes."""
+    if not rows.shape[0]:
+        return np.eye(rows.shape[1])
+    _, values, vectors = np.linalg.svd(rows)
+    rank = int(np.sum(values > 1e-10 * max(float(values.max(initial=0.0)), 1e-300)))
+    return np.asarray(vectors[rank:].T)
+
+
+def _functions(extremal: Extremal) -> tuple[ca.Function, ca.Function]:
+    """(u, v) -> Hessian of the Lagrangian times v, and u -> Jacobian of what is held, both by single shooting."""
+    st, mesh, multipliers = extremal.statement, extremal.mesh, extremal.multipliers
+    t, p = ca.DM(extremal.trajectory.duration), ca.DM(extremal.parameters)
+    u = ca.MX.sym("u", st.nu * mesh.control_nodes)
+    x, e, cost = _single_shooting(extremal, ca.reshape(u, st.nu, mesh.control_nodes))
+    last_x, last_e = x[:, -1], e[:, -1]
+    value = ca.sum2(cost) + st.terminal(last_x, last_e, t, p)
+    x0, xf, _, ef = st.boundary_values(extremal.parameters)
+    fixed_x, fixed_e = np.flatnonzero(~np.isnan(xf)), np.flatnonzero(~np.isnan(ef))
+    value += ca.dot(ca.DM(multipliers.final), last_x) + ca.dot(ca.DM(multipliers.final_matrices), last_e)
+    held = [ca.vertcat(ca.MX(0, 1), *(values[int(i)] for i in at)) for values, at in ((last_x, fixed_x), (last_e, fixed_e))]
+    count = mesh.intervals + 1
+    columns = u_at_nodes(extremal, ca.reshape(u, st.nu, mesh.control_nodes))
+    time = ca.DM(extremal.time).T
+    for conditions, weights, at in (
+        (st.path, multipliers.path, list(range(count))),
+        (st.end, multipliers.end[None, :], [count - 1]),
+    ):
+        if conditions.size:
+            k = len(at)
+            rows = conditions.function.map(k)(
+                x[:, at], columns[:, at], e[:, at], time[:, at], ca.repmat(t, 1, k), repeat(p, k)
+            )
+            value += ca.dot(ca.DM(weights.T), rows)
+            active = np.flatnonzero(np.abs(weights.ravel()) > ACTIVE * max(1e-300, float(np.abs(weights).max())))
+            held.append(ca.vec(rows)[active.tolist()])
+    states = multipliers.states.T
+    if np.abs(states).max(initial=0.0) > 0:
+        value += ca.dot(ca.DM(states), x)
+        active = np.flatnonzero(np.abs(states.ravel(order="F")) > ACTIVE * np.abs(states).max())
+        held.append(ca.vec(x)[active.tolist()])
+    direction = ca.MX.sym("v", u.shape[0])
+    gradient = ca.gradient(value, u)
+    product = ca.Function("product", [u, direction], [ca.densify(ca.jtimes(gradient, u, direction))])
+    kept = ca.vertcat(ca.MX(0, 1), *held)
+    return product, ca.Function("held", [u], [ca.densify(ca.jacobian(kept, u))])
+
+
+def u_at_nodes(extremal: Extremal, u: Any) -> Any:
+    """Controls at all nodes, a column each."""
+    return u if u.shape[1] == extremal.mesh.intervals + 1 else ca.horzcat(u, u[:, -1])
+
+
+def _single_shooting(extremal: Extremal, u: Any) -> tuple[Any, Any, Any]:
+    """States, half-vectors at the nodes and running costs as functions of the controls alone."""
+    st, mesh, trajectory = extremal.statement, extremal.mesh, extremal.trajectory
+    p = ca.DM(extremal.parameters)
+    common = common_columns(mesh, u, ca.DM(trajectory.duration), p)
+    x0, e0 = ca.DM(trajectory.x[0]), ca.DM(trajectory.e[0])
+    if st.coupled:
+        interval = full_interval(st, mesh.substeps, mesh.step)
+        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
+        nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
+        return nodes[: st.nx, :], nodes[st.nx :, :], cost
+    ends, fine, cost = nominal_interval(st, mesh.substeps).mapaccum("run", mesh.intervals)(x0, *common)
+    x = ca.horzcat(x0, ends)
+    if not st.matrices:
+        return x, ca.MX(0, mesh.intervals + 1), cost
+    e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, e0)
+    return x, e, cost + matrix_cost

@@ -1,0 +1,145 @@
+"""What a user has declared, name by name: the records that `Problem` collects and `freeze` turns into a statement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.checks import check_positive, check_times
+from covocp.matrices import Array
+
+Guess = float | Array | Callable[[Array], Any] | None
+Place = Literal["path", "initial", "final"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """A terminal time that the solver chooses.
+
+    Args:
+        guess: where to start [s].
+        lower: smallest terminal time allowed [s], positive; a thousandth of the guess where it is not given.
+        upper: largest terminal time allowed [s].
+
+    Raises:
+        ProblemError: where 0 < lower <= guess <= upper does not hold.
+    """
+
+    guess: float
+    lower: float
+    upper: float
+
+    def __init__(self, guess: float, lower: float | None = None, upper: float = np.inf) -> None:
+        """Check and keep the three numbers."""
+        check_positive("duration", guess, unit="s")
+        object.__setattr__(self, "guess", float(guess))
+        object.__setattr__(self, "lower", 1e-3 * float(guess) if lower is None else float(lower))
+        object.__setattr__(self, "upper", float(upper))
+        check_times(self.guess, self.lower, self.upper)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """A vector state of the nominal; data are columns of numbers or of expressions in the parameters."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    initial: ca.MX
+    final: ca.MX
+    lower: Array
+    upper: Array
+    guess: Guess
+    scale: Array | None
+    variance: ca.MX
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unknown:
+    """A constant unknown parameter of the actual system."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    mean: Array
+    variance: ca.MX
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parameter:
+    """A known number."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    value: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Control:
+    """A control vector."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    lower: Array
+    upper: Array
+    guess: Guess
+    scale: Array | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matrix:
+    """A symmetric matrix state; `symbol` is its half-vector, `matrix` the full matrix that the user sees."""
+
+    name: str
+    symbol: ca.MX
+    matrix: ca.MX
+    size: int
+    where: str
+    initial: ca.MX | None
+    final: ca.MX | None
+    lower: float | None
+    guess: Any
+    covariance: bool
+    estimation: bool
+    labels: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dynamics:
+    """Rate of a state or of the half-vector of a matrix; `noise` is a square density matrix, None without noise."""
+
+    rate: ca.MX
+    noise: ca.MX | None
+    where: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """A continuous measurement and the density matrix of its noise."""
+
+    name: str
+    expression: ca.MX
+    noise: ca.MX
+    where: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Constraint:
+    """lower <= expression <= upper along the path, at the start or at the end."""
+
+    name: str
+    expression: ca.MX
+    lower: Array
+    upper: Array
+    at: Place
+    where: str

@@ -1,0 +1,59 @@
+"""The errors that covocp raises, and the warnings that it gives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from covocp.solution import Solution
+
+
+class CovocpError(Exception):
+    """Base of every error that covocp raises on purpose."""
+
+
+class ProblemError(CovocpError, ValueError):
+    """The statement of a problem, or an option, is wrong: says which name, what was given and what is needed."""
+
+
+class SolveError(CovocpError, RuntimeError):
+    """A solver ended without a solution.
+
+    Attributes:
+        solution: the last iterate as a `Solution` (its `status` says that it did not converge), or None where not
+            even one iterate exists. It can be saved, plotted and used as a guess.
+        violations: largest violation of each violated constraint, by the name of the constraint, in its own unit.
+    """
+
+    def __init__(
+        self, message: str, *, solution: Solution | None = None, violations: Mapping[str, float] | None = None
+    ) -> None:
+        """Keep the last iterate and the violated constraints beside the message."""
+        super().__init__(message)
+        self.solution = solution
+        self.violations = dict(violations or {})
+
+
+class ExportError(CovocpError, RuntimeError):
+    """Something cannot be exported or written: says what, and why."""
+
+
+class CovocpWarning(UserWarning):
+    """The result is usable, but the user should know something about it (mesh too coarse, saddle point left)."""
+
+
+def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
+    """Text of an error in the one form that all of them have.
+
+    Args:
+        problem: what is wrong, with the user's name of the thing.
+        expected: what is needed.
+        received: what was given.
+        remedy: what to do next.
+
+    Returns:
+        The message, four lines.
+    """
+    return f"{problem}\n  expected: {expected}\n  received: {received}\n  remedy:   {remedy}"

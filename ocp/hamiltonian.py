@@ -1,0 +1,230 @@
+"""Costates and the Hamiltonian along a trajectory.
+
+H = L + p' f + tr(P V)  [specification, section 2]. The matrices are half-vectors here, so tr(P V) becomes the product of
+the half-vector of V with its costate (P_ii on the diagonal, 2 P_ij off it); `matrices.unpack_costate` gives P.
+
+Costates come in two independent ways: by the adjoint of the discrete steps, with the multipliers of the NLP as terminal
+values (`discrete_costates`), and by integrating the continuous adjoint equations p' = -H_x, P' = -H_E backward
+(`integrated_costates`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.extremal import Extremal
+from covocp.integrators import Step, full_interval, interval_symbols
+from covocp.matrices import Array
+from covocp.shooting import common_columns, terminal_slopes
+from covocp.statement import Statement
+
+
+@dataclass(frozen=True, kw_only=True)
+class Costates:
+    """Costates at the nodes: p (N + 1, nx), those of the half-vectors (N + 1, ne)."""
+
+    state: Array
+    matrices: Array
+
+
+def hamiltonian(statement: Statement) -> Callable[[str, Callable[..., list[Any]]], ca.Function]:
+    """Maker of functions of (x, u, e, t, T, p, costate of x, costate of e) built on the Hamiltonian.
+
+    Returns:
+        make(name, select): `select(H, x, u, e, t)` gives the outputs, expressions in the statement's own symbols.
+    """
+    symbolic: Any = statement.symbolic
+    sizes = {"x": statement.nx, "u": statement.nu, "e": statement.ne, "t": 1, "T": 1, "p": statement.np}
+    symbols = {name: symbolic.sym(name, size) for name, size in sizes.items()}
+    costate_x, costate_e = symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)
+    rates, matrix_rates, running = statement.rates(*symbols.values())
+    value = running + ca.dot(costate_x, rates) + ca.dot(costate_e, matrix_rates)
+
+    def make(name: str, select: Callable[..., list[Any]]) -> ca.Function:
+        outputs = select(value, symbols["x"], symbols["u"], symbols["e"], symbols["t"])
+        return ca.Function(name, [*symbols.values(), costate_x, costate_e], [ca.densify(v) for v in outputs])
+
+    return make
+
+
+def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list[Array]:
+    """A function made by `hamiltonian` at all nodes; each output with the node first."""
+    count = extremal.mesh.intervals + 1
+    values = function.map(count)(*extremal.columns(), costates.state.T, costates.matrices.T)
+    outputs = values if isinstance(values, (tuple, list)) else [values]
+    result = []
+    for value in outputs:
+        numbers = np.asarray(value.full()).reshape(value.shape[0], count, -1).transpose(1, 0, 2)
+        result.append(numbers[:, :, 0] if numbers.shape[2] == 1 else numbers)
+    return result
+
+
+def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
+    """p(T) = k_x + l and the costate of the half-vectors at T, with all multipliers that act there."""
+    multipliers = extremal.multipliers
+    slopes = terminal_slopes(
+        extremal.statement,
+        extremal.trajectory,
+        extremal.parameters,
+        multipliers.end,
+        multipliers.path[-1],
+        extremal.mesh,
+    )
+    return slopes[0] + multipliers.final, slopes[1] + multipliers.final_matrices
+
+
+def impulses(extremal: Extremal) -> Array:
+    """Jumps of the costates at the nodes, (N + 1, nx + ne): multipliers of path constraints and bounds that act there.
+
+    The row of the last node is zero: what acts there is part of the terminal costates.
+    """
+    statement, multipliers = extremal.statement, extremal.multipliers
+    jumps = np.hstack([multipliers.states, multipliers.matrices])
+    if statement.path.size:
+        symbolic: Any = statement.symbolic
+        sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
+        symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
+        weights = symbolic.sym("mu", statement.path.size)
+        value = ca.dot(weights, statement.path.function(*symbols))
+        slope = ca.gradient(value, ca.vertcat(symbols[0], symbols[2])) if statement.symbolic is ca.SX else ca.vertcat(
+            ca.gradient(value, symbols[0]), ca.gradient(value, symbols[2])
+        )
+        function = ca.Function("jumps", [*symbols, weights], [ca.densify(slope)])
+        count = extremal.mesh.intervals + 1
+        jumps = jumps + np.asarray(function.map(count)(*extremal.columns(), multipliers.path.T).full()).T
+    jumps[-1] = 0.0
+    return np.asarray(jumps)
+
+
+def _columns(extremal: Extremal) -> tuple[Any, ...]:
+    """Common arguments of the interval functions along an extremal."""
+    return common_columns(
+        extremal.mesh, ca.DM(extremal.trajectory.u.T), extremal.trajectory.duration, ca.DM(extremal.parameters)
+    )
+
+
+def _stack(extremal: Extremal) -> Any:
+    return ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
+
+
+def adjoint_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
+    """Adjoint of one discrete control interval.
+
+    Returns:
+        (costates at the end, impulse at the start, x and e stacked, *common) -> costates at the start, slopes of the
+        Lagrangian by the control at the start, by that at the end, by T.
+    """
+    interval = full_interval(statement, substeps, step)
+    symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
+    size = statement.nx + statement.ne
+    after, impulse, z = symbolic.sym("after", size), symbolic.sym("impulse", size), symbolic.sym("z", size)
+    common = interval_symbols(statement, symbolic)
+    end, _, cost = interval(z, *common)
+    value = ca.dot(after, end) + cost
+    slopes = [ca.gradient(value, symbol) for symbol in (z, common[0], common[1], common[4])]
+    return ca.Function("adjoint", [after, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
+
+
+def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """Costates of the discretised problem, by the adjoint sweep from the multipliers at the end.
+
+    Returns:
+        Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
+        multipliers of control bounds; its slope by T through the intervals.
+    """
+    st, mesh = extremal.statement, extremal.mesh
+    n = mesh.intervals
+    last = np.concatenate(terminal_costates(extremal))
+    jumps = impulses(extremal)
+    sweep = adjoint_interval(st, mesh.substeps, mesh.step).mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    columns = [column[:, backward] for column in (ca.DM(jumps[:-1].T), _stack(extremal)[:, :n], *_columns(extremal))]
+    values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in sweep(last, *columns))
+    costates = np.vstack([values.T, last])
+    slopes = np.zeros((mesh.control_nodes, st.nu))
+    slopes[:n] += by_start.T
+    slopes[int(mesh.control == "linear") :][:n] += by_end.T
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, float(by_duration.sum())
+
+
+def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:
+    """Each interval integrated again from its node with other substeps.
+
+    Returns:
+        x and e stacked at the starts of the substeps and at the end (N, substeps + 1, nx + ne), the jump between the
+        ends of the intervals and the next nodes (N, nx + ne), the running cost of each interval (N,).
+    """
+    n = extremal.mesh.intervals
+    start = _stack(extremal)
+    interval = full_interval(extremal.statement, substeps, extremal.mesh.step)
+    end, fine, cost = interval.map(n)(start[:, :n], *_columns(extremal))
+    size = start.shape[0]
+    inside = np.asarray(fine.full()).T.reshape(n, substeps, size)
+    first = np.asarray(start.full()).T
+    values = np.concatenate([first[:-1, None, :], inside], axis=1)
+    return values, np.asarray(end.full()).T - first[1:], np.asarray(cost.full()).ravel()
+
+
+def backward_interval(statement: Statement) -> ca.Function:
+    """Classical Runge-Kutta step of the adjoint equations p' = -H_x, P' = -H_E backward over a pair of substeps.
+
+    Returns:
+        (costates at the end, stacked x and e at start, middle and end, *common of the pair) -> costates at the start.
+    """
+    symbolic: Any = statement.symbolic
+    nx, size = statement.nx, statement.nx + statement.ne
+    after = symbolic.sym("after", size)
+    points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+    slope = hamiltonian(statement)("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
+
+    def rate(costate: Any, c: float) -> Any:
+        z = points[round(2 * c)]
+        u, t = ua + c * (ub - ua), duration * (s + c * ds)
+        return slope(z[:nx], u, z[nx:], t, duration, p, costate[:nx], costate[nx:])
+
+    h = duration * ds
+    k1 = rate(after, 1.0)
+    k2 = rate(after + h / 2 * k1, 0.5)
+    k3 = rate(after + h / 2 * k2, 0.5)
+    k4 = rate(after + h * k3, 0.0)
+    return ca.Function("backward", [after, *points, *common], [after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+
+
+def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
+    """Costates by integrating the adjoint equations backward, independently of the discrete steps.
+
+    Args:
+        extremal: trajectory and terminal multipliers.
+        pairs: Runge-Kutta steps of the adjoint per control interval.
+
+    Returns:
+        Costates at the nodes.
+    """
+    st, n, size = extremal.statement, extremal.mesh.intervals, extremal.statement.nx + extremal.statement.ne
+    values, _, _ = fine_trajectory(extremal, 2 * pairs)
+    ua, ub, s, ds, duration, p = _columns(extremal)
+    step = backward_interval(st)
+    after, impulse = ca.MX.sym("after", size), ca.MX.sym("impulse", size)
+    z = ca.MX.sym("z", size, 2 * pairs + 1)
+    common = interval_symbols(st, ca.MX)
+    value = after
+    for j in range(pairs - 1, -1, -1):
+        c, d = j / pairs, (j + 1) / pairs
+        start, end = common[0] + c * (common[1] - common[0]), common[0] + d * (common[1] - common[0])
+        ends = (start, end, common[2] + c * common[3], common[3] / pairs, common[4], common[5])
+        value = step(value, z[:, 2 * j], z[:, 2 * j + 1], z[:, 2 * j + 2], *ends)
+    sweep = ca.Function("sweep", [after, impulse, z, *common], [value + impulse]).mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    last = np.concatenate(terminal_costates(extremal))
+    stacked = ca.DM(values[::-1].transpose(2, 0, 1).reshape(size, -1))
+    columns = [column[:, backward] for column in (ua, ub, s, ds, duration, p)]
+    result = sweep(last, ca.DM(impulses(extremal)[:-1][::-1].T), stacked, *columns)
+    costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])

@@ -1,0 +1,298 @@
+"""One control interval: the nominal by Runge-Kutta, the covariances given the nominal by gauss, strang or rk4 steps.
+
+All functions made here take one control interval [s, s + ds] of the normalised time s = t/T, the controls at its two
+ends, and cut it into `substeps` equal steps. Their common arguments, after state (and half-vectors), are
+
+    (control at the start, control at the end, s, ds, T, parameters)
+
+Covariance steps for V = F E + E F' + Q - E W E, as 2n x 2n *step matrices* D with E+ = (D21 + D22 E)(D11 + D12 E)^-1:
+
+- gauss: two-stage Gauss method for X' = -F'X + W Y, Y' = Q X + F Y, E = Y X^-1. Symplectic, order 4, positive
+  semidefinite at any step size (Dieci and Eirola, Numer. Math. 67, 1994).
+- strang: half a measurement update, half the noise, transition with the tangent of the Runge-Kutta step, half the
+  noise, half a measurement update. Order 2, positive semidefinite at any step size.
+
+rk4 is the classical Runge-Kutta step of nominal and half-vectors together, for any rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.matrices import pack_symbolic, unpack_symbolic
+from covocp.statement import Statement
+
+Step = Literal["gauss", "strang", "rk4"]
+
+LINEAR_SOLVER = "lapacklu"
+
+GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
+GAUSS_MATRIX = ((0.25, 0.25 - np.sqrt(3.0) / 6.0), (0.25 + np.sqrt(3.0) / 6.0, 0.25))
+COMMON = ("start", "end", "s", "ds", "duration", "parameters")
+
+
+def interval_symbols(statement: Statement, symbolic: Any) -> tuple[Any, ...]:
+    """Symbols of the common arguments."""
+    nu = statement.nu
+    return (
+        symbolic.sym("ua", nu),
+        symbolic.sym("ub", nu),
+        symbolic.sym("s"),
+        symbolic.sym("ds"),
+        symbolic.sym("T"),
+        symbolic.sym("p", statement.np),
+    )
+
+
+def nominal_interval(statement: Statement, substeps: int) -> ca.Function:
+    """The nominal over one control interval by classical Runge-Kutta steps.
+
+    Returns:
+        (x, *common) -> state at the end, states at the ends of the substeps (nx, substeps), integral of the running
+        cost (0 where that depends on the matrices).
+    """
+    symbolic: Any = statement.symbolic
+    nominal = statement.nominal
+    if nominal is None:
+        raise ValueError("a coupled problem has no separate nominal")
+    x = symbolic.sym("x", statement.nx)
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+
+    def rate(value: Any, c: Any) -> Any:
+        outputs = nominal(value[:-1], ua + c * (ub - ua), duration * (s + c * ds), duration, p)
+        return ca.vertcat(*outputs)
+
+    states, cost = _runge_kutta(rate, ca.vertcat(x, 0), duration * ds, substeps)
+    return ca.Function("nominal_interval", [x, *common], [states[:, -1], states, cost])
+
+
+def joint_interval(statement: Statement, substeps: int) -> ca.Function:
+    """Nominal and half-vectors together by classical Runge-Kutta steps (covariance step rk4).
+
+    Returns:
+        (x and e stacked, *common) -> the stack at the end, at the ends of the substeps (nx + ne, substeps), integral
+        of the running cost.
+    """
+    symbolic: Any = statement.symbolic
+    nx = statement.nx
+    z = symbolic.sym("z", nx + statement.ne)
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+
+    def rate(value: Any, c: Any) -> Any:
+        control, time = ua + c * (ub - ua), duration * (s + c * ds)
+        return ca.vertcat(*statement.rates(value[:nx], control, value[nx:-1], time, duration, p))
+
+    stacked, cost = _runge_kutta(rate, ca.vertcat(z, 0), duration * ds, substeps)
+    return ca.Function("joint_interval", [z, *common], [stacked[:, -1], stacked, cost])
+
+
+def _runge_kutta(rate: Callable[[Any, Any], Any], start: Any, h: Any, substeps: int) -> tuple[Any, Any]:
+    """Classical Runge-Kutta over an interval of length h; rate(value, c), c in [0, 1]; the last entry is the cost."""
+    value, values = start, []
+    step = h / substeps
+    for j in range(substeps):
+        c, d = j / substeps, 1.0 / substeps
+        k1 = rate(value, c)
+        k2 = rate(value + step / 2 * k1, c + d / 2)
+        k3 = rate(value + step / 2 * k2, c + d / 2)
+        k4 = rate(value + step * k3, c + d)
+        value = value + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        values.append(value)
+    stacked = ca.horzcat(*values)
+    return stacked[:-1, :], stacked[-1, -1]
+
+
+def step_matrix(statement: Statement, index: int, step: Step) -> ca.Function:
+    """The step matrix D of one matrix state over one substep, given the nominal at both ends of it.
+
+    Returns:
+        (xa, xb, *common of the substep) -> D, shape (2n, 2n); it does not depend on E.
+    """
+    size = statement.matrices[index].size
+    inner = _gauss_system(statement, index) if step == "gauss" else _strang_parts(statement, index)
+    xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
+    common = interval_symbols(statement, ca.MX)
+    compose = _gauss_matrix if step == "gauss" else _strang_matrix
+    value = compose(inner(xa, xb, *common), size)
+    return ca.Function("step_matrix", [xa, xb, *common], [value])
+
+
+def _solve(matrix: ca.MX, right: Any) -> ca.MX:
+    """matrix^-1 right by LAPACK; faster than elimination written out in SX even for 2 x 2 covariances."""
+    return ca.solve(matrix, right, LINEAR_SOLVER)
+
+
+def _gauss_system(statement: Statement, index: int) -> ca.Function:
+    """The linear system A [K1; K2] = B of the two stages, and the step h."""
+    form = _form(statement, index)
+    symbolic: Any = statement.symbolic
+    xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+    h = duration * ds
+    fa = _slope(statement, xa, ua, s, duration, p)
+    fb = _slope(statement, xb, ub, s + ds, duration, p)
+    stages = []
+    for c in GAUSS_NODES:
+        x = hermite(xa, xb, h * fa, h * fb, c)
+        drift, noise, information = form(x, ua + c * (ub - ua), duration * (s + c * ds), duration, p)
+        stages.append(ca.blockcat([[-drift.T, information], [noise, drift]]))
+    (a11, a12), (a21, a22) = GAUSS_MATRIX
+    first, second = stages
+    unit = ca.DM.eye(first.shape[0])
+    left = ca.blockcat([[unit - h * a11 * first, -h * a12 * first], [-h * a21 * second, unit - h * a22 * second]])
+    return ca.Function("gauss_system", [xa, xb, *common], [left, ca.vertcat(first, second), h])
+
+
+def _gauss_matrix(system: Any, size: int) -> Any:
+    """D = I + h/2 (K1 + K2)."""
+    left, right, h = system
+    stages = _solve(left, right)
+    return ca.DM.eye(2 * size) + h / 2 * (stages[: 2 * size, :] + stages[2 * size :, :])
+
+
+def _strang_parts(statement: Statement, index: int) -> ca.Function:
+    """Transition matrix of the Runge-Kutta step, noise and information at both ends (times h/2)."""
+    form = _form(statement, index)
+    symbolic: Any = statement.symbolic
+    size = statement.matrices[index].size
+    xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+    h = duration * ds
+
+    def rates(x: Any, transition: Any, c: float) -> tuple[Any, Any]:
+        u, t = ua + c * (ub - ua), duration * (s + c * ds)
+        return _slope(statement, x, u, s + c * ds, duration, p), form(x, u, t, duration, p)[0] @ transition
+
+    unit = ca.DM.eye(size)
+    k1, m1 = rates(xa, unit, 0.0)
+    k2, m2 = rates(xa + h / 2 * k1, unit + h / 2 * m1, 0.5)
+    k3, m3 = rates(xa + h / 2 * k2, unit + h / 2 * m2, 0.5)
+    _, m4 = rates(xa + h * k3, unit + h * m3, 1.0)
+    transition = unit + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
+    _, noise_a, information_a = form(xa, ua, duration * s, duration, p)
+    _, noise_b, information_b = form(xb, ub, duration * (s + ds), duration, p)
+    outputs = [transition, *(h / 2 * entry for entry in (noise_a, information_a, noise_b, information_b))]
+    return ca.Function("strang_parts", [xa, xb, *common], [ca.densify(entry) for entry in outputs])
+
+
+def _strang_matrix(parts: Any, size: int) -> Any:
+    """Product of the elementary step matrices; update with W: [I W; 0 I], noise Q: [I 0; Q I]."""
+    transition, noise_a, information_a, noise_b, information_b = parts
+    unit, zero = ca.DM.eye(size), ca.DM(size, size)
+    update_a, update_b = (ca.blockcat([[unit, w], [zero, unit]]) for w in (information_a, information_b))
+    diffuse_a, diffuse_b = (ca.blockcat([[unit, zero], [q, unit]]) for q in (noise_a, noise_b))
+    move = ca.blockcat([[_solve(transition.T, unit), zero], [zero, transition]])
+    return update_b @ diffuse_b @ move @ diffuse_a @ update_a
+
+
+def _form(statement: Statement, index: int) -> ca.Function:
+    form = statement.riccati[index]
+    if form is None:
+        raise ValueError("the rate of this matrix has no Riccati form")
+    return form
+
+
+def _slope(statement: Statement, x: Any, u: Any, s: Any, duration: Any, p: Any) -> Any:
+    """Rate of the nominal."""
+    if statement.nominal is None:
+        raise ValueError("a coupled problem has no separate nominal")
+    return statement.nominal(x, u, duration * s, duration, p)[0]
+
+
+def hermite(start: Any, end: Any, slope_start: Any, slope_end: Any, c: Any) -> Any:
+    """Cubic Hermite polynomial at c in [0, 1]; slopes per unit of c."""
+    return (
+        (1 + 2 * c) * (1 - c) ** 2 * start
+        + c * (1 - c) ** 2 * slope_start
+        + c**2 * (3 - 2 * c) * end
+        + c**2 * (c - 1) * slope_end
+    )
+
+
+def apply_step(matrix: Any, half: Any, size: int) -> Any:
+    """Half-vector of E+ = (D21 + D22 E)(D11 + D12 E)^-1, symmetrised."""
+    covariance = unpack_symbolic(half, size)
+    below = matrix[size:, :size] + matrix[size:, size:] @ covariance
+    above = matrix[:size, :size] + matrix[:size, size:] @ covariance
+    return pack_symbolic(_solve(above.T, below.T))
+
+
+def propagate_interval(statement: Statement, substeps: int) -> ca.Function:
+    """All half-vectors over one control interval, given the step matrices of its substeps.
+
+    Returns:
+        (e, D of matrix 1 (2n, 2n substeps), D of matrix 2, ...) -> half-vectors at the end of the interval (ne, 1),
+        at the ends of the substeps (ne, substeps).
+    """
+    e = ca.MX.sym("e", statement.ne)
+    steps = [ca.MX.sym(f"d_{b.name}", 2 * b.size, 2 * b.size * substeps) for b in statement.matrices]
+    columns = []
+    halves = [e[block.span] for block in statement.matrices]
+    for j in range(substeps):
+        for i, block in enumerate(statement.matrices):
+            width = 2 * block.size
+            halves[i] = apply_step(steps[i][:, j * width : (j + 1) * width], halves[i], block.size)
+        columns.append(ca.vertcat(*halves))
+    return ca.Function("propagate_interval", [e, *steps], [columns[-1], ca.horzcat(*columns)])
+
+
+def simpson_interval(statement: Statement, substeps: int) -> ca.Function:
+    """Integral of a running cost that depends on the matrices, by Simpson's rule over pairs of substeps.
+
+    Returns:
+        (x, e, states at the ends of the substeps, half-vectors there, *common) -> integral.
+    """
+    if substeps % 2:
+        raise ValueError("Simpson's rule needs an even number of substeps")
+    symbolic: Any = statement.symbolic
+    nx, ne = statement.nx, statement.ne
+    x, e = symbolic.sym("x", nx), symbolic.sym("e", ne)
+    states, halves = symbolic.sym("xf", nx, substeps), symbolic.sym("ef", ne, substeps)
+    common = interval_symbols(statement, symbolic)
+    ua, ub, s, ds, duration, p = common
+    total = 0
+    for j in range(substeps + 1):
+        c = j / substeps
+        weight = (1 if j in (0, substeps) else 4 if j % 2 else 2) / (3 * substeps)
+        xj, ej = (x, e) if j == 0 else (states[:, j - 1], halves[:, j - 1])
+        cost = statement.rates(xj, ua + c * (ub - ua), ej, duration * (s + c * ds), duration, p)[2]
+        total = total + weight * cost
+    return ca.Function("simpson_interval", [x, e, states, halves, *common], [duration * ds * total])
+
+
+def full_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
+    """Nominal and half-vectors over one control interval with the given covariance step.
+
+    Returns:
+        (x and e stacked, *common) -> the stack at the end, at the ends of the substeps (nx + ne, substeps), integral
+        of the running cost.
+    """
+    if step == "rk4" or not statement.matrices:
+        return joint_interval(statement, substeps)
+    z = ca.MX.sym("z", statement.nx + statement.ne)
+    x, e = z[: statement.nx], z[statement.nx :]
+    common = interval_symbols(statement, ca.MX)
+    ua, ub, s, ds, duration, p = common
+    _, states, cost = nominal_interval(statement, substeps)(x, *common)
+    starts = ca.horzcat(x, states[:, : substeps - 1])
+    matrices = [step_matrix(statement, i, step) for i in range(len(statement.matrices))]
+    columns: list[list[Any]] = [[] for _ in matrices]
+    for j in range(substeps):
+        c, d = j / substeps, (j + 1) / substeps
+        ends = (ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, ds / substeps, duration, p)
+        for i, matrix in enumerate(matrices):
+            columns[i].append(matrix(starts[:, j], states[:, j], *ends))
+    stacked = [ca.horzcat(*entry) for entry in columns]
+    _, halves = propagate_interval(statement, substeps)(e, *stacked)
+    if statement.running_uses_matrices:
+        cost = simpson_interval(statement, substeps)(x, e, states, halves, *common)
+    fine = ca.vertcat(states, halves)
+    return ca.Function("full_interval", [z, *common], [fine[:, -1], fine, cost])

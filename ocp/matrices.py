@@ -1,0 +1,117 @@
+"""Symmetric matrices as half-vectors, and what is asked of them.
+
+A symmetric n x n matrix is stored as its n(n+1)/2 entries (i, j), i >= j, column by column: (0,0), (1,0), ..., (n-1,0),
+(1,1), ... The costate of an off-diagonal entry of the half-vector is twice the entry of the matrix costate P, because
+the entry stands for two entries of the matrix (Schmidt 1971, section 2.4; specification, section 2).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# A covariance counts as positive semidefinite while its smallest eigenvalue is above minus this times its largest:
+# roundoff of a propagation over some thousand steps.
+SEMIDEFINITE_TOLERANCE = 1e-9
+
+
+def half_length(size: int) -> int:
+    """Number of distinct entries of a symmetric matrix of the given size."""
+    return size * (size + 1) // 2
+
+
+@lru_cache(maxsize=64)
+def half_indices(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns (i >= j) of the entries of the half-vector, in its order."""
+    columns, rows = np.triu_indices(size)
+    return rows, columns
+
+
+@lru_cache(maxsize=64)
+def unpack_indices(size: int) -> NDArray[np.intp]:
+    """Position in the half-vector of each entry of the full matrix, shape (size, size)."""
+    rows, columns = half_indices(size)
+    positions = np.zeros((size, size), dtype=np.intp)
+    positions[rows, columns] = np.arange(rows.size)
+    positions[columns, rows] = np.arange(rows.size)
+    return positions
+
+
+def pack(matrix: ArrayLike) -> Array:
+    """Half-vector of symmetric matrices.
+
+    Args:
+        matrix: shape (..., n, n); the symmetric part is taken.
+
+    Returns:
+        Shape (..., n(n+1)/2).
+    """
+    full = np.asarray(matrix, dtype=float)
+    rows, columns = half_indices(full.shape[-1])
+    return np.asarray(0.5 * (full[..., rows, columns] + full[..., columns, rows]))
+
+
+def unpack(half: ArrayLike, size: int) -> Array:
+    """Full symmetric matrices from half-vectors of shape (..., n(n+1)/2); shape (..., n, n)."""
+    return np.asarray(np.asarray(half, dtype=float)[..., unpack_indices(size)])
+
+
+def unpack_costate(half: ArrayLike, size: int) -> Array:
+    """Matrix costate P from the costates of the half-vector: off-diagonal entries are halved."""
+    half = np.asarray(half, dtype=float)
+    rows, columns = half_indices(size)
+    return unpack(np.where(rows == columns, half, 0.5 * half), size)
+
+
+def pack_costate(matrix: ArrayLike) -> Array:
+    """Costates of the half-vector from the matrix costate P: off-diagonal entries are doubled."""
+    half = pack(matrix)
+    rows, columns = half_indices(np.shape(matrix)[-1])
+    return np.asarray(np.where(rows == columns, half, 2.0 * half))
+
+
+def pack_symbolic(matrix: Any) -> Any:
+    """Half-vector of a symbolic symmetric matrix; the symmetric part is taken."""
+    size = matrix.shape[0]
+    rows, columns = half_indices(size)
+    lower, upper = columns * size + rows, rows * size + columns
+    flat = ca.vec(ca.densify(matrix))
+    return 0.5 * (flat[lower.tolist()] + flat[upper.tolist()])
+
+
+def unpack_symbolic(half: Any, size: int) -> Any:
+    """Full symmetric matrix of a symbolic half-vector."""
+    order = unpack_indices(size).T.ravel().tolist()
+    return ca.reshape(half[order], size, size)
+
+
+def smallest_eigenvalue(matrices: ArrayLike) -> float:
+    """Smallest eigenvalue over all the symmetric matrices of shape (..., n, n); inf where there is none."""
+    full = np.asarray(matrices, dtype=float)
+    if full.size == 0:
+        return np.inf
+    if not np.all(np.isfinite(full)):
+        return -np.inf
+    return float(np.linalg.eigvalsh(full).min())
+
+
+def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERANCE) -> bool:
+    """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff."""
+    full = np.asarray(matrices, dtype=float)
+    if full.size == 0:
+        return True
+    if not np.all(np.isfinite(full)):
+        return False
+    values = np.linalg.eigvalsh(full)
+    return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
+
+
+def block_diagonal(blocks: list[Any]) -> Any:
+    """Block-diagonal matrix of symbolic or numeric blocks (an empty list gives a 0 x 0 matrix)."""
+    return ca.diagcat(*blocks) if blocks else ca.DM(0, 0)

@@ -1,0 +1,202 @@
+"""The mesh of a transcription: nodes, controls, substeps, shooting segments, and where the covariances are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from covocp.checks import as_number
+from covocp.errors import ProblemError, describe
+from covocp.integrators import Step
+from covocp.matrices import Array
+from covocp.statement import Statement
+
+# Covariances that are not needed along the path are eliminated above this number of half-vector entries (measured by
+# benchmarks/formulations.py: the time of the limited-memory iterations against the exact Hessian's).
+LARGEST_STATES = 1
+ELIMINATED_SEGMENTS = 10
+LARGEST_SUBSTEPS = 64
+# h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
+STIFFNESS_PER_STEP = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every shooting method, as the user gives them (`solve`); checked on construction."""
+
+    intervals: int = 100
+    control: Literal["linear", "constant"] = "linear"
+    substeps: int | Literal["auto"] = "auto"
+    grid: Any = None
+    segments: int | Literal["auto"] = "auto"
+    covariances: Literal["auto", "eliminated", "states"] = "auto"
+    covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuse options that mean nothing."""
+        _whole("intervals", self.intervals)
+        _choice("control", self.control, ("linear", "constant"))
+        _choice("covariances", self.covariances, ("auto", "eliminated", "states"))
+        _choice("covariance_step", self.covariance_step, ("auto", "gauss", "strang", "rk4"))
+        for name, value in (("substeps", self.substeps), ("segments", self.segments)):
+            if value != "auto":
+                _whole(name, value)
+
+    def nodes(self) -> Array:
+        """Nodes of the normalised time, from 0 to 1.
+
+        Raises:
+            ProblemError: where the given grid does not rise from 0 to 1.
+        """
+        if self.grid is None:
+            return np.linspace(0.0, 1.0, self.intervals + 1)
+        nodes = as_number("grid", "option", self.grid).ravel()
+        if nodes.size < 2 or nodes[0] != 0 or nodes[-1] != 1 or not (np.diff(nodes) > 0).all():
+            raise ProblemError(
+                describe(
+                    "The grid does not rise from 0 to 1.",
+                    expected="increasing nodes of t/T, the first 0, the last 1",
+                    received=np.array2string(nodes, threshold=8),
+                    remedy="divide the times by the duration",
+                )
+            )
+        return nodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """A resolved mesh.
+
+    Args:
+        nodes: normalised time, shape (N + 1,), from 0 to 1.
+        control: piecewise linear or piecewise constant.
+        substeps: integration steps an interval.
+        segments: lengths of the shooting segments, in intervals; they add up to N.
+        eliminated: whether the matrices are propagated along the nominal instead of being variables.
+        step: covariance step.
+    """
+
+    nodes: Array
+    control: str
+    substeps: int
+    segments: tuple[int, ...]
+    eliminated: bool
+    step: Step
+
+    @property
+    def intervals(self) -> int:
+        """Number of control intervals N."""
+        return self.nodes.size - 1
+
+    @property
+    def control_nodes(self) -> int:
+        """Number of control values: N + 1 (linear) or N (constant)."""
+        return self.intervals + (self.control == "linear")
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Node at which each segment starts, and the last node."""
+        return tuple(np.cumsum([0, *self.segments]).tolist())
+
+
+def choose_mesh(statement: Statement, options: Options, stiffness: float) -> Mesh:
+    """Resolve every "auto".
+
+    Args:
+        statement: the problem.
+        options: what the user asked for.
+        stiffness: largest h times rate of change of what is stepped by Runge-Kutta (`guess.stiffness`), for one step
+            an interval.
+
+    Raises:
+        ProblemError: options that contradict the problem.
+    """
+    nodes = options.nodes()
+    intervals = nodes.size - 1
+    step = choose_step(statement, options)
+    eliminated = _choose_eliminated(statement, options)
+    if options.segments == "auto":
+        count = min(ELIMINATED_SEGMENTS, intervals) if eliminated and statement.matrices else intervals
+    else:
+        count = min(options.segments, intervals)
+    if options.substeps == "auto":
+        substeps = int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
+    else:
+        substeps = options.substeps
+    if statement.running_uses_matrices and step != "rk4" and substeps % 2:
+        substeps += 1  # Simpson's rule for the running cost takes them in pairs
+    short, longer = divmod(intervals, count)
+    lengths = (short + 1,) * longer + (short,) * (count - longer)
+    return Mesh(
+        nodes=nodes, control=options.control, substeps=substeps, segments=lengths, eliminated=eliminated, step=step
+    )
+
+
+def choose_step(statement: Statement, options: Options) -> Step:
+    """The covariance step: gauss where every rate has the Riccati form, else rk4."""
+    riccati = all(form is not None for form in statement.riccati) and not statement.coupled
+    if options.covariance_step == "auto":
+        return "gauss" if riccati else "rk4"
+    if options.covariance_step != "rk4" and not riccati:
+        names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
+        reason = "feeds back into the nominal" if statement.coupled else "is not of the form F E + E F' + Q - E W E"
+        raise ProblemError(
+            describe(
+                f"covariance_step='{options.covariance_step}' does not apply: the rate of "
+                f"{', '.join(names) or 'a matrix'} {reason}.",
+                expected="rates of Riccati or Lyapunov form that depend on the nominal only",
+                received=", ".join(names) or "a coupled problem",
+                remedy="use covariance_step='rk4' (or leave it 'auto')",
+            )
+        )
+    return options.covariance_step
+
+
+def _choose_eliminated(statement: Statement, options: Options) -> bool:
+    """Whether the matrices are eliminated; the rules of the design's section Speed."""
+    if not statement.matrices:
+        return True
+    initial = statement.boundary_values(statement.values)[2]
+    obstacle = None
+    if statement.coupled:
+        obstacle = "the rate of a state depends on a matrix"
+    elif np.isnan(initial).any():
+        obstacle = "an initial value of a matrix is free"
+    if options.covariances == "eliminated" and obstacle:
+        raise ProblemError(
+            describe(
+                "The matrices cannot be eliminated.",
+                expected="matrices that follow from the nominal",
+                received=obstacle,
+                remedy="use covariances='states' (or leave it 'auto')",
+            )
+        )
+    if options.covariances != "auto":
+        return options.covariances == "eliminated"
+    return obstacle is None and not statement.path.uses_matrices and statement.ne > LARGEST_STATES
+
+
+def _whole(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ProblemError(
+            describe(
+                f"The option '{name}' must be a positive whole number.",
+                expected="1, 2, 3, ...",
+                received=repr(value),
+                remedy=f"correct {name}=",
+            )
+        )
+
+
+def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ProblemError(
+            describe(
+                f"The option '{name}' has an unknown value.",
+                expected="one of " + ", ".join(repr(choice) for choice in choices),
+                received=repr(value),
+                remedy=f"correct {name}=",
+            )
+        )

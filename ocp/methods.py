@@ -1,0 +1,259 @@
+"""Solving: methods are looked up by name, and an outcome becomes a solution or an error."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import warnings
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, cast
+
+import numpy as np
+
+from covocp.checks import column
+from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
+from covocp.extremal import Guess, Outcome, Prepared
+from covocp.matrices import Array
+from covocp.mesh import Options
+from covocp.problem import Problem
+from covocp.progress import Progress
+from covocp.solution import Solution
+from covocp.starting import make_guess, random_guesses
+from covocp.statement import Statement
+
+METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
+
+# Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
+COARSE_MESH = 1e-4
+# A run that ends after so few iterations began at a stationary point, which need not be a minimum.
+SUSPICIOUS_ITERATIONS = 3
+NEGATIVE_CURVATURE = -1e-6
+ESCAPES = (1.0, -1.0)
+STARTS = 8
+
+
+def methods() -> tuple[str, ...]:
+    """Names of the methods installed."""
+    return tuple(METHODS)
+
+
+class Solver:
+    """A problem made ready for one method: built once, solved again with new parameters and guesses.
+
+    Args:
+        problem: what to solve.
+        method: a name in `methods()`.
+        intervals: number of control intervals.
+        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`) and of the
+            method.
+
+    Raises:
+        ProblemError: unknown method or option, or a statement that is wrong.
+    """
+
+    def __init__(self, problem: Problem, method: str = "ipopt", *, intervals: int = 100, **options: Any) -> None:
+        """Build the statement and make the method ready."""
+        if method not in METHODS:
+            raise ProblemError(
+                describe(
+                    "There is no such method.",
+                    expected="one of " + ", ".join(repr(name) for name in METHODS),
+                    received=repr(method),
+                    remedy="correct method=",
+                )
+            )
+        prepare = importlib.import_module(METHODS[method]).prepare
+        known = {field.name for field in fields(Options)}
+        own = {name: p for name, p in inspect.signature(prepare).parameters.items() if p.kind is p.KEYWORD_ONLY}
+        for name in options:
+            if name not in known and name not in own:
+                raise ProblemError(
+                    describe(
+                        f"The method '{method}' has no option '{name}'.",
+                        expected="one of " + ", ".join(sorted([*known, *own])),
+                        received=f"{name}={options[name]!r}",
+                        remedy="correct or remove it",
+                    )
+                )
+        self.method = method
+        self.statement: Statement = problem.statement()
+        mesh = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        self._prepared = cast(Prepared, prepare(self.statement, mesh, **{k: v for k, v in options.items() if k in own}))
+
+    def solve(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        guess: Any = None,
+        progress: bool = True,
+        allow_failure: bool = False,
+        starts: int = STARTS,
+        seed: int = 0,
+    ) -> Solution:
+        """Solve for some values of the parameters.
+
+        Args:
+            parameters: new values of known parameters and of means of unknowns, by name; the others keep theirs.
+            guess: None: the problem's own; a `Solution` (also on another mesh, or of another problem with the same
+                names): warm start; "multistart": the best of several random starts; a dict of name to guess.
+            progress: whether to show the iterations on a terminal.
+            allow_failure: return the last iterate of a run that did not converge instead of raising.
+            starts: number of random starts of "multistart".
+            seed: of the random starts.
+
+        Returns:
+            The solution.
+
+        Raises:
+            ProblemError: a name or a guess is wrong.
+            SolveError: the method did not converge (carries the last iterate).
+        """
+        values = self._values(parameters or {})
+        with Progress(self.statement.name or "solving", progress) as reporter:
+            if isinstance(guess, str):
+                outcome = self._multistart(guess, values, starts, seed, reporter)
+            else:
+                start = make_guess(self.statement, self._prepared.mesh, values, guess)
+                outcome = self._prepared.solve(values, start, reporter)
+                outcome = self._leave_saddle(outcome, values, reporter, warm=start.warm)
+        return self._finish(outcome, allow_failure)
+
+    def _values(self, parameters: Mapping[str, Any]) -> Array:
+        """The stacked parameters with some of them replaced."""
+        values = self.statement.values.copy()
+        blocks = {b.name: b for b in (*self.statement.of_kind("parameter"), *self.statement.of_kind("unknown"))}
+        for name, value in parameters.items():
+            if name not in blocks:
+                raise ProblemError(
+                    describe(
+                        f"There is no parameter '{name}'.",
+                        expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
+                        received=repr(name),
+                        remedy="declare it by Problem.parameter",
+                    )
+                )
+            values[blocks[name].span] = column(name, "value", value, blocks[name].size)
+        return values
+
+    def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
+        """The best of the problem's own start and several random ones."""
+        if guess != "multistart":
+            raise ProblemError(
+                describe(
+                    "The guess is an unknown word.",
+                    expected="None, 'multistart', a Solution, or a dict of name to guess",
+                    received=repr(guess),
+                    remedy="correct guess=",
+                )
+            )
+        best: Outcome | None = None
+        costs = []
+        for start in random_guesses(self.statement, self._prepared.mesh, values, starts, seed):
+            outcome = self._prepared.solve(values, start, reporter)
+            cost = sum(outcome.cost_terms.values())
+            costs.append(cost if outcome.converged else np.nan)
+            if best is None or (outcome.converged, -cost) > (best.converged, -sum(best.cost_terms.values())):
+                best = outcome
+            if reporter.stop:
+                break
+        assert best is not None
+        return _with_stats(best, starts=costs)
+
+    def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, *, warm: bool) -> Outcome:
+        """Where a run ended as soon as it began, look at the curvature, and leave a saddle along it."""
+        iterations = outcome.stats.get("iterations", -1)
+        exact = outcome.stats.get("hessian") == "exact"
+        if not outcome.converged or iterations > SUSPICIOUS_ITERATIONS or (exact and not warm and iterations > 0):
+            return outcome
+        from covocp.curvature import smallest_curvature
+
+        curvature = smallest_curvature(outcome.extremal)
+        if curvature is None or curvature.value > NEGATIVE_CURVATURE * curvature.largest:
+            return outcome
+        candidates = []
+        for sign in ESCAPES:
+            start = make_guess(self.statement, self._prepared.mesh, values, curvature.displaced(outcome.extremal, sign))
+            candidates.append(self._prepared.solve(values, start, reporter))
+        better = [c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())]
+        if not better:
+            return outcome
+        warnings.warn(
+            "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction.",
+            CovocpWarning,
+            stacklevel=4,
+        )
+        return _with_stats(min(better, key=lambda c: sum(c.cost_terms.values())), left_saddle=True)
+
+    def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
+        """An outcome as a solution, with what the user must know about it."""
+        solution = Solution.of(outcome, self.method)
+        if not outcome.converged:
+            if allow_failure:
+                return solution
+            lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
+            violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
+            raise SolveError(
+                f"'{self.statement.name or 'the problem'}' was not solved by {self.method}: {outcome.message}.{violated}"
+                "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
+                solution=solution,
+                violations=outcome.violations,
+            )
+        error = solution.mesh_error
+        if error > COARSE_MESH:
+            warnings.warn(
+                f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative). "
+                "Use more intervals or substeps.",
+                CovocpWarning,
+                stacklevel=3,
+            )
+        smallest = solution.smallest_eigenvalue
+        if smallest < 0 and not solution.semidefinite:
+            warnings.warn(
+                f"A covariance is indefinite (smallest eigenvalue {smallest:.3g}); use covariance_step='gauss' or "
+                "more intervals.",
+                CovocpWarning,
+                stacklevel=3,
+            )
+        return solution
+
+
+def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
+    from dataclasses import replace
+
+    return replace(outcome, stats={**outcome.stats, **stats})
+
+
+def solve(
+    problem: Problem,
+    method: str = "ipopt",
+    *,
+    intervals: int = 100,
+    guess: Any = None,
+    progress: bool = True,
+    allow_failure: bool = False,
+    parameters: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Solution:
+    """Solve a problem; `Solver` behind it solves again without rebuilding.
+
+    Args:
+        problem: what to solve.
+        method: a name in `methods()`.
+        intervals: number of control intervals.
+        guess: where to start; see `Solver.solve`.
+        progress: whether to show the iterations on a terminal.
+        allow_failure: return the last iterate of a run that did not converge instead of raising.
+        parameters: values of parameters other than the declared ones, by name.
+        options: of the mesh and of the method; see `Solver`.
+
+    Returns:
+        The solution.
+
+    Raises:
+        ProblemError: the statement or an option is wrong.
+        SolveError: the method did not converge (carries the last iterate).
+    """
+    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
+    solver = Solver(problem, method, intervals=intervals, **options)
+    return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

@@ -1,0 +1,265 @@
+"""Residuals of the necessary conditions, gathered in one record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.curvature import smallest_curvature
+from covocp.extremal import Extremal
+from covocp.guess import quadrature_weights
+from covocp.hamiltonian import (
+    Costates,
+    along,
+    discrete_costates,
+    fine_trajectory,
+    hamiltonian,
+    integrated_costates,
+)
+from covocp.matrices import Array
+
+# A multiplier of a control bound above this share of the largest slope counts the bound as active.
+ACTIVE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimality:
+    """How well a solution meets the necessary conditions.
+
+    Attributes:
+        stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
+            neighbourhood of a node), bounds' multipliers included; relative to the largest |L_u| + |p' f_u + P V_u|.
+        control_slope: root mean square of H_u at the nodes with free controls; of the order of the square of the
+            interval for piecewise-linear controls; same normalisation.
+        costate_difference: largest difference between the costates of the multipliers and those integrated backward,
+            relative to the largest costate of each kind.
+        hamiltonian_variation: (largest - smallest H) / (largest sum of the absolute terms of H); None where the problem
+            depends on time explicitly.
+        transversality: k_T + H(T) with all multipliers, same normalisation as H times 1; None for a fixed duration.
+        terminal_violation: largest violated constraint, in its own unit.
+        mesh_error: relative change of the cost by halving the integration steps.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
+        smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
+        curvature: smallest eigenvalue of the reduced Hessian, relative to its largest; None where it cannot be had.
+            Negative: the solution is a saddle.
+    """
+
+    stationarity: float
+    control_slope: float
+    costate_difference: float
+    hamiltonian_variation: float | None
+    transversality: float | None
+    mesh_error: float
+    control_error: float
+    smallest_eigenvalue: float
+    curvature: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The values by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __str__(self) -> str:
+        """One line a residual."""
+        return "\n".join(
+            f"{name.replace('_', ' '):24s}{'-' if value is None else format(value, '.3g')}"
+            for name, value in self.as_dict().items()
+        )
+
+
+def assess(extremal: Extremal, costates: Costates, mesh_error: float, smallest_eigenvalue: float) -> Optimality:
+    """Evaluate all necessary conditions along an extremal.
+
+    Args:
+        extremal: the solution.
+        costates: of its multipliers.
+        mesh_error: estimated before.
+        smallest_eigenvalue: of its covariances.
+
+    Returns:
+        The record.
+    """
+    st = extremal.statement
+    slope, curvature, values, size = _along(extremal, costates)
+    _, slopes, by_duration = discrete_costates(extremal)
+    scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
+    weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
+    residual = (slopes + _path_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
+    free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
+    control_slope, control_error = 0.0, 0.0
+    if st.nu and free is not None:
+        free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
+        if not st.path.size:
+            control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
+            control_error = _control_error(extremal, costates, free)
+    return Optimality(
+        stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
+        control_slope=control_slope / scale,
+        costate_difference=_costate_difference(extremal, costates),
+        hamiltonian_variation=_variation(values) if st.autonomous else None,
+        transversality=_transversality(extremal, by_duration, values) if st.duration.free else None,
+        mesh_error=mesh_error,
+        control_error=control_error,
+        smallest_eigenvalue=smallest_eigenvalue,
+        curvature=_curvature(extremal),
+    )
+
+
+def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array, Array]:
+    """H_u (K, nu), H_uu (K, nu, nu), [H, sum of its absolute terms] (K, 2), |L_u| + |rest| (K, nu) at the nodes."""
+    st = extremal.statement
+    make = hamiltonian(st)
+
+    def select(h: Any, x: Any, u: Any, e: Any, t: Any) -> list[Any]:
+        return [h, ca.gradient(h, u), ca.hessian(h, u)[0] if st.nu else ca.DM(0, 0)]
+
+    function = make("along", select)
+    h, slope, curvature = along(function, extremal, costates)
+    zero = Costates(state=np.zeros_like(costates.state), matrices=np.zeros_like(costates.matrices))
+    cost, cost_slope, _ = along(function, extremal, zero)
+    values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
+    terms = np.abs(costates.state * np.asarray(values[0].full()).T).sum(axis=1)
+    terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1) + np.abs(cost[:, 0])
+    count = slope.shape[0]
+    return (
+        slope,
+        curvature.reshape(count, st.nu, st.nu),
+        np.column_stack([h[:, 0], terms]),
+        np.abs(cost_slope) + np.abs(slope - cost_slope),
+    )
+
+
+def _path_slopes(extremal: Extremal) -> Array:
+    """Slopes by the control values of the path constraints times their multipliers."""
+    st, mesh = extremal.statement, extremal.mesh
+    result = np.zeros((mesh.control_nodes, st.nu))
+    if not st.path.size:
+        return result
+    symbolic: Any = st.symbolic
+    symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate((st.nx, st.nu, st.ne, 1, 1, st.np))]
+    weights = symbolic.sym("mu", st.path.size)
+    slope = ca.gradient(ca.dot(weights, st.path.function(*symbols)), symbols[1])
+    function = ca.Function("slopes", [*symbols, weights], [ca.densify(slope)])
+    count = mesh.intervals + 1
+    values = np.asarray(function.map(count)(*extremal.columns(), extremal.multipliers.path.T).full()).T
+    result += values[: mesh.control_nodes]
+    if mesh.control == "constant":
+        result[-1] += values[-1]
+    return result
+
+
+def _control_error(extremal: Extremal, costates: Costates, free: Array) -> float:
+    """Relative cost of the piecewise form of the control, from H_u at the middles of the intervals."""
+    st, mesh = extremal.statement, extremal.mesh
+    values, _, _ = fine_trajectory(extremal, 2 * mesh.substeps)
+    middle = values[:, mesh.substeps, :]
+    after = np.hstack([costates.state, costates.matrices])
+    rates = _costate_rates(extremal, costates)
+    h = np.diff(extremal.time)[:, None]
+    mean = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
+    u = extremal.controls
+    controls = u[:-1] if mesh.control == "constant" else 0.5 * (u[1:] + u[:-1])
+    make = hamiltonian(st)
+    function = make("middle", lambda v, x, w, e, t: [ca.gradient(v, w), ca.hessian(v, w)[0]])
+    n = mesh.intervals
+    time = 0.5 * (extremal.time[1:] + extremal.time[:-1])
+    arguments = (
+        middle[:, : st.nx].T,
+        controls.T,
+        middle[:, st.nx :].T,
+        time[None, :],
+        np.full((1, n), extremal.trajectory.duration),
+        np.tile(extremal.parameters[:, None], (1, n)),
+        mean[:, : st.nx].T,
+        mean[:, st.nx :].T,
+    )
+    slope, curvature = (np.asarray(v.full()) for v in function.map(n)(*arguments))
+    slope = np.where(free[:-1] & free[1:], slope.T, 0.0)
+    curvature = curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2)
+    smallest = np.linalg.eigvalsh(curvature)[:, 0]
+    if (smallest <= 0).any():
+        return float("nan")
+    steps = np.linalg.solve(curvature, slope[:, :, None])[:, :, 0]
+    terminal = st.terminal(
+        extremal.trajectory.x[-1], extremal.trajectory.e[-1], extremal.trajectory.duration, extremal.parameters
+    )
+    cost = st.rates.map(n)(*arguments[:6])[2]
+    total = abs(float(terminal)) + abs(float(np.sum(np.asarray(cost.full()).ravel() * h[:, 0])))
+    return float(0.5 * np.sum(h[:, 0] * np.sum(slope * steps, axis=1)) / max(total, np.finfo(float).tiny))
+
+
+def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
+    """-H_x and -H_e at the nodes, stacked."""
+    make = hamiltonian(extremal.statement)
+    function = make("rates", lambda h, x, u, e, t: [-ca.gradient(h, x), -ca.gradient(h, e)])
+    return np.hstack(along(function, extremal, costates))
+
+
+def _costate_difference(extremal: Extremal, costates: Costates) -> float:
+    """Largest relative difference to the costates that are integrated backward."""
+    other = integrated_costates(extremal, max(1, extremal.mesh.substeps))
+    largest = 0.0
+    for one, two in ((costates.state, other.state), (costates.matrices, other.matrices)):
+        size = np.abs(one).max(initial=0.0)
+        if size > 0:
+            largest = max(largest, float(np.abs(one - two).max() / size))
+    return largest
+
+
+def _variation(values: Array) -> float:
+    """Variation of H relative to its terms."""
+    return float(np.ptp(values[:, 0]) / max(float(values[:, 1].max()), np.finfo(float).tiny))
+
+
+def _transversality(extremal: Extremal, by_duration: float, values: Array) -> float:
+    """k_T + end conditions' slope + H(T), relative to the terms of H(T)."""
+    st, trajectory = extremal.statement, extremal.trajectory
+    duration = ca.MX.sym("T")
+    value = st.terminal(trajectory.x[-1], trajectory.e[-1], duration, extremal.parameters)
+    if st.end.size:
+        arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
+        value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
+    slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
+    return float(abs(slope + values[-1, 0]) / max(values[-1, 1], abs(slope), np.finfo(float).tiny))
+
+
+def _curvature(extremal: Extremal) -> float | None:
+    result = smallest_curvature(extremal)
+    return None if result is None else result.value / max(result.largest, np.finfo(float).tiny)
+
+
+def path_violations(extremal: Extremal, points: int) -> Mapping[str, float]:
+    """Largest violations of path constraints and state bounds at `points` parts of each interval, by name."""
+    st, mesh = extremal.statement, extremal.mesh
+    factor = 2 * points if st.running_uses_matrices else points
+    values, _, _ = fine_trajectory(extremal, factor)
+    n = mesh.intervals
+    u = extremal.controls
+    c = np.arange(factor + 1) / factor
+    after = u[:-1] if mesh.control == "constant" else u[1:]
+    controls = u[:-1, None, :] + c[None, :, None] * (after - u[:-1])[:, None, :]
+    time = extremal.time[:-1, None] + c[None, :] * np.diff(extremal.time)[:, None]
+    count = n * (factor + 1)
+    z = values.reshape(count, -1)
+    result: dict[str, float] = {}
+    groups = [(st.state_names, z[:, : st.nx], *st.state_bounds)]
+    if st.path.size:
+        arguments = (
+            z[:, : st.nx].T,
+            controls.reshape(count, st.nu).T,
+            z[:, st.nx :].T,
+            time.reshape(1, count),
+            np.full((1, count), extremal.trajectory.duration),
+            np.tile(extremal.parameters[:, None], (1, count)),
+        )
+        rows = np.asarray(st.path.function.map(count)(*arguments).full()).T
+        groups.append((st.path.names, rows, st.path.lower, st.path.upper))
+    for names, rows, lower, upper in groups:
+        excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=-np.inf)
+        result |= {name: float(v) for name, v in zip(names, excess, strict=True) if v > 0}
+    return result
+
+

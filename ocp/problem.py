@@ -1,0 +1,645 @@
+"""The builder: symbols, dynamics, noise, measurements, costs and constraints of a vector-matrix problem."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.checks import (
+    as_number,
+    caller,
+    check_bounds,
+    check_density,
+    check_inside,
+    check_positive,
+    check_size,
+    column,
+    data_column,
+    density_matrix,
+    is_symbolic,
+    shape_error,
+    symmetric_data,
+)
+from covocp.declarations import (
+    Constraint,
+    Control,
+    Dynamics,
+    Free,
+    Guess,
+    Matrix,
+    Measurement,
+    Parameter,
+    Place,
+    State,
+    Unknown,
+)
+from covocp.errors import ProblemError, describe
+from covocp.freeze import freeze
+from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
+from covocp.statement import Statement
+
+
+class EstimationCovariance:
+    """The covariance of the estimation error of the augmented state (states, then unknowns), as the user sees it.
+
+    `E[a, b]` is the block between two symbols, names, or expressions of them (to first order, by their Jacobians);
+    `E.matrix` is the whole symmetric matrix.
+    """
+
+    def __init__(self, problem: Problem, declaration: Matrix) -> None:
+        """Keep the problem (to look symbols up) and the declared matrix."""
+        self._problem = problem
+        self._declaration = declaration
+
+    @property
+    def matrix(self) -> ca.MX:
+        """The full symmetric matrix, shape (n, n), n entries of the augmented state."""
+        return self._declaration.matrix
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the rows."""
+        return self._declaration.labels
+
+    def __getitem__(self, key: Any) -> ca.MX:
+        """Covariance between two symbols or names, shape (size of a, size of b).
+
+        Raises:
+            ProblemError: where a name is unknown, or an expression contains no augmented state.
+        """
+        if not isinstance(key, tuple) or len(key) != 2:
+            raise ProblemError(
+                describe(
+                    "A covariance is indexed by two symbols.",
+                    expected="E[a, b] with a, b of " + ", ".join(self._problem.augmented_names()),
+                    received=f"E[{key}]",
+                    remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
+                )
+            )
+        left, right = (self._problem.augmented_jacobian(entry) for entry in key)
+        if isinstance(left, slice) and isinstance(right, slice):
+            return self.matrix[left, right]
+        size = self.matrix.shape[0]
+        rows, columns = (ca.MX.eye(size)[j, :] if isinstance(j, slice) else j for j in (left, right))
+        return rows @ self.matrix @ columns.T
+
+
+class Problem:
+    """An optimal control problem whose state holds vectors and symmetric (covariance) matrices.
+
+    Args:
+        duration: terminal time [s], or `Free(guess, lower, upper)`.
+        name: appears in printouts and plots.
+
+    Raises:
+        ProblemError: where the duration is not positive.
+    """
+
+    def __init__(self, duration: float | Free, name: str = "") -> None:
+        """Start an empty problem."""
+        if not isinstance(duration, Free):
+            duration = check_positive("duration", duration, unit="s")
+        self.name = name
+        self.free_duration: Free | None = duration if isinstance(duration, Free) else None
+        self._time = ca.MX.sym("time")
+        self._duration: Any = ca.MX.sym("duration") if isinstance(duration, Free) else duration
+        self.states: list[State] = []
+        self.unknowns: list[Unknown] = []
+        self.parameters: list[Parameter] = []
+        self.controls: list[Control] = []
+        self.matrices: list[Matrix] = []
+        self.rates: dict[str, Dynamics] = {}
+        self.measurements: list[Measurement] = []
+        self.constraints: list[Constraint] = []
+        self.cost: tuple[ca.MX, ca.MX] | None = None
+        self._frozen: Statement | None = None
+
+    @property
+    def time(self) -> ca.MX:
+        """Symbol of the running time [s]."""
+        return self._time
+
+    @property
+    def duration(self) -> Any:
+        """Symbol of the terminal time [s], or its number where it is fixed."""
+        return self._duration
+
+    def state(
+        self,
+        name: str,
+        shape: int = 1,
+        *,
+        initial: Any,
+        final: Any = None,
+        lower: Any = -np.inf,
+        upper: Any = np.inf,
+        guess: Guess = None,
+        scale: Any = None,
+        variance: Any = None,
+    ) -> ca.MX:
+        """Declare a nominal vector state.
+
+        Args:
+            name: unique name.
+            shape: number of components.
+            initial: start values, shape () or (shape,); numbers or expressions in parameters; None or NaN: free.
+            final: values to reach at the end; None or NaN: free.
+            lower: lower bounds along the path, at the nodes of the mesh.
+            upper: upper bounds along the path, at the nodes of the mesh.
+            guess: a number, an array over the nodes, or a function of s = t/T; None: simulated from the controls.
+            scale: typical magnitude; None: from bounds, guess and simulated trajectory.
+            variance: of the error of the initial estimate: scalar, vector (diagonal) or matrix; None: zero.
+
+        Returns:
+            The symbol, shape (shape, 1).
+
+        Raises:
+            ProblemError: name used twice, shapes that do not fit, bounds crossed, values outside the bounds, NaN or
+                inf in data, variance not positive semidefinite.
+        """
+        size = self._declare(name, shape)
+        low, high = (
+            column(name, "lower bound", lower, size, inf=True),
+            column(name, "upper bound", upper, size, inf=True),
+        )
+        check_bounds(name, low, high)
+        free = np.full(size, np.nan)
+        for what, value in (("initial", initial), ("final", final)):
+            if value is not None and not is_symbolic(value):
+                check_inside(name, what, column(name, f"{what} value", value, size, nan=True), low, high)
+        declaration = State(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            initial=data_column(name, "initial value", free if initial is None else initial, size, nan=True),
+            final=data_column(name, "final value", free if final is None else final, size, nan=True),
+            lower=low,
+            upper=high,
+            guess=guess,
+            scale=self._scale(name, scale, size),
+            variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
+        )
+        self.states.append(declaration)
+        return declaration.symbol
+
+    def unknown(self, name: str, mean: Any, variance: Any) -> ca.MX:
+        """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
+
+        Args:
+            name: unique name.
+            mean: its expected value, a number or a vector.
+            variance: of that value: scalar, vector (diagonal) or matrix; numbers or expressions in parameters.
+
+        Returns:
+            The symbol, shape (n, 1).
+
+        Raises:
+            ProblemError: name used twice, NaN or inf, variance not positive semidefinite or of the wrong size.
+        """
+        size = self._declare(name, int(np.size(as_number(name, "mean", mean))))
+        declaration = Unknown(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            mean=column(name, "mean", mean, size),
+            variance=density_matrix(name, "variance", variance, size),
+        )
+        self.unknowns.append(declaration)
+        return declaration.symbol
+
+    def parameter(self, name: str, value: Any) -> ca.MX:
+        """Declare a known number (or vector) that may change from solve to solve without rebuilding.
+
+        Raises:
+            ProblemError: name used twice, NaN or inf.
+        """
+        size = self._declare(name, int(np.size(as_number(name, "value", value))))
+        declaration = Parameter(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            value=column(name, "value", value, size),
+        )
+        self.parameters.append(declaration)
+        return declaration.symbol
+
+    def control(
+        self,
+        name: str,
+        shape: int = 1,
+        *,
+        lower: Any = -np.inf,
+        upper: Any = np.inf,
+        guess: Guess = 0.0,
+        scale: Any = None,
+    ) -> ca.MX:
+        """Declare a control vector with its bounds, guess (as for states) and scale.
+
+        Returns:
+            The symbol, shape (shape, 1).
+
+        Raises:
+            ProblemError: name used twice, shapes that do not fit, bounds crossed.
+        """
+        size = self._declare(name, shape)
+        low, high = (
+            column(name, "lower bound", lower, size, inf=True),
+            column(name, "upper bound", upper, size, inf=True),
+        )
+        check_bounds(name, low, high)
+        declaration = Control(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            lower=low,
+            upper=high,
+            guess=guess,
+            scale=self._scale(name, scale, size),
+        )
+        self.controls.append(declaration)
+        return declaration.symbol
+
+    def symmetric(
+        self, name: str, size: int, *, initial: Any, final: Any = None, lower: float | None = None, guess: Any = None
+    ) -> ca.MX:
+        """Declare a general symmetric matrix state, stored as its half-vector.
+
+        Args:
+            name: unique name.
+            size: number of rows.
+            initial: matrix (size, size), or a scalar where size is 1; None or NaN entries: free.
+            final: as `initial`; None: free.
+            lower: lower bound of the diagonal entries at the nodes; 0 or more also declares it positive semidefinite.
+            guess: a matrix, used where the matrix is an NLP variable and cannot be simulated; None: simulated.
+
+        Returns:
+            The full symmetric matrix, shape (size, size).
+
+        Raises:
+            ProblemError: name used twice, shape that does not fit, NaN or inf, not symmetric; with `lower` >= 0 an
+                initial matrix that is not positive semidefinite.
+        """
+        size = self._declare(name, size)
+        covariance = lower is not None and lower >= 0
+        labels = tuple(str(i) for i in range(size))
+        declaration = self._add_matrix(name, size, initial, final, lower, guess, covariance, False, labels)
+        return declaration.matrix
+
+    def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
+        """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
+
+        Its rate is F E + E F' + Q - E M' U^-1 M E, with F and M the Jacobians of dynamics and measurements along the
+        nominal, Q and U the noise densities given to `dynamics` and `measurement`.
+
+        Args:
+            initial: covariance at the start; None: from the variances of states and unknowns.
+
+        Returns:
+            The covariance; `E[x, b]` gives entries and blocks.
+
+        Raises:
+            ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
+        """
+        labels = self.augmented_names()
+        if not labels:
+            raise ProblemError(
+                describe(
+                    "There is nothing to estimate.",
+                    expected="states and unknowns declared before estimation_covariance()",
+                    received="none",
+                    remedy="call estimation_covariance() after the last state() and unknown()",
+                )
+            )
+        size = self._declare("E", len(labels))
+        if initial is None:
+            initial = ca.diagcat(*(entry.variance for entry in (*self.states, *self.unknowns)))
+        return EstimationCovariance(self, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels))
+
+    def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
+        """Give the rate of a state or of a symmetric matrix state.
+
+        Args:
+            symbol: what `state` or `symmetric` returned, or its name.
+            rate: d(symbol)/dt, of the shape of the symbol, per second.
+            noise: power spectral density of additive white noise: scalar, vector (diagonal) or matrix; may depend on
+                state, control and time. Only for vector states.
+
+        Raises:
+            ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
+        """
+        name = self._name_of(symbol, "dynamics")
+        for state in self.states:
+            if state.name == name:
+                value = self._expression(name, "rate", rate, (state.size, 1))
+                density = None if noise is None else density_matrix(name, "noise density", noise, state.size)
+                break
+        else:
+            matrix = next((entry for entry in self.matrices if entry.name == name and not entry.estimation), None)
+            if matrix is None or noise is not None:
+                raise ProblemError(
+                    describe(
+                        f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
+                        expected="a state, or a symmetric matrix without noise",
+                        received=f"'{name}'",
+                        remedy="unknowns are constant, and the estimation covariance has its rate already",
+                    )
+                )
+            value, density = pack_symbolic(self._expression(name, "rate", rate, (matrix.size, matrix.size))), None
+        if name in self.rates:
+            raise ProblemError(
+                describe(
+                    f"The rate of '{name}' is given twice.",
+                    expected="one call of dynamics() for each state",
+                    received=f"a first one at {self.rates[name].where}",
+                    remedy="remove one of them",
+                )
+            )
+        self.rates[name] = Dynamics(rate=value, noise=density, where=caller())
+        self._frozen = None
+
+    def measurement(self, name: str, expression: Any, noise: Any) -> None:
+        """Add a continuous measurement m = expression + v with white noise v.
+
+        Args:
+            name: unique name.
+            expression: of states, unknowns, controls and time, shape (m, 1).
+            noise: power spectral density of v: scalar, vector (diagonal) or matrix (correlated), positive definite.
+
+        Raises:
+            ProblemError: name used twice, density singular, negative or of the wrong size.
+        """
+        value = ca.MX(expression)
+        size = self._declare(name, value.shape[0])
+        if value.shape[1] != 1:
+            raise shape_error(name, "measurement", "a column", f"shape {value.shape}")
+        density = density_matrix(name, "noise density", noise, size)
+        if density.is_constant():
+            check_density(name, "noise density", ca.evalf(density).full(), definite=True)
+        self.measurements.append(Measurement(name=name, expression=value, noise=density, where=caller()))
+
+    def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
+        """State the deterministic cost: terminal + integral of running over [0, T].
+
+        Args:
+            running: L(x, u, E, t), scalar, cost per second.
+            terminal: k(x(T), E(T), T), scalar; tr(C E(T)) is written as such.
+
+        Raises:
+            ProblemError: not scalar, or given twice.
+        """
+        if self.cost is not None:
+            raise ProblemError(
+                describe(
+                    "The cost is given twice.",
+                    expected="one call of minimize()",
+                    received="a second one",
+                    remedy="add the terms up in one call",
+                )
+            )
+        self.cost = (
+            self._expression("minimize", "running cost", running, (1, 1)),
+            self._expression("minimize", "terminal cost", terminal, (1, 1)),
+        )
+        self._frozen = None
+
+    def subject_to(
+        self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None
+    ) -> None:
+        """Require lower <= expression <= upper.
+
+        Path constraints hold at the nodes of the mesh; `Solution.check_path` looks between them. With constant
+        controls a path constraint holds at each node with the control of the interval that starts there (at the last
+        node: the last control).
+
+        Args:
+            expression: of states, controls, matrix states, time; a column or a scalar.
+            lower: numbers, shape of the expression.
+            upper: numbers, shape of the expression; 0 by default.
+            at: "path", "initial" or "final".
+            name: appears in every diagnostic; "constraint k" by default.
+
+        Raises:
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place.
+        """
+        label = name if name is not None else f"constraint {len(self.constraints) + 1}"
+        if at not in ("path", "initial", "final"):
+            raise ProblemError(
+                describe(
+                    f"'{label}' has an unknown place.",
+                    expected="at='path', 'initial' or 'final'",
+                    received=repr(at),
+                    remedy="choose one of the three",
+                )
+            )
+        value = ca.MX(expression) if not isinstance(expression, ca.MX) else expression
+        known = {entry.name for entry in self.parameters}
+        if not any(symbol.name() not in known for symbol in ca.symvar(value)):
+            raise ProblemError(
+                describe(
+                    f"'{label}' contains no variable.",
+                    expected="an expression of states, controls, matrix states or time",
+                    received=str(expression),
+                    remedy="remove it, or use the symbols that state(), control() and symmetric() return",
+                )
+            )
+        if value.shape[1] != 1:
+            raise shape_error(label, "expression", "a scalar or a column", f"shape {value.shape}")
+        size = self._declare(label, value.shape[0])
+        low, high = (
+            column(label, "lower bound", lower, size, inf=True),
+            column(label, "upper bound", upper, size, inf=True),
+        )
+        check_bounds(label, low, high)
+        self.constraints.append(Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller()))
+
+    def statement(self) -> Statement:
+        """The frozen problem that solvers read; built once and kept until something is added.
+
+        Raises:
+            ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
+        """
+        if self._frozen is None:
+            self._frozen = freeze(self)
+        return self._frozen
+
+    def augmented_names(self) -> tuple[str, ...]:
+        """Names of the rows of the estimation covariance: states, then unknowns."""
+        entries = (*self.states, *self.unknowns)
+        return tuple(
+            entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
+        )
+
+    def augmented_jacobian(self, key: Any) -> Any:
+        """Rows of the augmented state that a symbol or name stands for (a slice), or the Jacobian of an expression.
+
+        Raises:
+            ProblemError: where the name is unknown, or the expression contains no augmented state.
+        """
+        offset = 0
+        jacobians = []
+        for entry in (*self.states, *self.unknowns):
+            span = slice(offset, offset + entry.size)
+            if key is entry.symbol or (isinstance(key, str) and key == entry.name):
+                return span
+            if is_symbolic(key):
+                if key.is_symbolic() and ca.is_equal(key, entry.symbol):
+                    return span
+                jacobians.append(ca.jacobian(key, entry.symbol))
+            offset = span.stop
+        jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
+        if jacobian.nnz() == 0:
+            raise ProblemError(
+                describe(
+                    f"'{key}' is not part of the estimated state.",
+                    expected="a symbol or name of " + ", ".join(self.augmented_names()),
+                    received=str(key),
+                    remedy="index the covariance with states and unknowns of this problem",
+                )
+            )
+        return ca.densify(jacobian)
+
+    def _declare(self, name: str, size: Any) -> int:
+        """Check that the name is new and the size sensible; forget the frozen statement."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(
+                describe(
+                    "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
+                )
+            )
+        taken: list[Any] = [
+            *self.states,
+            *self.unknowns,
+            *self.parameters,
+            *self.controls,
+            *self.matrices,
+            *self.measurements,
+            *self.constraints,
+        ]
+        for entry in taken:
+            if entry.name == name:
+                raise ProblemError(
+                    describe(
+                        f"The name '{name}' is used twice.",
+                        expected="a unique name for each symbol, measurement and constraint",
+                        received=f"'{name}', declared before at {entry.where}",
+                        remedy="choose another name",
+                    )
+                )
+        if name in ("time", "duration"):
+            raise ProblemError(
+                describe(
+                    f"The name '{name}' is taken.",
+                    expected="any other name",
+                    received=name,
+                    remedy=f"use Problem.{name} for that symbol",
+                )
+            )
+        self._frozen = None
+        return check_size(name, size)
+
+    def _scale(self, name: str, scale: Any, size: int) -> Any:
+        if scale is None:
+            return None
+        values = column(name, "scale", scale, size)
+        if (values <= 0).any():
+            raise ProblemError(
+                describe(
+                    f"The scale of '{name}' must be positive.",
+                    expected="typical magnitudes > 0",
+                    received=str(values),
+                    remedy="give magnitudes, or None for automatic scaling",
+                )
+            )
+        return values
+
+    def _add_matrix(
+        self,
+        name: str,
+        size: int,
+        initial: Any,
+        final: Any,
+        lower: float | None,
+        guess: Any,
+        covariance: bool,
+        estimation: bool,
+        labels: tuple[str, ...],
+    ) -> Matrix:
+        """Declare a matrix state; constant initial values are checked."""
+        half = ca.MX.sym(name, half_length(size))
+        ends = [
+            None if value is None else symmetric_data(name, what, value, size, semidefinite=covariance)
+            for what, value in (("initial value", initial), ("final value", final))
+        ]
+        declaration = Matrix(
+            name=name,
+            symbol=half,
+            matrix=unpack_symbolic(half, size),
+            size=size,
+            where=caller(),
+            initial=ends[0],
+            final=ends[1],
+            lower=lower,
+            guess=guess,
+            covariance=covariance,
+            estimation=estimation,
+            labels=labels,
+        )
+        self.matrices.append(declaration)
+        return declaration
+
+    def _name_of(self, symbol: Any, what: str) -> str:
+        """Name of a declared state or matrix, from its symbol or name."""
+        if isinstance(symbol, str):
+            candidates: list[Any] = [entry for entry in (*self.states, *self.matrices) if entry.name == symbol]
+        else:
+            candidates = [entry for entry in self.states if symbol is entry.symbol]
+            candidates += [entry for entry in self.matrices if symbol is entry.matrix]
+            candidates += [
+                entry
+                for entry in (*self.states, *self.unknowns, *self.controls, *self.parameters)
+                if is_symbolic(symbol) and symbol.is_symbolic() and ca.is_equal(symbol, entry.symbol)
+            ]
+        if not candidates:
+            raise ProblemError(
+                describe(
+                    f"{what}() was given something that is not a state of this problem.",
+                    expected="one of " + ", ".join(entry.name for entry in (*self.states, *self.matrices)),
+                    received=str(symbol),
+                    remedy="pass the symbol that state() or symmetric() returned",
+                )
+            )
+        return str(candidates[0].name)
+
+    def _expression(self, name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
+        """The value as an expression of the given shape (a scalar zero fits every shape)."""
+        try:
+            expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
+        except (TypeError, ValueError, NotImplementedError) as error:
+            raise ProblemError(
+                describe(
+                    f"The {what} of '{name}' is not an expression.",
+                    expected="an expression of the symbols of this problem",
+                    received=repr(value),
+                    remedy="use casadi functions on the symbols (casadi.sin, @, *), not numpy arrays of objects",
+                )
+            ) from error
+        if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():
+            return ca.MX.zeros(*shape)
+        if expression.shape != shape:
+            raise shape_error(name, what, f"shape {shape}", f"shape {expression.shape}")
+        if expression.is_constant() and not np.isfinite(ca.evalf(expression).full()).all():
+            raise ProblemError(
+                describe(
+                    f"The {what} of '{name}' is NaN or inf.",
+                    expected="a finite expression",
+                    received=str(expression),
+                    remedy=f"correct the {what}",
+                )
+            )
+        return expression

@@ -1,0 +1,540 @@
+"""Statement -> NLP by multiple shooting, with the matrices eliminated or as half-vector states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.integrators import (
+    full_interval,
+    interval_symbols,
+    joint_interval,
+    nominal_interval,
+    propagate_interval,
+    simpson_interval,
+    step_matrix,
+)
+from covocp.matrices import Array
+from covocp.mesh import Mesh
+from covocp.statement import Conditions, Statement
+from covocp.trajectory import Multipliers, Trajectory
+
+# Scaled residual above which a constraint of a failed run is reported as violated.
+VIOLATION = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Typical magnitudes of the entries of x, u, e and T; the NLP works in units of them."""
+
+    x: Array
+    u: Array
+    e: Array
+    duration: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A group of constraint rows: `names[i % len(names)]` is the user's name of row i; value = expression / scale."""
+
+    kind: str
+    expression: Any
+    lower: Array
+    upper: Array
+    names: tuple[str, ...]
+    scale: Array
+    dense: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NLP:
+    """A transcribed problem: minimise f(w, p) subject to bounds on w and g(w, p); everything scaled.
+
+    `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
+    nodes (columns), the terminal time, running cost, terminal cost and g.
+    """
+
+    statement: Statement
+    mesh: Mesh
+    scales: Scales
+    w: Any
+    p: Any
+    f: Any
+    g: Any
+    rows: tuple[Rows, ...]
+    jacobian: ca.Function | None
+    evaluate: ca.Function
+
+    def pack(self, trajectory: Trajectory) -> Array:
+        """The scaled variables of a trajectory."""
+        nodes = list(self.mesh.starts)
+        parts = [trajectory.x[nodes] / self.scales.x]
+        if not self.mesh.eliminated:
+            parts.append(trajectory.e[nodes] / self.scales.e)
+        parts.append(trajectory.u / self.scales.u)
+        stacked = [part.ravel() for part in parts]
+        if self.statement.duration.free:
+            stacked.append(np.array([trajectory.duration / self.scales.duration]))
+        return np.concatenate(stacked)
+
+    def unpack(self, w: Array, parameters: Array) -> tuple[Trajectory, dict[str, Any]]:
+        """The trajectory at all nodes, and the cost terms and constraint values, of some variables."""
+        x, e, u, duration, running, terminal, g = (
+            np.asarray(v.full()) for v in self.evaluate(w, np.append(parameters, 1.0))
+        )
+        trajectory = Trajectory(x=x.T, u=u.T, e=e.T, duration=float(duration.item()))
+        return trajectory, {"running": float(running.item()), "terminal": float(terminal.item()), "g": g.ravel()}
+
+    def bounds(self, parameters: Array) -> dict[str, Array]:
+        """Bounds of w and g (nlpsol's names) for these parameters."""
+        st = self.statement
+        x0, xf, e0, ef = st.boundary_values(parameters)
+        count = len(self.mesh.starts)
+        xl, xu = np.tile(st.state_bounds[0], (count, 1)), np.tile(st.state_bounds[1], (count, 1))
+        _fix(xl[0], xu[0], x0)
+        _fix(xl[-1], xu[-1], xf)
+        lows, highs = [xl / self.scales.x], [xu / self.scales.x]
+        if not self.mesh.eliminated:
+            el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
+            _fix(el[0], eu[0], e0)
+            _fix(el[-1], eu[-1], ef)
+            lows.append(el / self.scales.e)
+            highs.append(eu / self.scales.e)
+        nodes = self.mesh.control_nodes
+        lows.append(np.tile(st.control_bounds[0] / self.scales.u, (nodes, 1)))
+        highs.append(np.tile(st.control_bounds[1] / self.scales.u, (nodes, 1)))
+        if st.duration.free:
+            lows.append(np.array([st.duration.lower / self.scales.duration]))
+            highs.append(np.array([st.duration.upper / self.scales.duration]))
+        lbg = np.concatenate([np.zeros(0), *(rows.lower for rows in self.rows)])
+        ubg = np.concatenate([np.zeros(0), *(rows.upper for rows in self.rows)])
+        offset = 0
+        for rows in self.rows:
+            if rows.kind == "final_matrices":
+                target = ef[~np.isnan(ef)] / rows.scale
+                lbg[offset : offset + rows.lower.size] = ubg[offset : offset + rows.lower.size] = target
+            offset += rows.lower.size
+        return {
+            "lbx": np.concatenate([v.ravel() for v in lows]),
+            "ubx": np.concatenate([v.ravel() for v in highs]),
+            "lbg": lbg,
+            "ubg": ubg,
+        }
+
+    def violations(self, g: Array, parameters: Array) -> dict[str, float]:
+        """Largest violation of each violated constraint, in its own unit, by name."""
+        bounds = self.bounds(parameters)
+        excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
+        excess = np.where(np.isfinite(g), excess, np.inf)
+        result: dict[str, float] = {}
+        fixed = ~np.isnan(self.statement.boundary_values(parameters)[1])
+        offset = 0
+        for rows in self.rows:
+            size = rows.lower.size
+            for i in np.flatnonzero(excess[offset : offset + size] > VIOLATION):
+                name = rows.names[i % len(rows.names)]
+                if rows.kind == "gap_x" and i >= size - len(rows.names) and fixed[i % len(rows.names)]:
+                    name = f"final value of {self.statement.state_names[i % len(rows.names)]}"
+                result[name] = max(result.get(name, 0.0), float(excess[offset + i] * rows.scale[i]))
+            offset += size
+        return dict(sorted(result.items(), key=lambda entry: -entry[1]))
+
+    def unpack_multipliers(
+        self, lam_x: Array, lam_g: Array, trajectory: Trajectory, parameters: Array
+    ) -> Multipliers:
+        """Multipliers of the statement's constraints from those of the NLP (for a cost scale of 1)."""
+        st, mesh = self.statement, self.mesh
+        by_kind, offset = {}, 0
+        for rows in self.rows:
+            by_kind[rows.kind] = lam_g[offset : offset + rows.lower.size] / rows.scale
+            offset += rows.lower.size
+        zero = Multipliers.zero(st, mesh)
+        parts = self._split(lam_x)
+        states, matrices = zero.states.copy(), zero.matrices.copy()
+        starts = list(mesh.starts)
+        states[starts[1:-1]] = (parts["x"] / self.scales.x)[1:-1]
+        if "state_bounds" in by_kind:
+            bounded = np.flatnonzero(np.isfinite(st.state_bounds[0]) | np.isfinite(st.state_bounds[1]))
+            inside = sorted(set(range(mesh.intervals + 1)) - set(starts))
+            states[np.ix_(inside, bounded)] = by_kind["state_bounds"].reshape(len(inside), bounded.size)
+        end = by_kind.get("end", zero.end)
+        path = by_kind.get("path", zero.path.ravel()).reshape(zero.path.shape)
+        costate = by_kind["gap_x"][-st.nx :]
+        slope_x, slope_e = terminal_slopes(st, trajectory, parameters, end, path[-1], mesh)
+        final_matrices = zero.final_matrices.copy()
+        if "e" in parts:
+            matrices[starts[1:-1]] = (parts["e"] / self.scales.e)[1:-1]
+            final_matrices = by_kind["gap_e"][-st.ne :] - slope_e
+        elif "final_matrices" in by_kind:
+            known = ~np.isnan(st.boundary_values(parameters)[3])
+            final_matrices[known] = by_kind["final_matrices"]
+        return Multipliers(
+            final=costate - slope_x,
+            final_matrices=final_matrices,
+            end=end,
+            start=by_kind.get("start", zero.start),
+            path=path,
+            states=states,
+            matrices=matrices,
+            controls=parts["u"] / self.scales.u,
+        )
+
+    def pack_multipliers(self, multipliers: Multipliers, costates: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Multipliers of the NLP (for a cost scale of 1) from those of the statement and the costates at the nodes."""
+        starts = list(self.mesh.starts)
+        inside = sorted(set(range(self.mesh.intervals + 1)) - set(starts))
+        st = self.statement
+        bounded = np.flatnonzero(np.isfinite(st.state_bounds[0]) | np.isfinite(st.state_bounds[1]))
+        known = ~np.isnan(st.boundary_values(st.values)[3])
+        values = {
+            "gap_x": costates[0][starts[1:]],
+            "gap_e": costates[1][starts[1:]],
+            "state_bounds": multipliers.states[np.ix_(inside, bounded)],
+            "path": multipliers.path,
+            "start": multipliers.start,
+            "end": multipliers.end,
+            "final_matrices": multipliers.final_matrices[known],
+        }
+        lam_g = [values[rows.kind].ravel() * rows.scale for rows in self.rows]
+        lam_x = [multipliers.states[starts] * self.scales.x]
+        if not self.mesh.eliminated:
+            lam_x.append(multipliers.matrices[starts] * self.scales.e)
+        lam_x.append(multipliers.controls * self.scales.u)
+        if st.duration.free:
+            lam_x.append(np.zeros(1))
+        return np.concatenate([v.ravel() for v in lam_x]), np.concatenate([np.zeros(0), *lam_g])
+
+    def _split(self, w: Array) -> dict[str, Array]:
+        """Parts of a vector of the size of the variables, a row for each node."""
+        st, count, nodes = self.statement, len(self.mesh.starts), self.mesh.control_nodes
+        lengths = {"x": (count, st.nx)} | ({} if self.mesh.eliminated else {"e": (count, st.ne)}) | {"u": (nodes, st.nu)}
+        parts, offset = {}, 0
+        for name, shape in lengths.items():
+            parts[name] = w[offset : offset + shape[0] * shape[1]].reshape(shape)
+            offset += shape[0] * shape[1]
+        return parts
+
+
+def terminal_slopes(
+    statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array, mesh: Mesh
+) -> tuple[Array, Array]:
+    """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
+    x, e = ca.MX.sym("x", statement.nx), ca.MX.sym("e", statement.ne)
+    t, u = trajectory.duration, trajectory.u[-1]
+    value = statement.terminal(x, e, t, parameters)
+    for conditions, weights in ((statement.end, end), (statement.path, path)):
+        if conditions.size:
+            value += ca.dot(ca.DM(weights), conditions.function(x, u, e, t, t, parameters))
+    slopes = ca.Function("slopes", [x, e], [ca.gradient(value, x), ca.gradient(value, e)])
+    return tuple(np.asarray(v.full()).ravel() for v in slopes(trajectory.x[-1], trajectory.e[-1]))  # type: ignore[return-value]
+
+
+def _fix(lower: Array, upper: Array, values: Array) -> None:
+    """Fix the entries that have a value (in place)."""
+    known = ~np.isnan(values)
+    lower[known] = upper[known] = values[known]
+
+
+def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
+    """Build the NLP of a statement on a mesh.
+
+    Args:
+        statement: the problem.
+        mesh: nodes, segments, formulation.
+        scales: magnitudes in which the NLP works.
+
+    Returns:
+        The NLP; its functions are not yet differentiated.
+    """
+    variables = _Variables(statement, mesh, scales)
+    nodes = _shoot(statement, mesh, variables)
+    running = ca.sum2(nodes["cost"])
+    last_x, last_e = nodes["x"][:, -1], nodes["e"][:, -1]
+    terminal = statement.terminal(last_x, last_e, variables.duration, variables.parameters)
+    rows = _constraints(statement, mesh, scales, variables, nodes)
+    g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
+    p = ca.vertcat(variables.p)
+    outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
+    return NLP(
+        statement=statement,
+        mesh=mesh,
+        scales=scales,
+        w=variables.w,
+        p=p,
+        f=(running + terminal) / variables.cost_scale,
+        g=g,
+        rows=rows,
+        jacobian=_split_jacobian(variables, rows, g),
+        evaluate=ca.Function("evaluate", [variables.w, p], outputs),
+    )
+
+
+class _Variables:
+    """The variables of the NLP, and their unscaled values as matrices with a column for each node."""
+
+    def __init__(self, statement: Statement, mesh: Mesh, scales: Scales) -> None:
+        nx, ne, nu, count, nodes = statement.nx, statement.ne, statement.nu, len(mesh.starts), mesh.control_nodes
+        lengths = [nx * count, 0 if mesh.eliminated else ne * count, nu * nodes, int(statement.duration.free)]
+        ends = np.cumsum([0, *lengths]).tolist()
+        self.w = ca.MX.sym("w", ends[-1])
+        x, e, u, duration = (self.w[i:j] for i, j in zip(ends[:-1], ends[1:], strict=True))
+        self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
+        self.e = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
+        self.u = ca.reshape(u, nu, nodes) * ca.repmat(ca.DM(scales.u), 1, nodes)
+        self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
+        self.p = ca.MX.sym("p", statement.np + 1)
+        self.parameters, self.cost_scale = ca.vertsplit(self.p, [0, statement.np, statement.np + 1])
+
+
+def repeat(column: Any, count: int) -> Any:
+    """A column repeated; one without entries stays without."""
+    return ca.repmat(column, 1, count) if column.shape[0] else ca.DM(0, count)
+
+
+def control_ends(mesh: Mesh, u: Any) -> tuple[Any, Any]:
+    """Controls at the starts and the ends of the intervals, a column each."""
+    return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
+
+
+def common_columns(mesh: Mesh, u: Any, duration: Any, parameters: Any) -> tuple[Any, ...]:
+    """The common arguments of the interval functions, a column for each interval."""
+    n = mesh.intervals
+    start, end = control_ends(mesh, u)
+    s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
+    return start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n)
+
+
+def _shoot(statement: Statement, mesh: Mesh, variables: _Variables) -> dict[str, Any]:
+    """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
+    common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
+    if not mesh.eliminated or statement.coupled:
+        start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
+        advance = full_interval(statement, mesh.substeps, mesh.step)
+    else:
+        start, advance = variables.x, nominal_interval(statement, mesh.substeps)
+    ends, fine, cost = _segments(mesh, advance, start, common)
+    nodes = _node_values(mesh, start, ends)
+    last = [i - 1 for i in mesh.starts[1:]]
+    gaps = ends[:, last] - start[:, 1:]
+    nx = statement.nx
+    result = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
+    if not statement.matrices:
+        return result | {"e": ca.MX(0, mesh.intervals + 1)}
+    if not mesh.eliminated:
+        return result | {"e": nodes[nx:, :]}
+    e, matrix_cost = matrices_along(statement, mesh, result["x"], fine, common, variables.parameters)
+    return result | {"e": e, "cost": cost + matrix_cost}
+
+
+def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
+    ends, fine, costs = [], [], []
+    first_segment = first_interval = 0
+    for length in sorted(set(mesh.segments), reverse=True):
+        count = mesh.segments.count(length)
+        function = advance if length == 1 else advance.mapaccum("segment", length)
+        function = function.map(count) if count > 1 else function
+        span = slice(first_interval, first_interval + count * length)
+        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in common))
+        for collected, value in zip((ends, fine, costs), outputs, strict=True):
+            collected.append(value)
+        first_segment, first_interval = first_segment + count, span.stop
+    return ca.horzcat(*ends), ca.horzcat(*fine), ca.horzcat(*costs)
+
+
+def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
+    """Values at all nodes: variables where segments start and at the end, computed ones between."""
+    if len(mesh.segments) == mesh.intervals:
+        return start
+    columns = []
+    for j, (i, k) in enumerate(zip(mesh.starts[:-1], mesh.starts[1:], strict=True)):
+        columns += [start[:, j], ends[:, i : k - 1]]
+    return ca.horzcat(*columns, start[:, -1])
+
+
+def matrices_along(
+    statement: Statement,
+    mesh: Mesh,
+    x: Any,
+    fine: Any,
+    common: tuple[Any, ...],
+    parameters: Any,
+    e0: Any = None,
+) -> tuple[Any, Any]:
+    """Propagate the matrices along a nominal.
+
+    Args:
+        statement: an uncoupled problem with matrices.
+        mesh: nodes, substeps, covariance step.
+        x: states at the nodes, (nx, N + 1).
+        fine: states at the ends of all substeps, (nx, N substeps).
+        common: common arguments of the interval functions, a column for each interval.
+        parameters: of the statement.
+        e0: half-vectors at the start; None: the statement's.
+
+    Returns:
+        Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
+    """
+    n, m = mesh.intervals, mesh.substeps
+    e0 = statement.boundary(parameters)[2] if e0 is None else e0
+    starts = x[:, :n]
+    if mesh.step == "rk4":
+        ends, cost = _runge_kutta_along(statement, mesh, e0, starts, common)
+        return ca.horzcat(e0, ends), cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
+    before = starts
+    if m > 1:
+        before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
+        before = ca.reshape(before, statement.nx, n * m)
+    ends_of = substep_columns(common, m, n)
+    matrices = [
+        step_matrix(statement, i, mesh.step).map(n * m)(before, fine, *ends_of) for i in range(len(statement.matrices))
+    ]
+    ends, halves = propagate_interval(statement, m).mapaccum("propagate", n)(e0, *matrices)
+    e = ca.horzcat(e0, ends)
+    if not statement.running_uses_matrices:
+        return e, ca.DM.zeros(1, n)
+    return e, simpson_interval(statement, m).map(n)(starts, e[:, :n], fine, halves, *common)
+
+
+def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
+    """The common arguments for each substep, a column each."""
+    if m == 1:
+        return common
+    start, end, s, ds, duration, parameters = common
+
+    def interleave(columns: list[Any]) -> Any:
+        return ca.reshape(ca.vertcat(*columns), columns[0].shape[0], n * m)
+
+    at = [start + (j / m) * (end - start) for j in range(m + 1)]
+    return (
+        interleave(at[:m]),
+        interleave(at[1:]),
+        interleave([s + (j / m) * ds for j in range(m)]),
+        interleave([ds / m] * m),
+        interleave([duration] * m),
+        interleave([parameters] * m),
+    )
+
+
+def _runge_kutta_along(
+    statement: Statement, mesh: Mesh, e0: Any, starts: Any, common: tuple[Any, ...]
+) -> tuple[Any, Any]:
+    """The rk4 covariance step in sequence, restarted at the nominal of each node."""
+    interval = joint_interval(statement, mesh.substeps)
+    symbolic: Any = statement.symbolic
+    x, e = symbolic.sym("x", statement.nx), symbolic.sym("e", statement.ne)
+    rest = interval_symbols(statement, symbolic)
+    end, _, cost = interval(ca.vertcat(x, e), *rest)
+    step = ca.Function("matrix_step", [e, x, *rest], [end[statement.nx :], cost])
+    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *common))
+
+
+def _constraints(
+    statement: Statement, mesh: Mesh, scales: Scales, variables: _Variables, nodes: dict[str, Any]
+) -> tuple[Rows, ...]:
+    """All constraint rows; those that depend on eliminated matrices (dense rows) come last."""
+    rows = [_gap_rows("gap_x", nodes["gap_x"], scales.x, statement.state_names)]
+    if not mesh.eliminated and statement.matrices:
+        rows.append(_gap_rows("gap_e", nodes["gap_e"], scales.e, statement.matrix_names))
+    rows += _interior_bounds(statement, mesh, scales, nodes["x"])
+    u = variables.u
+    at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1]) if statement.nu else u
+    n = mesh.intervals + 1
+    if not statement.nu:
+        at_nodes = ca.MX(0, n)
+    time = variables.duration * ca.DM(mesh.nodes).T
+    arguments = (nodes["x"], at_nodes, nodes["e"], time)
+    places: Mapping[str, tuple[Conditions, list[int]]] = {
+        "path": (statement.path, list(range(n))),
+        "start": (statement.start, [0]),
+        "end": (statement.end, [n - 1]),
+    }
+    for kind, (conditions, columns) in places.items():
+        if conditions.size:
+            k = len(columns)
+            value = conditions.function.map(k)(
+                *(v[:, columns] for v in arguments),
+                ca.repmat(variables.duration, 1, k),
+                repeat(variables.parameters, k),
+            )
+            rows.append(
+                Rows(
+                    kind=kind,
+                    expression=ca.vec(value),
+                    lower=np.tile(conditions.lower, k),
+                    upper=np.tile(conditions.upper, k),
+                    names=conditions.names,
+                    scale=np.ones(k * conditions.size),
+                    dense=conditions.uses_matrices and mesh.eliminated,
+                )
+            )
+    if mesh.eliminated and statement.matrices:
+        rows += _final_matrices(statement, scales, nodes["e"][:, -1])
+    return tuple(sorted(rows, key=lambda entry: entry.dense))
+
+
+def _gap_rows(kind: str, gaps: Any, scale: Array, names: tuple[str, ...]) -> Rows:
+    """Continuity at the ends of the segments."""
+    count = gaps.shape[1]
+    return Rows(
+        kind=kind,
+        expression=ca.vec(gaps / ca.repmat(ca.DM(scale), 1, count)),
+        lower=np.zeros(scale.size * count),
+        upper=np.zeros(scale.size * count),
+        names=tuple(f"continuity of {name}" for name in names),
+        scale=np.tile(scale, count),
+    )
+
+
+def _interior_bounds(statement: Statement, mesh: Mesh, scales: Scales, x: Any) -> list[Rows]:
+    """Bounds on states at the nodes inside the segments, where they are not variables."""
+    lower, upper = statement.state_bounds
+    bounded = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    inside = sorted(set(range(mesh.intervals + 1)) - set(mesh.starts))
+    if not bounded.size or not inside:
+        return []
+    scale = scales.x[bounded]
+    value = x[bounded.tolist(), inside] / ca.repmat(ca.DM(scale), 1, len(inside))
+    return [
+        Rows(
+            kind="state_bounds",
+            expression=ca.vec(value),
+            lower=np.tile(lower[bounded] / scale, len(inside)),
+            upper=np.tile(upper[bounded] / scale, len(inside)),
+            names=tuple(f"bounds of {statement.state_names[i]}" for i in bounded),
+            scale=np.tile(scale, len(inside)),
+        )
+    ]
+
+
+def _final_matrices(statement: Statement, scales: Scales, last: Any) -> list[Rows]:
+    """Terminal conditions on entries of eliminated matrices; their targets are set for each solve."""
+    known = np.flatnonzero(~np.isnan(statement.boundary_values(statement.values)[3]))
+    if not known.size:
+        return []
+    scale = scales.e[known]
+    return [
+        Rows(
+            kind="final_matrices",
+            expression=last[known.tolist()] / ca.DM(scale),
+            lower=np.zeros(known.size),
+            upper=np.zeros(known.size),
+            names=tuple(f"final value of {statement.matrix_names[i]}" for i in known),
+            scale=scale,
+            dense=True,
+        )
+    ]
+
+
+def _split_jacobian(variables: _Variables, rows: tuple[Rows, ...], g: Any) -> ca.Function | None:
+    """Jacobian of g where it has dense rows: those by their own adjoint sweeps, the rest with its sparsity."""
+    dense = [entry.expression for entry in rows if entry.dense]
+    if not dense:
+        return None
+    sparse = ca.vertcat(*(entry.expression for entry in rows if not entry.dense))
+    blocks = [ca.jacobian(sparse, variables.w), ca.jacobian(ca.vertcat(*dense), variables.w)]
+    return ca.Function("nlp_jac_g", [variables.w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])

@@ -1,0 +1,434 @@
+"""A solution: plain data at the nodes, indexed by the user's symbols and names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import CovocpError, ProblemError, describe
+from covocp.extremal import Extremal, Outcome
+from covocp.hamiltonian import Costates, discrete_costates, fine_trajectory
+from covocp.integrators import hermite
+from covocp.matrices import Array, is_semidefinite, smallest_eigenvalue, unpack, unpack_costate
+from covocp.mesh import Mesh
+from covocp.optimality import Optimality, assess
+from covocp.statement import Block, Statement, entry_names
+from covocp.trajectory import Multipliers, Trajectory
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Values at some times, indexed like a solution (time first where several times were asked for)."""
+
+    t: Any
+    values: Mapping[str, Array] = field(repr=False)
+    symbols: Mapping[str, Any] = field(repr=False)
+
+    def __getitem__(self, key: Any) -> Array:
+        """The value of a symbol or name."""
+        return self.values[name_of(key, self.symbols, tuple(self.values))]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """An optimal control problem solved (or its last iterate: see `converged`).
+
+    `solution[key]`, with the symbol, its name, or any expression of the problem's symbols, gives the values at the
+    nodes, time first: (K,) for scalars, (K, n) for vectors, (K, n, n) for matrices.
+
+    Attributes:
+        name: of the problem.
+        method: that found it.
+        converged: whether the method's own test was met.
+        message: how the method ended.
+        cost_terms: terminal and running cost.
+        mesh: nodes, controls, covariance step.
+        trajectory: x, u, e at the nodes, terminal time [s].
+        parameters: stacked values of known parameters and means of unknowns.
+        multipliers: of the constraints.
+        costates: p and the costates of the half-vectors at the nodes.
+        rates: of x and e stacked, at the nodes, (K, nx + ne).
+        filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
+        mesh_error: relative change of the cost by halving the integration steps (estimated with the costates).
+        violations: of constraints, by name.
+        stats: iterations, times, what the method counts.
+        blocks: where each symbol lies.
+        augmented: names of the rows of the estimation covariance.
+        statement: the problem solved; None for a solution read from a file.
+    """
+
+    name: str
+    method: str
+    converged: bool
+    message: str
+    cost_terms: Mapping[str, float]
+    mesh: Mesh
+    trajectory: Trajectory
+    parameters: Array
+    multipliers: Multipliers
+    costates: Costates
+    rates: Array
+    filter_gain: Array | None
+    mesh_error: float
+    violations: Mapping[str, float]
+    stats: Mapping[str, Any]
+    blocks: tuple[Block, ...]
+    augmented: tuple[str, ...]
+    statement: Statement | None = field(default=None, repr=False)
+    stored_optimality: Optimality | None = field(default=None, repr=False)
+
+    @staticmethod
+    def of(outcome: Outcome, method: str) -> Solution:
+        """The solution of an outcome, with its costates and the estimate of its mesh error."""
+        extremal = outcome.extremal
+        st, trajectory = extremal.statement, extremal.trajectory
+        costates, _, _ = discrete_costates(extremal)
+        _, jumps, fine_cost = fine_trajectory(extremal, 2 * extremal.mesh.substeps)
+        cost = sum(outcome.cost_terms.values())
+        after = np.hstack([costates.state, costates.matrices])[1:]
+        change = float(np.sum(after * jumps)) + float(fine_cost.sum()) - outcome.cost_terms["running"]
+        values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
+        rates = np.vstack([np.asarray(values[0].full()), np.asarray(values[1].full())]).T
+        for array in (trajectory.x, trajectory.u, trajectory.e, costates.state, costates.matrices, rates):
+            array.setflags(write=False)
+        return Solution(
+            name=st.name,
+            method=method,
+            converged=outcome.converged,
+            message=outcome.message,
+            cost_terms=dict(outcome.cost_terms),
+            mesh=extremal.mesh,
+            trajectory=trajectory,
+            parameters=extremal.parameters,
+            multipliers=extremal.multipliers,
+            costates=costates,
+            rates=rates,
+            filter_gain=_filter_gain(extremal),
+            mesh_error=abs(change) / max(abs(cost), np.finfo(float).tiny) if change else 0.0,
+            violations=dict(outcome.violations),
+            stats=dict(outcome.stats),
+            blocks=st.blocks,
+            augmented=st.augmented,
+            statement=st,
+        )
+
+    @property
+    def cost(self) -> float:
+        """The cost, sum of its terms."""
+        return float(sum(self.cost_terms.values()))
+
+    @property
+    def status(self) -> str:
+        """How the run ended, in words."""
+        return self.message if self.converged else f"NOT CONVERGED: {self.message}"
+
+    @property
+    def duration(self) -> float:
+        """Terminal time [s]."""
+        return self.trajectory.duration
+
+    @property
+    def t(self) -> Array:
+        """Times of the nodes [s], shape (K,)."""
+        return np.asarray(self.mesh.nodes * self.duration)
+
+    @property
+    def gains(self) -> Mapping[str, Array]:
+        """Gains at the nodes: "K", the filter's, (K, n, m) over the augmented state."""
+        return {} if self.filter_gain is None else {"K": self.filter_gain}
+
+    @property
+    def symbols(self) -> Mapping[str, Any]:
+        """The user's symbols by name; empty for a solution read from a file."""
+        return self.statement.symbols if self.statement is not None else {}
+
+    @property
+    def extremal(self) -> Extremal:
+        """Trajectory and multipliers with the statement, for the functions of `hamiltonian`.
+
+        Raises:
+            CovocpError: where the solution was read from a file without its problem.
+        """
+        if self.statement is None:
+            raise CovocpError(
+                "This solution was read from a file and knows no problem: use load(path, problem=...) for this."
+            )
+        return Extremal(
+            statement=self.statement,
+            mesh=self.mesh,
+            trajectory=self.trajectory,
+            parameters=self.parameters,
+            multipliers=self.multipliers,
+        )
+
+    @cached_property
+    def optimality(self) -> Optimality:
+        """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
+        if self.stored_optimality is not None:
+            return self.stored_optimality
+        return assess(self.extremal, self.costates, self.mesh_error, self.smallest_eigenvalue)
+
+    @cached_property
+    def smallest_eigenvalue(self) -> float:
+        """Smallest eigenvalue of the covariances at all nodes; inf without covariances."""
+        return min((smallest_eigenvalue(self._matrix(b)) for b in self._covariances()), default=np.inf)
+
+    @cached_property
+    def semidefinite(self) -> bool:
+        """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
+        return all(is_semidefinite(self._matrix(b)) for b in self._covariances())
+
+    def _covariances(self) -> list[Block]:
+        return [b for b in self.blocks if b.kind == "matrix" and b.covariance]
+
+    def _matrix(self, block: Block) -> Array:
+        return unpack(self.trajectory.e[:, block.span], block.size)
+
+    def block(self, name: str) -> Block:
+        """Where a name lies."""
+        return next(b for b in self.blocks if b.name == name)
+
+    @cached_property
+    def values(self) -> Mapping[str, Array]:
+        """Values of all symbols at the nodes by name."""
+        return self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
+
+    @property
+    def controls(self) -> Array:
+        """Controls at all K nodes; a constant control holds its last value at the last node."""
+        u = self.trajectory.u
+        return u if u.shape[0] == self.mesh.nodes.size else np.vstack([u, u[-1:]])
+
+    def _assemble(self, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
+        """Values by name at some times; x (K, nx), u (K, nu), e (K, ne)."""
+        sources = {"state": x, "control": u}
+        result: dict[str, Array] = {"time": t, "duration": np.full(t.shape, self.duration)}
+        for b in self.blocks:
+            if b.kind == "matrix":
+                result[b.name] = unpack(e[:, b.span], b.size)
+                continue
+            values = sources[b.kind][:, b.span] if b.kind in sources else np.tile(self.parameters[b.span], (t.size, 1))
+            result[b.name] = values[:, 0] if b.size == 1 else values
+        return result
+
+    def __getitem__(self, key: Any) -> Array:
+        """Values at the nodes of a symbol, a name, or an expression of the problem's symbols.
+
+        Raises:
+            ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
+        """
+        found = name_of(key, self.symbols, tuple(self.values), missing_ok=isinstance(key, ca.MX))
+        if found:
+            return self.values[found]
+        extremal = self.extremal
+        try:
+            function = extremal.statement.expression(key)
+        except RuntimeError as error:
+            raise unknown_name(key, tuple(self.values)) from error
+        count = self.mesh.nodes.size
+        value = np.asarray(function.map(count)(*extremal.columns()).full())
+        rows, columns = key.shape
+        shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
+        return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
+
+    def at(self, t: Any) -> Sample:
+        """Values at other times than the nodes.
+
+        States and matrices by cubic Hermite polynomials (a matrix linearly where that would not be positive
+        semidefinite but its neighbours are), controls as they were transcribed.
+
+        Args:
+            t: a time or an array of times [s], within [0, duration].
+
+        Returns:
+            What `[symbol or name]` gives the values of.
+
+        Raises:
+            ValueError: where a time lies outside.
+        """
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and (times.min() < -1e-9 * self.duration or times.max() > (1 + 1e-9) * self.duration):
+            raise ValueError(f"times must lie in [0, {self.duration:g}] s; received [{times.min():g}, {times.max():g}]")
+        nodes = self.t
+        k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
+        h = (nodes[k + 1] - nodes[k])[:, None]
+        c = (times[:, None] - nodes[k][:, None]) / h
+        z = np.hstack([self.trajectory.x, self.trajectory.e])
+        smooth = hermite(z[k], z[k + 1], h * self.rates[k], h * self.rates[k + 1], c)
+        straight = z[k] + c * (z[k + 1] - z[k])
+        nx = self.trajectory.x.shape[1]
+        e = smooth[:, nx:]
+        for b in self._covariances():
+            for i, half in enumerate(e[:, b.span]):
+                if not is_semidefinite(unpack(half, b.size)):
+                    e[i, b.span] = straight[i, nx:][b.span]
+        u = self.controls
+        controls = u[k] if self.mesh.control == "constant" else u[k] + c * (u[k + 1] - u[k])
+        values = self._assemble(times, smooth[:, :nx], controls, e)
+        if np.ndim(t) == 0:
+            values = {name: value[0] for name, value in values.items()}
+        return Sample(t=t, values=values, symbols=self.symbols)
+
+    def costate(self, symbol: Any) -> Array:
+        """Costate of a state, (K,) or (K, n), or of a matrix, the symmetric P of (K, n, n).
+
+        Raises:
+            ProblemError: where the symbol is neither.
+        """
+        name = name_of(symbol, self.symbols, tuple(self.values))
+        b = next((b for b in self.blocks if b.name == name), None)
+        if b is None or b.kind not in ("state", "matrix"):
+            names = ", ".join(q.name for q in self.blocks if q.kind in ("state", "matrix"))
+            raise ProblemError(
+                describe(
+                    f"'{name}' has no costate.",
+                    expected=f"a state or a matrix: {names}",
+                    received=name,
+                    remedy="ask for one of them",
+                )
+            )
+        if b.kind == "matrix":
+            return unpack_costate(self.costates.matrices[:, b.span], b.size)
+        values = self.costates.state[:, b.span]
+        return np.asarray(values[:, 0] if b.size == 1 else values)
+
+    def covariance(self, a: Any, b: Any = None) -> Array:
+        """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).
+
+        Args:
+            a: a state or an unknown, symbol or name.
+            b: another one; None: a itself.
+
+        Raises:
+            ProblemError: where there is no estimation covariance, or the symbol is not in it.
+        """
+        block = next((q for q in self.blocks if q.kind == "matrix" and q.estimation), None)
+        if block is None:
+            raise ProblemError(
+                describe(
+                    "The problem has no estimation covariance.",
+                    expected="a problem with estimation_covariance()",
+                    received=self.name,
+                    remedy="index the matrices of the problem by their names",
+                )
+            )
+        full = self._matrix(block)
+        rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
+        return np.asarray(full[:, rows, columns])
+
+    def deviation(self, symbol: Any) -> Array:
+        """Standard deviation of a state or an unknown, (K,) or (K, n), in its unit."""
+        variances = np.diagonal(self.covariance(symbol), axis1=1, axis2=2)
+        values = np.sqrt(np.maximum(variances, 0.0))
+        return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
+
+    def _augmented_span(self, key: Any) -> slice:
+        offset = 0
+        candidates = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
+        name = name_of(key, self.symbols, tuple(q.name for q in candidates))
+        for q in candidates:
+            if q.name == name:
+                return slice(offset, offset + q.size)
+            offset += q.size
+        raise unknown_name(key, tuple(q.name for q in candidates))
+
+    def check_path(self, points: int = 10) -> Mapping[str, float]:
+        """Largest violation of each path constraint and state bound between the nodes.
+
+        Path inequalities are imposed at the nodes only; this looks at `points` equal parts of each interval.
+
+        Args:
+            points: parts of each interval.
+
+        Returns:
+            Violation by name, in the unit of the constraint; only those that are violated.
+        """
+        from covocp.optimality import path_violations
+
+        return path_violations(self.extremal, points)
+
+    def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
+        """Draw the solution; see `covocp.plot.plot_solutions`."""
+        from covocp.plot import plot_solutions
+
+        return plot_solutions([self], *names, **options)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the solution to a .npz or .json file; see `covocp.storage.save`."""
+        from covocp.storage import save
+
+        return save(self, path)
+
+    def to_xarray(self) -> Any:
+        """The solution as an xarray.Dataset; see `covocp.storage.to_xarray`."""
+        from covocp.storage import to_xarray
+
+        return to_xarray(self)
+
+    def __str__(self) -> str:
+        """The summary that print shows."""
+        from covocp.report import summary
+
+        return summary(self)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the entries of the state."""
+        return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
+
+
+def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
+    """Name of a symbol or name; "" where it is not one and that is allowed.
+
+    Raises:
+        ProblemError: where it is unknown.
+    """
+    if isinstance(key, str) and key in names:
+        return key
+    if isinstance(key, ca.MX):
+        for name, symbol in symbols.items():
+            if key.is_symbolic() and ca.is_equal(key, symbol) and name in names and key.shape == symbol.shape:
+                return name
+    label = getattr(key, "labels", None)
+    if label is not None and "E" in names:
+        return "E"
+    if missing_ok:
+        return ""
+    raise unknown_name(key, names)
+
+
+def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
+    """The error for something that is not in the solution."""
+    return ProblemError(
+        describe(
+            f"'{key}' is not in this solution.",
+            expected="a symbol or name of " + ", ".join(names),
+            received=str(key),
+            remedy="check the spelling, or use the symbols of the problem that was solved",
+        )
+    )
+
+
+def _filter_gain(extremal: Extremal) -> Array | None:
+    """Kalman gain K = E M' U^-1 at the nodes [specification, section 1]."""
+    st = extremal.statement
+    block = next((b for b in st.matrices if b.estimation), None)
+    if block is None or st.measurement is None:
+        return None
+    x, u, _, t, duration, p = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    _, jacobian, density = st.measurement.map(count)(x, u, t, duration, p)
+    size, m = block.size, density.shape[0]
+    M = np.asarray(jacobian.full()).reshape(m, count, size).transpose(1, 0, 2)
+    U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
+    E = unpack(extremal.trajectory.e[:, block.span], size)
+    return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))

@@ -1,0 +1,127 @@
+"""Guesses for a solver: the problem's own, another solution on this mesh, given values, random starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from covocp.errors import ProblemError, describe
+from covocp.extremal import Guess
+from covocp.guess import first_guess, quadrature_weights
+from covocp.matrices import Array, pack
+from covocp.mesh import Mesh
+from covocp.solution import Solution
+from covocp.statement import Statement
+from covocp.trajectory import Multipliers, Trajectory
+
+
+def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Guess:
+    """A guess on a mesh from what the user gave.
+
+    Raises:
+        ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess.
+    """
+    if guess is None:
+        return Guess(trajectory=first_guess(statement, mesh, parameters))
+    if isinstance(guess, Trajectory):
+        return Guess(trajectory=guess)
+    if isinstance(guess, Solution):
+        return _from_solution(statement, mesh, parameters, guess)
+    if isinstance(guess, Mapping):
+        guesses = dict(statement.guesses)
+        for key, value in guess.items():
+            names = [n for n, s in statement.symbols.items() if key is s or (isinstance(key, str) and key == n)]
+            if not names or names[0] not in guesses:
+                raise ProblemError(
+                    describe(
+                        f"The guess names '{key}', which cannot be guessed.",
+                        expected="states, controls or matrices: " + ", ".join(guesses),
+                        received=str(key),
+                        remedy="correct the name",
+                    )
+                )
+            guesses[names[0]] = value
+        return Guess(trajectory=first_guess(replace(statement, guesses=guesses), mesh, parameters))
+    raise ProblemError(
+        describe(
+            "The guess is of an unknown kind.",
+            expected="None, 'multistart', a Solution, or a dict of name to guess",
+            received=repr(guess)[:100],
+            remedy="correct guess=",
+        )
+    )
+
+
+def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, starts: int, seed: int) -> Iterator[Guess]:
+    """The problem's own start, then random ones."""
+    yield Guess(trajectory=first_guess(statement, mesh, parameters))
+    for child in np.random.SeedSequence(seed).spawn(starts):
+        yield Guess(trajectory=first_guess(statement, mesh, parameters, np.random.default_rng(child)))
+
+
+def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
+    """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
+    duration = solution.duration if statement.duration.free else statement.duration.guess
+    own = solution.mesh
+    same = own.nodes.shape == mesh.nodes.shape and np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
+    sample = solution.at(mesh.nodes * solution.duration)
+    at_controls = sample
+    if mesh.control == "constant":
+        at_controls = solution.at(0.5 * (mesh.nodes[:-1] + mesh.nodes[1:]) * solution.duration)
+    plain = first_guess(statement, mesh, parameters)
+    x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
+    matched = True
+    for block in (*statement.states, *statement.controls, *statement.matrices):
+        other = next((b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None)
+        if other is None:
+            matched = False
+        elif block.kind == "state":
+            x[:, block.span] = sample[block.name].reshape(-1, block.size)
+        elif block.kind == "control":
+            u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+        else:
+            e[:, block.span] = pack(sample[block.name])
+    if same and matched and solution.trajectory.u.shape == u.shape:
+        u = solution.trajectory.u.copy()
+    trajectory = Trajectory(x=x, u=u, e=e, duration=duration)
+    if not matched or not solution.converged or solution.multipliers.path.shape[1] != statement.path.size:
+        return Guess(trajectory=trajectory, warm=True)
+    costates = _resample(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    return Guess(
+        trajectory=trajectory,
+        multipliers=_multipliers(solution.multipliers, own, mesh, statement),
+        costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
+        warm=True,
+    )
+
+
+def _resample(values: Array, old: Array, new: Array) -> Array:
+    """Columns interpolated linearly from old nodes to new ones."""
+    if old.shape == new.shape and np.array_equal(old, new):
+        return values
+    return np.stack([np.interp(new, old, column) for column in values.T], axis=1).reshape(new.size, values.shape[1])
+
+
+def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh, statement: Statement) -> Multipliers:
+    """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
+    if old == new or (old.nodes.shape == new.nodes.shape and np.array_equal(old.nodes, new.nodes) and old.control == new.control):
+        return multipliers
+    before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
+
+    def at_nodes(values: Array) -> Array:
+        return _resample(values / before, old.nodes, new.nodes) * after
+
+    controls = multipliers.controls
+    own = controls / quadrature_weights(old)[:, None]
+    places = [m.nodes if m.control == "linear" else 0.5 * (m.nodes[1:] + m.nodes[:-1]) for m in (old, new)]
+    resampled = np.stack([np.interp(places[1], places[0], c) for c in own.T], axis=1) if statement.nu else own[:0]
+    return replace(
+        multipliers,
+        path=at_nodes(multipliers.path),
+        states=at_nodes(multipliers.states),
+        matrices=at_nodes(multipliers.matrices),
+        controls=resampled.reshape(new.control_nodes, statement.nu) * quadrature_weights(new)[:, None],
+    )

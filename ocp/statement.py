@@ -1,0 +1,195 @@
+"""The frozen result of building a problem: CasADi functions with named inputs, dimensions and bounds.
+
+This is what solvers read. The *nominal* (state x, control u) and the *matrices* (all symmetric matrix states, stacked
+half-vectors e) are kept apart: the nominal drives the matrices, and only where `coupled` is true do the matrices drive
+the nominal. Every function takes its arguments in the order
+
+    (state, control, matrices, time, duration, parameters)
+
+and leaves out those that it cannot depend on. `parameters` stacks the known parameters and the means of the unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.matrices import Array, half_indices, half_length
+
+Kind = Literal["state", "control", "matrix", "unknown", "parameter"]
+
+INPUTS = ("state", "control", "matrices", "time", "duration", "parameters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Where one of the user's symbols lies in its stacked vector."""
+
+    name: str
+    kind: Kind
+    size: int
+    offset: int
+    labels: tuple[str, ...] = ()
+    covariance: bool = False
+    estimation: bool = False
+
+    @property
+    def length(self) -> int:
+        """Entries in the stacked vector (of a matrix: of its half-vector)."""
+        return half_length(self.size) if self.kind == "matrix" else self.size
+
+    @property
+    def span(self) -> slice:
+        """The entries in the stacked vector."""
+        return slice(self.offset, self.offset + self.length)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """Inequalities lower <= value(...) <= upper of one kind: along the path, at the start or at the end.
+
+    `function` takes (state, control, matrices, time, duration, parameters); `names` has one entry for each row.
+    """
+
+    function: ca.Function
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    uses_matrices: bool
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Duration:
+    """The terminal time: its guess and bounds [s]; fixed where the bounds are equal."""
+
+    guess: float
+    lower: float
+    upper: float
+
+    @property
+    def free(self) -> bool:
+        """Whether the solver chooses it."""
+        return self.lower < self.upper
+
+
+@dataclass(frozen=True, kw_only=True)
+class Statement:
+    """A vector-matrix optimal control problem, ready for any method.
+
+    Functions (arguments in the order of `INPUTS`):
+        nominal: (state, control, time, duration, parameters) -> rate, running cost. Only where not `coupled`; the
+            running cost is zero here where it depends on the matrices.
+        rates: (all six) -> rate of the state, rate of the stacked half-vectors, running cost.
+        terminal: (state, matrices, duration, parameters) -> terminal cost.
+        boundary: (parameters) -> initial state, final state, initial matrices, final matrices (NaN: free).
+        riccati: for each matrix, (state, control, time, duration, parameters) -> F, Q, W with
+            V = F E + E F' + Q - E W E, or None where the rate has not this form.
+        measurement: (state, control, time, duration, parameters) -> measured values, H = their Jacobian by the
+            augmented state, noise density; None without measurements.
+        expression: a user's expression -> function of the six inputs.
+    """
+
+    name: str
+    blocks: tuple[Block, ...]
+    duration: Duration
+    values: Array
+    nominal: ca.Function | None
+    rates: ca.Function
+    terminal: ca.Function
+    boundary: ca.Function
+    riccati: tuple[ca.Function | None, ...]
+    measurement: ca.Function | None
+    measurement_names: tuple[str, ...]
+    path: Conditions
+    start: Conditions
+    end: Conditions
+    state_bounds: tuple[Array, Array]
+    control_bounds: tuple[Array, Array]
+    matrix_lower: Array
+    guesses: Mapping[str, Any]
+    scales: Mapping[str, Array]
+    augmented: tuple[str, ...]
+    coupled: bool
+    symbolic: type
+    autonomous: bool
+    running_uses_matrices: bool
+    symbols: Mapping[str, Any] = field(repr=False)
+    expression: Callable[[Any], ca.Function] = field(repr=False)
+
+    def of_kind(self, kind: Kind) -> tuple[Block, ...]:
+        """The blocks of one kind, in the order of their declaration."""
+        return tuple(block for block in self.blocks if block.kind == kind)
+
+    @cached_property
+    def states(self) -> tuple[Block, ...]:
+        """Blocks of the nominal state."""
+        return self.of_kind("state")
+
+    @cached_property
+    def controls(self) -> tuple[Block, ...]:
+        """Blocks of the control."""
+        return self.of_kind("control")
+
+    @cached_property
+    def matrices(self) -> tuple[Block, ...]:
+        """Blocks of the matrix states."""
+        return self.of_kind("matrix")
+
+    @cached_property
+    def nx(self) -> int:
+        """Entries of the nominal state."""
+        return sum(block.length for block in self.states)
+
+    @cached_property
+    def nu(self) -> int:
+        """Entries of the control."""
+        return sum(block.length for block in self.controls)
+
+    @cached_property
+    def ne(self) -> int:
+        """Entries of all half-vectors together."""
+        return sum(block.length for block in self.matrices)
+
+    @property
+    def np(self) -> int:
+        """Entries of the parameters (known, then means of the unknowns)."""
+        return int(self.values.size)
+
+    def boundary_values(self, parameters: Array) -> tuple[Array, Array, Array, Array]:
+        """Initial state, final state, initial matrices, final matrices for these parameters (NaN: free)."""
+        values = self.boundary(parameters)
+        return tuple(np.asarray(value.full()).ravel() for value in values)  # type: ignore[return-value]
+
+    @cached_property
+    def matrix_names(self) -> tuple[str, ...]:
+        """Names of the entries of the stacked half-vectors, such as 'E[x, b]'."""
+        names: list[str] = []
+        for block in self.matrices:
+            rows, columns = half_indices(block.size)
+            names += [f"{block.name}[{block.labels[i]}, {block.labels[j]}]" for i, j in zip(rows, columns, strict=True)]
+        return tuple(names)
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the entries of the state, such as 'y' or 'y[2]'."""
+        return entry_names(self.states)
+
+    @cached_property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the entries of the control."""
+        return entry_names(self.controls)
+
+
+def entry_names(blocks: tuple[Block, ...]) -> tuple[str, ...]:
+    """Names of the entries of some stacked vectors."""
+    return tuple(block.name if block.size == 1 else f"{block.name}[{i}]" for block in blocks for i in range(block.size))

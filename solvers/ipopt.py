@@ -1,0 +1,270 @@
+"""Multiple shooting with Ipopt, or any other NLP plugin of CasADi."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import ProblemError, describe
+from covocp.extremal import Extremal, Guess, Multipliers, Outcome
+from covocp.guess import choose_scales, first_guess, stiffness
+from covocp.matrices import Array
+from covocp.mesh import Mesh, Options, choose_mesh, choose_step
+from covocp.progress import Progress
+from covocp.shooting import NLP, transcribe
+from covocp.statement import Statement
+
+HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
+# Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
+# curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
+STRETCH = 10.0
+# Relative length of the step along the gradient by which the curvature of the cost is probed.
+PROBE = 1e-4
+SMALLEST_CURVATURE = 1e-6
+
+MESSAGES = {
+    "Solve_Succeeded": "solved",
+    "Solved_To_Acceptable_Level": "solved to the acceptable level only: the tolerance asked for was not reached",
+    "Infeasible_Problem_Detected": "converged to a point of local infeasibility: the constraints may contradict",
+    "Maximum_Iterations_Exceeded": "stopped at the largest number of iterations: start closer, or allow more",
+    "Restoration_Failed": "the restoration of feasibility failed: the constraints may contradict, or start elsewhere",
+    "User_Requested_Stop": "interrupted by the user",
+    "Diverging_Iterates": "the iterates diverge: the cost may be unbounded below; add bounds",
+    "Search_Direction_Becomes_Too_Small": "no further progress is possible at this accuracy",
+    "Invalid_Number_Detected": "the model became NaN or inf: add bounds that keep it in its domain",
+}
+
+
+def prepare(
+    statement: Statement,
+    options: Options,
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = 1000,
+    hessian: str = "auto",
+    plugin: str = "ipopt",
+    plugin_options: Mapping[str, Any] | None = None,
+    compile: bool = False,
+) -> ShootingSolver:
+    """Transcribe a problem and make its NLP solver.
+
+    Args:
+        statement: the problem.
+        options: mesh and formulation.
+        tolerance: on the scaled optimality conditions.
+        max_iterations: of the NLP solver.
+        hessian: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or "limited-memory".
+        plugin: name of a CasADi NLP plugin, such as "ipopt", "sqpmethod" or "fatrop".
+        plugin_options: passed to CasADi's nlpsol as they are.
+        compile: whether the functions of the NLP are compiled by the C compiler of the machine.
+
+    Returns:
+        The solver; `solve` may be called often.
+
+    Raises:
+        ProblemError: an option is wrong, or the model is not finite where the solver starts.
+    """
+    if hessian not in ("auto", "exact", "limited-memory"):
+        raise ProblemError(
+            describe(
+                "The option 'hessian' has an unknown value.",
+                expected="'auto', 'exact' or 'limited-memory'",
+                received=repr(hessian),
+                remedy="correct hessian=",
+            )
+        )
+    if not ca.has_nlpsol(plugin):
+        raise ProblemError(
+            describe(
+                "The NLP plugin is not there.",
+                expected="a plugin of this CasADi, such as 'ipopt' or 'sqpmethod'",
+                received=repr(plugin),
+                remedy="correct plugin=, or install a CasADi that has it",
+            )
+        )
+    step = choose_step(statement, options)
+    stiff = stiffness(statement, options.nodes(), options.control, statement.values, matrices=step == "rk4")
+    mesh = choose_mesh(statement, options, stiff)
+    limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+    if plugin == "ipopt":
+        settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
+        if limited:
+            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
+    if compile:
+        settings |= {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
+    for key, value in (plugin_options or {}).items():
+        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
+    return ShootingSolver(statement, mesh, plugin, settings, limited)
+
+
+class ShootingSolver:
+    """A transcribed problem with its NLP solver; the NLP is built at the first guess, which gives its scales."""
+
+    def __init__(
+        self, statement: Statement, mesh: Mesh, plugin: str, settings: dict[str, Any], limited: bool
+    ) -> None:
+        """Keep the settings; see `prepare`."""
+        self._statement, self._mesh = statement, mesh
+        self._plugin, self._settings, self._limited = plugin, settings, limited
+        self._monitor: _Monitor | None = None
+        self._nlp: NLP | None = None
+        self._cold: ca.Function | None = None
+        self._warm: ca.Function | None = None
+
+    @property
+    def mesh(self) -> Mesh:
+        """The resolved mesh."""
+        return self._mesh
+
+    def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
+        """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
+        begin = time.perf_counter()
+        nlp, solver = self._build(parameters, guess)
+        bounds = nlp.bounds(parameters)
+        w0 = np.clip(nlp.pack(guess.trajectory), bounds["lbx"], bounds["ubx"])
+        scale = self._cost_scale(solver, w0, parameters)
+        arguments: dict[str, Any] = {"x0": w0, "p": np.append(parameters, scale), **bounds}
+        if guess.multipliers is not None and guess.costates is not None:
+            lam_x, lam_g = nlp.pack_multipliers(guess.multipliers, guess.costates)
+            arguments |= {"lam_x0": lam_x / scale, "lam_g0": lam_g / scale}
+        built = time.perf_counter()
+        if self._monitor is not None:
+            self._monitor.attach(progress, scale, bounds)
+        result = solver(**arguments)
+        stats = solver.stats()
+        w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
+        counts = {
+            "iterations": int(stats.get("iter_count", -1)),
+            "build_seconds": built - begin,
+            "solve_seconds": time.perf_counter() - built,
+            "return_status": str(stats.get("return_status", "")),
+            "hessian": "limited-memory" if self._limited else "exact",
+        }
+        return self._outcome(nlp, w, scale * lam_x, scale * lam_g, parameters, bool(stats["success"]), counts)
+
+    def _outcome(
+        self, nlp: NLP, w: Array, lam_x: Array, lam_g: Array, parameters: Array, success: bool, stats: dict[str, Any]
+    ) -> Outcome:
+        """The iterate as data."""
+        trajectory, values = nlp.unpack(w, parameters)
+        extremal = Extremal(
+            statement=self._statement,
+            mesh=self._mesh,
+            trajectory=trajectory,
+            parameters=parameters,
+            multipliers=nlp.unpack_multipliers(lam_x, lam_g, trajectory, parameters),
+        )
+        status = stats["return_status"]
+        return Outcome(
+            extremal=extremal,
+            cost_terms={"terminal": values["terminal"], "running": values["running"]},
+            converged=success,
+            message=MESSAGES.get(status, status.replace("_", " ").lower() or ("solved" if success else "failed")),
+            violations=nlp.violations(values["g"], parameters),
+            stats=stats,
+        )
+
+    def _build(self, parameters: Array, guess: Guess) -> tuple[NLP, ca.Function]:
+        """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts."""
+        if self._nlp is None or self._cold is None:
+            stretch = STRETCH if self._limited else 1.0
+            scales = choose_scales(self._statement, guess.trajectory, parameters, stretch=stretch)
+            self._nlp = transcribe(self._statement, self._mesh, scales)
+            if self._plugin == "ipopt":
+                self._monitor = _Monitor(self._nlp)
+            self._cold = self._make({})
+        if not guess.warm or self._plugin != "ipopt" or guess.multipliers is None:
+            return self._nlp, self._cold
+        if self._warm is None:
+            shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | ({} if self._limited else {"hess_lag": "nlp_hess_l"})
+            self._warm = self._make(
+                {option: self._cold.get_function(name) for option, name in shared.items()}, warm=True
+            )
+        return self._nlp, self._warm
+
+    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> ca.Function:
+        nlp = self._nlp
+        assert nlp is not None
+        settings = {**self._settings, **functions}
+        if nlp.jacobian is not None and "jac_g" not in settings:
+            settings["jac_g"] = nlp.jacobian
+        if self._monitor is not None:
+            settings["iteration_callback"] = self._monitor
+        if warm:
+            settings["ipopt"] = {
+                **settings["ipopt"],
+                "warm_start_init_point": "yes",
+                "warm_start_bound_push": 1e-8,
+                "warm_start_mult_bound_push": 1e-8,
+                "warm_start_slack_bound_push": 1e-8,
+                "mu_init": 1e-6,
+            }
+        return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+
+    def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Array) -> float:
+        """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
+
+        Never above the size of cost and gradient, so that the tolerance keeps its meaning.
+        """
+        gradient = solver.get_function("nlp_grad_f")
+        p = np.append(parameters, 1.0)
+        value, first = (np.asarray(v.full()).ravel() for v in gradient(w0, p))
+        size = float(np.linalg.norm(first))
+        largest = max(abs(float(value[0])), float(np.abs(first).max(initial=0.0)))
+        if not np.isfinite(largest) or size == 0.0:
+            return 1.0
+        step = PROBE / size
+        second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
+        curvature = abs(float((first - second) @ first)) / (step * size**2)
+        return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+class _Monitor(ca.Callback):
+    """Ipopt's iteration callback: reports progress, and stops when the user asks."""
+
+    def __init__(self, nlp: NLP) -> None:
+        ca.Callback.__init__(self)
+        self._sizes = {"x": nlp.w.shape[0], "g": nlp.g.shape[0], "p": nlp.p.shape[0], "f": 1}
+        self._progress: Progress | None = None
+        self._scale, self._iteration = 1.0, 0
+        self._bounds: dict[str, Array] = {}
+        self.construct("progress", {})
+
+    def attach(self, progress: Progress, scale: float, bounds: dict[str, Array]) -> None:
+        """Report to this progress from now on."""
+        self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
+
+    def get_n_in(self) -> int:
+        """One for each output of the solver."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """Whether to stop."""
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        """Names of the outputs of the solver."""
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        """The name that nlpsol asks for."""
+        return "ret"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Columns."""
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i).removeprefix("lam_")], 1)
+
+    def eval(self, arg: Any) -> list[int]:
+        """One iteration."""
+        if self._progress is None:
+            return [0]
+        g = np.asarray(arg[ca.nlpsol_out().index("g")].full()).ravel()
+        violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
+        self._progress.update(self._iteration, float(arg[ca.nlpsol_out().index("f")]) * self._scale, float(violation))
+        self._iteration += 1
+        return [int(self._progress.stop)]
