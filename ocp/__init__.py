@@ -13,8 +13,8 @@ from covocp.errors import CovocpWarning as CovocpWarning
 from covocp.errors import ExportError as ExportError
 from covocp.errors import ProblemError as ProblemError
 from covocp.errors import SolveError as SolveError
-from covocp.problem import Problem as Problem
 from covocp.methods import Solver as Solver
 from covocp.methods import methods as methods
 from covocp.methods import solve as solve
+from covocp.problem import Problem as Problem
 from covocp.solution import Solution as Solution

@@ -230,3 +230,102 @@ def shape_error(name: str, what: str, expected: str, received: str) -> ProblemEr
             remedy=f"give the {what} of '{name}' in that shape",
         )
     )
+
+
+def scale_column(name: str, scale: Any, size: int) -> Array | None:
+    """Typical magnitudes, positive; None stays None."""
+    if scale is None:
+        return None
+    values = column(name, "scale", scale, size)
+    if (values <= 0).any():
+        raise ProblemError(
+            describe(
+                f"The scale of '{name}' must be positive.",
+                expected="typical magnitudes > 0",
+                received=str(values),
+                remedy="give magnitudes, or None for automatic scaling",
+            )
+        )
+    return values
+
+
+def check_name(name: Any, declared: list[Any]) -> None:
+    """A name must be a text that no declaration has yet."""
+    if not isinstance(name, str) or not name:
+        raise ProblemError(
+            describe(
+                "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
+            )
+        )
+    if name in ("time", "duration"):
+        raise ProblemError(
+            describe(
+                f"The name '{name}' is taken.",
+                expected="any other name",
+                received=name,
+                remedy=f"use Problem.{name} for that symbol",
+            )
+        )
+    for entry in declared:
+        if entry.name == name:
+            raise ProblemError(
+                describe(
+                    f"The name '{name}' is used twice.",
+                    expected="a unique name for each symbol, measurement and constraint",
+                    received=f"'{name}', declared before at {entry.where}",
+                    remedy="choose another name",
+                )
+            )
+
+
+def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, ...]) -> str:
+    """Name of what was declared, from its symbol or name."""
+    for entry in declared:
+        own = getattr(entry, "symbol", None)
+        if own is None:
+            continue
+        if (
+            symbol is own
+            or symbol is getattr(entry, "matrix", None)
+            or (isinstance(symbol, str) and symbol == entry.name)
+        ):
+            return str(entry.name)
+        if is_symbolic(symbol) and symbol.is_symbolic() and ca.is_equal(symbol, own):
+            return str(entry.name)
+    raise ProblemError(
+        describe(
+            f"{what}() was given something that is not a symbol of this problem.",
+            expected="one of " + ", ".join(entry.name for entry in allowed),
+            received=str(symbol),
+            remedy="pass the symbol that state() or symmetric() returned",
+        )
+    )
+
+
+def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
+    """The value as an expression of the given shape (a scalar zero fits every shape)."""
+    try:
+        expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
+    except (TypeError, ValueError, NotImplementedError) as error:
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is not an expression.",
+                expected="an expression of the symbols of this problem",
+                received=repr(value),
+                remedy="use casadi functions on the symbols (casadi.sin, @, *), not numpy arrays of objects",
+            )
+        ) from error
+    if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():
+        return ca.MX.zeros(*shape)
+    if expression.shape != shape:
+        raise shape_error(name, what, f"shape {shape}", f"shape {expression.shape}")
+    if expression.is_constant() and not np.isfinite(ca.evalf(expression).full()).all():
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is NaN or inf.",
+                expected="a finite expression",
+                received=str(expression),
+                remedy=f"correct the {what}",
+            )
+        )
+    return expression

@@ -37,9 +37,7 @@ class Curvature:
         size = max(float(np.sqrt(np.mean(u**2))), DISPLACEMENT)
         moved = u + sign * size * self.direction / np.abs(self.direction).max()
         t = extremal.trajectory
-        return Trajectory(
-            x=t.x, u=np.clip(moved, *extremal.statement.control_bounds), e=t.e, duration=t.duration
-        )
+        return Trajectory(x=t.x, u=np.clip(moved, *extremal.statement.control_bounds), e=t.e, duration=t.duration)
 
 
 def smallest_curvature(extremal: Extremal) -> Curvature | None:
@@ -124,7 +122,9 @@ def _functions(extremal: Extremal) -> tuple[ca.Function, ca.Function]:
     x0, xf, _, ef = st.boundary_values(extremal.parameters)
     fixed_x, fixed_e = np.flatnonzero(~np.isnan(xf)), np.flatnonzero(~np.isnan(ef))
     value += ca.dot(ca.DM(multipliers.final), last_x) + ca.dot(ca.DM(multipliers.final_matrices), last_e)
-    held = [ca.vertcat(ca.MX(0, 1), *(values[int(i)] for i in at)) for values, at in ((last_x, fixed_x), (last_e, fixed_e))]
+    held = [
+        ca.vertcat(ca.MX(0, 1), *(values[int(i)] for i in at)) for values, at in ((last_x, fixed_x), (last_e, fixed_e))
+    ]
     count = mesh.intervals + 1
     columns = u_at_nodes(extremal, ca.reshape(u, st.nu, mesh.control_nodes))
     time = ca.DM(extremal.time).T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -12,6 +13,7 @@ import numpy as np
 from covocp.checks import check_density
 from covocp.declarations import Constraint, Matrix, Place
 from covocp.errors import ProblemError, describe
+from covocp.estimation import augmented_names
 from covocp.matrices import pack_symbolic, unpack_symbolic
 from covocp.riccati import recognise, riccati_rate
 from covocp.statement import INPUTS, Block, Conditions, Duration, Statement
@@ -60,7 +62,9 @@ def freeze(problem: Problem) -> Statement:
         name=problem.name,
         blocks=_blocks(problem),
         duration=_duration(problem),
-        values=np.concatenate([np.zeros(0), *(q.value for q in problem.parameters), *(q.mean for q in problem.unknowns)]),
+        values=np.concatenate(
+            [np.zeros(0), *(q.value for q in problem.parameters), *(q.mean for q in problem.unknowns)]
+        ),
         nominal=nominal,
         rates=stacked.function("rates", [rates, matrix_rates, running]),
         terminal=stacked.function("terminal", [terminal], without=("control", "time")),
@@ -76,7 +80,7 @@ def freeze(problem: Problem) -> Statement:
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
         guesses={q.name: q.guess for q in (*problem.states, *problem.controls, *problem.matrices)},
         scales={q.name: q.scale for q in (*problem.states, *problem.controls) if q.scale is not None},
-        augmented=problem.augmented_names(),
+        augmented=augmented_names((*problem.states, *problem.unknowns)),
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
@@ -142,7 +146,9 @@ def _check_symbols(problem: Problem) -> None:
     """Every symbol in every expression belongs to this problem; the cost depends on something."""
     known = _symbols(problem)
     hashes = {symbol.__hash__() for symbol in known.values()}
-    expressions: list[tuple[str, Any]] = [(f"the rate of '{name}'", entry.rate) for name, entry in problem.rates.items()]
+    expressions: list[tuple[str, Any]] = [
+        (f"the rate of '{name}'", entry.rate) for name, entry in problem.rates.items()
+    ]
     expressions += [(f"the noise of '{k}'", v.noise) for k, v in problem.rates.items() if v.noise is not None]
     expressions += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
     expressions += [(f"'{c.name}'", c.expression) for c in problem.constraints]
@@ -203,7 +209,7 @@ def _stack(problem: Problem) -> Stacked:
     groups[3:] = [[*problem.parameters, *problem.unknowns]]
     for group, vector in zip(groups, (x, u, e, p), strict=True):
         offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
-        arguments += [vector[i:j] for i, j in zip(offsets[:-1], offsets[1:], strict=True)]
+        arguments += [vector[i:j] for i, j in pairwise(offsets)]
     arguments += [t, duration] if problem.free_duration is not None else [t]
 
     def substitute(*expressions: Any) -> list[Any]:
@@ -336,8 +342,13 @@ def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
     outputs = [
         ca.vertcat(ca.MX(0, 1), *(entry.initial for entry in problem.states)),
         ca.vertcat(ca.MX(0, 1), *(entry.final for entry in problem.states)),
-        ca.vertcat(ca.MX(0, 1), *(m.initial if m.initial is not None else f for m, f in zip(problem.matrices, free, strict=True))),
-        ca.vertcat(ca.MX(0, 1), *(m.final if m.final is not None else f for m, f in zip(problem.matrices, free, strict=True))),
+        ca.vertcat(
+            ca.MX(0, 1),
+            *(m.initial if m.initial is not None else f for m, f in zip(problem.matrices, free, strict=True)),
+        ),
+        ca.vertcat(
+            ca.MX(0, 1), *(m.final if m.final is not None else f for m, f in zip(problem.matrices, free, strict=True))
+        ),
     ]
     p = ca.MX.sym("parameters", sum(symbol.shape[0] for symbol in own))
     offsets = np.cumsum([0, *(symbol.shape[0] for symbol in own)]).tolist()
@@ -352,7 +363,7 @@ def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
                     remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
                 )
             )
-    arguments = [p[i:j] for i, j in zip(offsets[:-1], offsets[1:], strict=True)]
+    arguments = [p[i:j] for i, j in pairwise(offsets)]
     values = ca.Function("boundary", own, outputs).call(arguments, True, False)
     names = ["initial_state", "final_state", "initial_matrices", "final_matrices"]
     return ca.Function("boundary", [p], values, ["parameters"], names)

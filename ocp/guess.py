@@ -13,7 +13,8 @@ from covocp.errors import ProblemError, describe
 from covocp.integrators import full_interval, nominal_interval
 from covocp.matrices import Array, half_indices, unpack
 from covocp.mesh import Mesh
-from covocp.shooting import Scales, common_columns, matrices_along
+from covocp.nlp import Scales
+from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Block, Statement
 from covocp.trajectory import Trajectory
 
@@ -123,9 +124,7 @@ def first_guess(
         x = np.zeros((mesh.intervals + 1, statement.nx))
     for block in guessed:
         x[:, block.span] = evaluate_guess(block, statement.guesses[block.name], mesh.nodes)
-    return Trajectory(
-        x=x, u=u, e=simulate_matrices(statement, mesh, x, u, e0, duration, parameters), duration=duration
-    )
+    return Trajectory(x=x, u=u, e=simulate_matrices(statement, mesh, x, u, e0, duration, parameters), duration=duration)
 
 
 def _starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
@@ -216,9 +215,7 @@ def simulate_states(
     return np.asarray(start + mesh.nodes[:, None] * (final - start))
 
 
-def steer(
-    statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
-) -> Array:
+def steer(statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array) -> Array:
     """Add the control of least energy that brings the nominal to its final values; the bend follows its sign.
 
     The bend 1 - s breaks symmetries; where the terminal conditions prefer a direction, it must not oppose them. Steps
@@ -365,5 +362,3 @@ def _matrix_scales(statement: Statement, e: Array) -> Array:
         diagonal = np.where(diagonal > 0, diagonal, 1.0)
         scales[block.span] = np.sqrt(diagonal[rows] * diagonal[columns])
     return scales
-
-

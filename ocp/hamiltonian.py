@@ -20,7 +20,8 @@ import numpy as np
 from covocp.extremal import Extremal
 from covocp.integrators import Step, full_interval, interval_symbols
 from covocp.matrices import Array
-from covocp.shooting import common_columns, terminal_slopes
+from covocp.nlp import terminal_slopes
+from covocp.shooting import common_columns
 from covocp.statement import Statement
 
 
@@ -59,7 +60,8 @@ def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list
     outputs = values if isinstance(values, (tuple, list)) else [values]
     result = []
     for value in outputs:
-        numbers = np.asarray(value.full()).reshape(value.shape[0], count, -1).transpose(1, 0, 2)
+        shape = (value.shape[0], count, value.shape[1] // count)
+        numbers = np.asarray(value.full()).reshape(shape).transpose(1, 0, 2)
         result.append(numbers[:, :, 0] if numbers.shape[2] == 1 else numbers)
     return result
 
@@ -91,8 +93,10 @@ def impulses(extremal: Extremal) -> Array:
         symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
         weights = symbolic.sym("mu", statement.path.size)
         value = ca.dot(weights, statement.path.function(*symbols))
-        slope = ca.gradient(value, ca.vertcat(symbols[0], symbols[2])) if statement.symbolic is ca.SX else ca.vertcat(
-            ca.gradient(value, symbols[0]), ca.gradient(value, symbols[2])
+        slope = (
+            ca.gradient(value, ca.vertcat(symbols[0], symbols[2]))
+            if statement.symbolic is ca.SX
+            else ca.vertcat(ca.gradient(value, symbols[0]), ca.gradient(value, symbols[2]))
         )
         function = ca.Function("jumps", [*symbols, weights], [ca.densify(slope)])
         count = extremal.mesh.intervals + 1

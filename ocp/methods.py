@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.checks import column
 from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
-from covocp.extremal import Guess, Outcome, Prepared
+from covocp.extremal import Outcome, Prepared
 from covocp.matrices import Array
 from covocp.mesh import Options
 from covocp.problem import Problem
@@ -175,7 +175,9 @@ class Solver:
         for sign in ESCAPES:
             start = make_guess(self.statement, self._prepared.mesh, values, curvature.displaced(outcome.extremal, sign))
             candidates.append(self._prepared.solve(values, start, reporter))
-        better = [c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())]
+        better = [
+            c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())
+        ]
         if not better:
             return outcome
         warnings.warn(

@@ -87,7 +87,9 @@ def assess(extremal: Extremal, costates: Costates, mesh_error: float, smallest_e
     _, slopes, by_duration = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
-    residual = (slopes + _path_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
+    residual = (
+        (slopes + _path_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
+    )
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     control_slope, control_error = 0.0, 0.0
     if st.nu and free is not None:
@@ -261,5 +263,3 @@ def path_violations(extremal: Extremal, points: int) -> Mapping[str, float]:
         excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=-np.inf)
         result |= {name: float(v) for name, v in zip(names, excess, strict=True) if v > 0}
     return result
-
-

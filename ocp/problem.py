@@ -8,17 +8,21 @@ import casadi as ca
 import numpy as np
 
 from covocp.checks import (
+    as_expression,
     as_number,
     caller,
     check_bounds,
     check_density,
     check_inside,
+    check_name,
     check_positive,
     check_size,
     column,
     data_column,
     density_matrix,
+    find_name,
     is_symbolic,
+    scale_column,
     shape_error,
     symmetric_data,
 )
@@ -36,54 +40,10 @@ from covocp.declarations import (
     Unknown,
 )
 from covocp.errors import ProblemError, describe
+from covocp.estimation import EstimationCovariance, augmented_names
 from covocp.freeze import freeze
 from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
 from covocp.statement import Statement
-
-
-class EstimationCovariance:
-    """The covariance of the estimation error of the augmented state (states, then unknowns), as the user sees it.
-
-    `E[a, b]` is the block between two symbols, names, or expressions of them (to first order, by their Jacobians);
-    `E.matrix` is the whole symmetric matrix.
-    """
-
-    def __init__(self, problem: Problem, declaration: Matrix) -> None:
-        """Keep the problem (to look symbols up) and the declared matrix."""
-        self._problem = problem
-        self._declaration = declaration
-
-    @property
-    def matrix(self) -> ca.MX:
-        """The full symmetric matrix, shape (n, n), n entries of the augmented state."""
-        return self._declaration.matrix
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the rows."""
-        return self._declaration.labels
-
-    def __getitem__(self, key: Any) -> ca.MX:
-        """Covariance between two symbols or names, shape (size of a, size of b).
-
-        Raises:
-            ProblemError: where a name is unknown, or an expression contains no augmented state.
-        """
-        if not isinstance(key, tuple) or len(key) != 2:
-            raise ProblemError(
-                describe(
-                    "A covariance is indexed by two symbols.",
-                    expected="E[a, b] with a, b of " + ", ".join(self._problem.augmented_names()),
-                    received=f"E[{key}]",
-                    remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
-                )
-            )
-        left, right = (self._problem.augmented_jacobian(entry) for entry in key)
-        if isinstance(left, slice) and isinstance(right, slice):
-            return self.matrix[left, right]
-        size = self.matrix.shape[0]
-        rows, columns = (ca.MX.eye(size)[j, :] if isinstance(j, slice) else j for j in (left, right))
-        return rows @ self.matrix @ columns.T
 
 
 class Problem:
@@ -179,7 +139,7 @@ class Problem:
             lower=low,
             upper=high,
             guess=guess,
-            scale=self._scale(name, scale, size),
+            scale=scale_column(name, scale, size),
             variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
         )
         self.states.append(declaration)
@@ -260,7 +220,7 @@ class Problem:
             lower=low,
             upper=high,
             guess=guess,
-            scale=self._scale(name, scale, size),
+            scale=scale_column(name, scale, size),
         )
         self.controls.append(declaration)
         return declaration.symbol
@@ -306,7 +266,8 @@ class Problem:
         Raises:
             ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
         """
-        labels = self.augmented_names()
+        entries = (*self.states, *self.unknowns)
+        labels = augmented_names(entries)
         if not labels:
             raise ProblemError(
                 describe(
@@ -318,8 +279,8 @@ class Problem:
             )
         size = self._declare("E", len(labels))
         if initial is None:
-            initial = ca.diagcat(*(entry.variance for entry in (*self.states, *self.unknowns)))
-        return EstimationCovariance(self, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels))
+            initial = ca.diagcat(*(entry.variance for entry in entries))
+        return EstimationCovariance(entries, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels))
 
     def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
@@ -333,10 +294,10 @@ class Problem:
         Raises:
             ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
         """
-        name = self._name_of(symbol, "dynamics")
+        name = find_name(symbol, "dynamics", self._declared, (*self.states, *self.matrices))
         for state in self.states:
             if state.name == name:
-                value = self._expression(name, "rate", rate, (state.size, 1))
+                value = as_expression(name, "rate", rate, (state.size, 1))
                 density = None if noise is None else density_matrix(name, "noise density", noise, state.size)
                 break
         else:
@@ -350,7 +311,7 @@ class Problem:
                         remedy="unknowns are constant, and the estimation covariance has its rate already",
                     )
                 )
-            value, density = pack_symbolic(self._expression(name, "rate", rate, (matrix.size, matrix.size))), None
+            value, density = pack_symbolic(as_expression(name, "rate", rate, (matrix.size, matrix.size))), None
         if name in self.rates:
             raise ProblemError(
                 describe(
@@ -403,8 +364,8 @@ class Problem:
                 )
             )
         self.cost = (
-            self._expression("minimize", "running cost", running, (1, 1)),
-            self._expression("minimize", "terminal cost", terminal, (1, 1)),
+            as_expression("minimize", "running cost", running, (1, 1)),
+            as_expression("minimize", "terminal cost", terminal, (1, 1)),
         )
         self._frozen = None
 
@@ -468,95 +429,16 @@ class Problem:
             self._frozen = freeze(self)
         return self._frozen
 
-    def augmented_names(self) -> tuple[str, ...]:
-        """Names of the rows of the estimation covariance: states, then unknowns."""
-        entries = (*self.states, *self.unknowns)
-        return tuple(
-            entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
-        )
-
-    def augmented_jacobian(self, key: Any) -> Any:
-        """Rows of the augmented state that a symbol or name stands for (a slice), or the Jacobian of an expression.
-
-        Raises:
-            ProblemError: where the name is unknown, or the expression contains no augmented state.
-        """
-        offset = 0
-        jacobians = []
-        for entry in (*self.states, *self.unknowns):
-            span = slice(offset, offset + entry.size)
-            if key is entry.symbol or (isinstance(key, str) and key == entry.name):
-                return span
-            if is_symbolic(key):
-                if key.is_symbolic() and ca.is_equal(key, entry.symbol):
-                    return span
-                jacobians.append(ca.jacobian(key, entry.symbol))
-            offset = span.stop
-        jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
-        if jacobian.nnz() == 0:
-            raise ProblemError(
-                describe(
-                    f"'{key}' is not part of the estimated state.",
-                    expected="a symbol or name of " + ", ".join(self.augmented_names()),
-                    received=str(key),
-                    remedy="index the covariance with states and unknowns of this problem",
-                )
-            )
-        return ca.densify(jacobian)
-
     def _declare(self, name: str, size: Any) -> int:
         """Check that the name is new and the size sensible; forget the frozen statement."""
-        if not isinstance(name, str) or not name:
-            raise ProblemError(
-                describe(
-                    "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
-                )
-            )
-        taken: list[Any] = [
-            *self.states,
-            *self.unknowns,
-            *self.parameters,
-            *self.controls,
-            *self.matrices,
-            *self.measurements,
-            *self.constraints,
-        ]
-        for entry in taken:
-            if entry.name == name:
-                raise ProblemError(
-                    describe(
-                        f"The name '{name}' is used twice.",
-                        expected="a unique name for each symbol, measurement and constraint",
-                        received=f"'{name}', declared before at {entry.where}",
-                        remedy="choose another name",
-                    )
-                )
-        if name in ("time", "duration"):
-            raise ProblemError(
-                describe(
-                    f"The name '{name}' is taken.",
-                    expected="any other name",
-                    received=name,
-                    remedy=f"use Problem.{name} for that symbol",
-                )
-            )
+        check_name(name, self._declared)
         self._frozen = None
         return check_size(name, size)
 
-    def _scale(self, name: str, scale: Any, size: int) -> Any:
-        if scale is None:
-            return None
-        values = column(name, "scale", scale, size)
-        if (values <= 0).any():
-            raise ProblemError(
-                describe(
-                    f"The scale of '{name}' must be positive.",
-                    expected="typical magnitudes > 0",
-                    received=str(values),
-                    remedy="give magnitudes, or None for automatic scaling",
-                )
-            )
-        return values
+    @property
+    def _declared(self) -> list[Any]:
+        symbols: list[Any] = [*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices]
+        return [*symbols, *self.measurements, *self.constraints]
 
     def _add_matrix(
         self,
@@ -592,54 +474,3 @@ class Problem:
         )
         self.matrices.append(declaration)
         return declaration
-
-    def _name_of(self, symbol: Any, what: str) -> str:
-        """Name of a declared state or matrix, from its symbol or name."""
-        if isinstance(symbol, str):
-            candidates: list[Any] = [entry for entry in (*self.states, *self.matrices) if entry.name == symbol]
-        else:
-            candidates = [entry for entry in self.states if symbol is entry.symbol]
-            candidates += [entry for entry in self.matrices if symbol is entry.matrix]
-            candidates += [
-                entry
-                for entry in (*self.states, *self.unknowns, *self.controls, *self.parameters)
-                if is_symbolic(symbol) and symbol.is_symbolic() and ca.is_equal(symbol, entry.symbol)
-            ]
-        if not candidates:
-            raise ProblemError(
-                describe(
-                    f"{what}() was given something that is not a state of this problem.",
-                    expected="one of " + ", ".join(entry.name for entry in (*self.states, *self.matrices)),
-                    received=str(symbol),
-                    remedy="pass the symbol that state() or symmetric() returned",
-                )
-            )
-        return str(candidates[0].name)
-
-    def _expression(self, name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
-        """The value as an expression of the given shape (a scalar zero fits every shape)."""
-        try:
-            expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
-        except (TypeError, ValueError, NotImplementedError) as error:
-            raise ProblemError(
-                describe(
-                    f"The {what} of '{name}' is not an expression.",
-                    expected="an expression of the symbols of this problem",
-                    received=repr(value),
-                    remedy="use casadi functions on the symbols (casadi.sin, @, *), not numpy arrays of objects",
-                )
-            ) from error
-        if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():
-            return ca.MX.zeros(*shape)
-        if expression.shape != shape:
-            raise shape_error(name, what, f"shape {shape}", f"shape {expression.shape}")
-        if expression.is_constant() and not np.isfinite(ca.evalf(expression).full()).all():
-            raise ProblemError(
-                describe(
-                    f"The {what} of '{name}' is NaN or inf.",
-                    expected="a finite expression",
-                    received=str(expression),
-                    remedy=f"correct the {what}",
-                )
-            )
-        return expression

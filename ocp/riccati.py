@@ -56,9 +56,7 @@ def recognise(rate: Any, half: Any, size: int) -> tuple[Any, Any, Any] | None:
         quadratic = (ca.substitute(slope, half, probe) - linear)[position[i, i], :]
         for j in range(size):
             information[i, j] = -quadratic[position[max(i, j), min(i, j)]] / 2
-    form = pack_symbolic(
-        riccati_rate(unpack_symbolic(half, size), drift, unpack_symbolic(constant, size), information)
-    )
+    form = pack_symbolic(riccati_rate(unpack_symbolic(half, size), drift, unpack_symbolic(constant, size), information))
     return (drift, unpack_symbolic(constant, size), information) if _same(rate, form, half) else None
 
 

@@ -75,7 +75,9 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     matched = True
     for block in (*statement.states, *statement.controls, *statement.matrices):
-        other = next((b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None)
+        other = next(
+            (b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None
+        )
         if other is None:
             matched = False
         elif block.kind == "state":
@@ -107,7 +109,9 @@ def _resample(values: Array, old: Array, new: Array) -> Array:
 
 def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh, statement: Statement) -> Multipliers:
     """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
-    if old == new or (old.nodes.shape == new.nodes.shape and np.array_equal(old.nodes, new.nodes) and old.control == new.control):
+    if old == new or (
+        old.nodes.shape == new.nodes.shape and np.array_equal(old.nodes, new.nodes) and old.control == new.control
+    ):
         return multipliers
     before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
 

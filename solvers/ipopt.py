@@ -10,12 +10,13 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ProblemError, describe
-from covocp.extremal import Extremal, Guess, Multipliers, Outcome
-from covocp.guess import choose_scales, first_guess, stiffness
+from covocp.extremal import Extremal, Guess, Outcome
+from covocp.guess import choose_scales, stiffness
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
+from covocp.nlp import NLP
 from covocp.progress import Progress
-from covocp.shooting import NLP, transcribe
+from covocp.shooting import transcribe
 from covocp.statement import Statement
 
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
@@ -105,9 +106,7 @@ def prepare(
 class ShootingSolver:
     """A transcribed problem with its NLP solver; the NLP is built at the first guess, which gives its scales."""
 
-    def __init__(
-        self, statement: Statement, mesh: Mesh, plugin: str, settings: dict[str, Any], limited: bool
-    ) -> None:
+    def __init__(self, statement: Statement, mesh: Mesh, plugin: str, settings: dict[str, Any], limited: bool) -> None:
         """Keep the settings; see `prepare`."""
         self._statement, self._mesh = statement, mesh
         self._plugin, self._settings, self._limited = plugin, settings, limited
@@ -181,7 +180,9 @@ class ShootingSolver:
         if not guess.warm or self._plugin != "ipopt" or guess.multipliers is None:
             return self._nlp, self._cold
         if self._warm is None:
-            shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | ({} if self._limited else {"hess_lag": "nlp_hess_l"})
+            shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
+                {} if self._limited else {"hess_lag": "nlp_hess_l"}
+            )
             self._warm = self._make(
                 {option: self._cold.get_function(name) for option, name in shared.items()}, warm=True
             )
