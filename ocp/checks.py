@@ -76,7 +76,7 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
     return numbers
 
 
-def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> ca.MX:
+def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> Any:
     """Like `column`, but an expression in the parameters of the problem is accepted too."""
     if is_symbolic(value):
         if value.shape == (size, 1):
@@ -87,7 +87,7 @@ def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = Fals
     return ca.MX(ca.DM(column(name, what, value, size, nan=nan)))
 
 
-def density_matrix(name: str, what: str, value: Any, size: int) -> ca.MX:
+def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
     """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix.
 
     Constant data are checked here: finite, symmetric, positive semidefinite.
@@ -112,7 +112,7 @@ def density_matrix(name: str, what: str, value: Any, size: int) -> ca.MX:
     return ca.MX(ca.DM(numbers))
 
 
-def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite: bool) -> ca.MX:
+def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite: bool) -> Any:
     """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
     matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
     if not is_symbolic(value):

@@ -99,7 +99,7 @@ def lanczos(apply: Callable[[Array], Array], size: int) -> tuple[Array, Array]:
             break
         vector = image / beside[j]
     values, vectors = eigh_tridiagonal(diagonal[:steps], beside[: steps - 1])
-    return values, basis[:steps].T @ vectors
+    return np.asarray(values, dtype=float), np.asarray(basis[:steps].T @ vectors, dtype=float)
 
 
 def _null_space(rows: Array) -> Array:

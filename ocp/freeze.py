@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -78,9 +78,9 @@ def freeze(problem: Problem) -> Statement:
         state_bounds=_bounds(problem.states),
         control_bounds=_bounds(problem.controls),
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
-        guesses={q.name: q.guess for q in (*problem.states, *problem.controls, *problem.matrices)},
-        scales={q.name: q.scale for q in (*problem.states, *problem.controls) if q.scale is not None},
-        augmented=augmented_names((*problem.states, *problem.unknowns)),
+        guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
+        scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
+        augmented=augmented_names(_all(problem.states, problem.unknowns)),
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
@@ -90,9 +90,14 @@ def freeze(problem: Problem) -> Statement:
     )
 
 
+def _all(*groups: Iterable[Any]) -> list[Any]:
+    """Declarations of several kinds in one list."""
+    return [entry for group in groups for entry in group]
+
+
 def _check_complete(problem: Problem) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
-    for entry in (*problem.states, *(m for m in problem.matrices if not m.estimation)):
+    for entry in _all(problem.states, (m for m in problem.matrices if not m.estimation)):
         if entry.name not in problem.rates:
             raise ProblemError(
                 describe(
@@ -128,7 +133,7 @@ def _check_complete(problem: Problem) -> None:
                     remedy="declare a control by control()",
                 )
             )
-    entry_augmented = sum(s.size for s in (*problem.states, *problem.unknowns))
+    entry_augmented = sum(s.size for s in _all(problem.states, problem.unknowns))
     covariance = next((m for m in problem.matrices if m.estimation), None)
     if covariance is not None and covariance.size != entry_augmented:
         raise ProblemError(
@@ -164,7 +169,7 @@ def _check_symbols(problem: Problem) -> None:
                         remedy=f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
                     )
                 )
-    constants = {q.symbol.__hash__() for q in (*problem.parameters, *problem.unknowns)}
+    constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
     if all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
         raise ProblemError(
@@ -179,7 +184,7 @@ def _check_symbols(problem: Problem) -> None:
 
 def _symbols(problem: Problem) -> dict[str, Any]:
     """All symbols by name."""
-    entries = (*problem.states, *problem.controls, *problem.matrices, *problem.unknowns, *problem.parameters)
+    entries = _all(problem.states, problem.controls, problem.matrices, problem.unknowns, problem.parameters)
     symbols = {entry.name: entry.symbol for entry in entries} | {"time": problem.time}
     if problem.free_duration is not None:
         symbols["duration"] = problem.duration
@@ -233,7 +238,8 @@ def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, 
     """Rates of all half-vectors, their Riccati forms where they have one, and the measurement."""
     e = stacked.inputs[2]
     measurement = _measurement(problem, stacked)
-    values, forms = [], []
+    values: list[Any] = []
+    forms: list[Any] = []
     offset = 0
     for entry in problem.matrices:
         half = e[offset : offset + entry.symbol.shape[0]]
@@ -270,7 +276,7 @@ def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | N
 
 def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: Any) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
-    size = sum(entry.size for entry in (*problem.states, *problem.unknowns))
+    size = sum(entry.size for entry in _all(problem.states, problem.unknowns))
     constants = ca.DM.zeros(size - rates.shape[0], 1)
     drift = _augmented_jacobian(stacked, ca.vertcat(rates, constants))
     noises = []
@@ -337,7 +343,7 @@ def _duration(problem: Problem) -> Duration:
 
 def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
     """Initial and final values of states and matrices as functions of the parameters."""
-    own = [entry.symbol for entry in (*problem.parameters, *problem.unknowns)]
+    own = [entry.symbol for entry in _all(problem.parameters, problem.unknowns)]
     free = [ca.MX(ca.DM.nan(entry.symbol.shape)) for entry in problem.matrices]
     outputs = [
         ca.vertcat(ca.MX(0, 1), *(entry.initial for entry in problem.states)),

@@ -178,7 +178,7 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
                     describe(
                         f"The {what} '{name}' is {value} at the initial guess.",
                         expected="finite values where the solver starts",
-                        received=f"state = {_short(x)}, control = {_short(u)}, parameters = {_short(parameters)}, t = 0",
+                        received=f"state {_short(x)}, control {_short(u)}, parameters {_short(parameters)}, t = 0",
                         remedy="give another guess or initial value, or bounds that keep the model in its domain",
                     )
                 )
@@ -209,7 +209,7 @@ def simulate_states(
     values = np.vstack([start, ends[: statement.nx].T])
     if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:
         lower, upper = statement.state_bounds
-        return np.clip(values, lower, upper)
+        return np.asarray(np.clip(values, lower, upper))
     final = statement.boundary_values(parameters)[1]
     final = np.where(np.isnan(final), start, final)
     return np.asarray(start + mesh.nodes[:, None] * (final - start))
@@ -225,7 +225,7 @@ def steer(statement: Statement, mesh: Mesh, start: Array, u: Array, duration: fl
     fixed = np.flatnonzero(~np.isnan(final))
     if not fixed.size or not np.isfinite(start).all():
         return u
-    miss = _miss_function(statement, mesh, fixed)
+    miss = _miss_function(statement, mesh, fixed.tolist())
     weights = np.tile(quadrature_weights(mesh)[:, None], (1, statement.nu)).ravel()
     scale = np.maximum(np.maximum(np.abs(final[fixed]), np.abs(start[fixed])), 1e-3)
 
@@ -258,16 +258,16 @@ def quadrature_weights(mesh: Mesh) -> Array:
     return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
 
 
-def _miss_function(statement: Statement, mesh: Mesh, fixed: Array) -> ca.Function:
+def _miss_function(statement: Statement, mesh: Mesh, fixed: list[int]) -> ca.Function:
     """(start, controls, T, parameters) -> final values of the fixed components, their Jacobian by the controls."""
     u = ca.MX.sym("u", statement.nu * mesh.control_nodes)
     x0, duration, p = ca.MX.sym("x0", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     matrix = ca.reshape(u, statement.nu, mesh.control_nodes)
     run = nominal_interval(statement, mesh.substeps).mapaccum("simulate", mesh.intervals)
-    last = run(x0, *common_columns(mesh, matrix, duration, p))[0][:, -1][fixed.tolist()]
+    last = run(x0, *common_columns(mesh, matrix, duration, p))[0][:, -1][fixed]
     inner = ca.Function("miss", [x0, u, duration, p], [last, ca.jacobian(last, u)])
     controls = ca.MX.sym("controls", statement.nu, mesh.control_nodes)
-    return ca.Function("miss", [x0, controls, duration, p], inner(x0, ca.vec(controls), duration, p))
+    return ca.Function("miss", [x0, controls, duration, p], list(inner(x0, ca.vec(controls), duration, p)))
 
 
 def simulate_matrices(
@@ -298,7 +298,7 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
 
 
 def stiffness(statement: Statement, nodes: Array, control: str, parameters: Array, *, matrices: bool) -> float:
-    """Largest h times spectral radius of what Runge-Kutta integrates, at the start: f_x, and 2(F - E W) if `matrices`."""
+    """Largest h times spectral radius of what Runge-Kutta steps, at the start: f_x, with `matrices` 2 (F - E W)."""
     u = controls_guess(statement, nodes, control, None)[:1].ravel() if statement.nu else np.zeros(0)
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
     x, e = _starts(statement, mesh, parameters)
@@ -336,7 +336,7 @@ def _jacobian(statement: Statement, select: Callable[[list[Any], list[Any]], Any
 
 
 def choose_scales(statement: Statement, trajectory: Trajectory, parameters: Array, *, stretch: float = 1.0) -> Scales:
-    """Magnitudes (those of the states times `stretch`) from the given scales, the bounds, the boundary values and the guess."""
+    """Magnitudes from the given scales, bounds, boundary values and guess; those of the states times `stretch`."""
     x0, xf, _, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     candidates = [np.abs(trajectory.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]

@@ -1,7 +1,7 @@
 """Costates and the Hamiltonian along a trajectory.
 
-H = L + p' f + tr(P V)  [specification, section 2]. The matrices are half-vectors here, so tr(P V) becomes the product of
-the half-vector of V with its costate (P_ii on the diagonal, 2 P_ij off it); `matrices.unpack_costate` gives P.
+H = L + p' f + tr(P V)  [Schmidt 1971, section 3.2]. The matrices are half-vectors here, so tr(P V) becomes the product
+of the half-vector of V with its costate (P_ii on the diagonal, 2 P_ij off it); `matrices.unpack_costate` gives P.
 
 Costates come in two independent ways: by the adjoint of the discrete steps, with the multipliers of the NLP as terminal
 values (`discrete_costates`), and by integrating the continuous adjoint equations p' = -H_x, P' = -H_E backward

@@ -2,7 +2,7 @@
 
 A symmetric n x n matrix is stored as its n(n+1)/2 entries (i, j), i >= j, column by column: (0,0), (1,0), ..., (n-1,0),
 (1,1), ... The costate of an off-diagonal entry of the half-vector is twice the entry of the matrix costate P, because
-the entry stands for two entries of the matrix (Schmidt 1971, section 2.4; specification, section 2).
+the entry stands for two entries of the matrix (Schmidt 1971, section 2.4).
 """
 
 from __future__ import annotations

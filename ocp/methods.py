@@ -196,7 +196,8 @@ class Solver:
             lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
             raise SolveError(
-                f"'{self.statement.name or 'the problem'}' was not solved by {self.method}: {outcome.message}.{violated}"
+                f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
+                f"{violated}"
                 "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
                 solution=solution,
                 violations=outcome.violations,

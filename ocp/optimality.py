@@ -8,6 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.curvature import smallest_curvature
 from covocp.extremal import Extremal
@@ -153,7 +154,7 @@ def _path_slopes(extremal: Extremal) -> Array:
     return result
 
 
-def _control_error(extremal: Extremal, costates: Costates, free: Array) -> float:
+def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_]) -> float:
     """Relative cost of the piecewise form of the control, from H_u at the middles of the intervals."""
     st, mesh = extremal.statement, extremal.mesh
     values, _, _ = fine_trajectory(extremal, 2 * mesh.substeps)

@@ -266,7 +266,7 @@ class Problem:
         Raises:
             ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
         """
-        entries = (*self.states, *self.unknowns)
+        entries: list[Any] = [*self.states, *self.unknowns]
         labels = augmented_names(entries)
         if not labels:
             raise ProblemError(

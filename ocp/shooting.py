@@ -68,7 +68,7 @@ class _Variables:
         self.w = ca.MX.sym("w", ends[-1])
         x, e, u, duration = (self.w[i:j] for i, j in pairwise(ends))
         self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
-        self.e = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
+        self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
         self.u = ca.reshape(u, nu, nodes) * ca.repmat(ca.DM(scales.u), 1, nodes)
         self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
         self.p = ca.MX.sym("p", statement.np + 1)
@@ -117,7 +117,9 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables) -> dict[str,
 
 def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
-    ends, fine, costs = [], [], []
+    ends: list[Any] = []
+    fine: list[Any] = []
+    costs: list[Any] = []
     first_segment = first_interval = 0
     for length in sorted(set(mesh.segments), reverse=True):
         count = mesh.segments.count(length)

@@ -419,7 +419,7 @@ def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
 
 
 def _filter_gain(extremal: Extremal) -> Array | None:
-    """Kalman gain K = E M' U^-1 at the nodes [specification, section 1]."""
+    """Kalman gain K = E M' U^-1 at the nodes [Schmidt 2.5-3]."""
     st = extremal.statement
     block = next((b for b in st.matrices if b.estimation), None)
     if block is None or st.measurement is None:
