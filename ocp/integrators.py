@@ -28,7 +28,9 @@ from covocp.statement import Statement
 
 Step = Literal["gauss", "strang", "rk4"]
 
+# Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
+COMPILED_SOLVER = "qr"
 
 GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
 GAUSS_MATRIX = ((0.25, 0.25 - np.sqrt(3.0) / 6.0), (0.25 + np.sqrt(3.0) / 6.0, 0.25))
@@ -108,7 +110,7 @@ def _runge_kutta(rate: Callable[[Any, Any], Any], start: Any, h: Any, substeps: 
     return stacked[:-1, :], stacked[-1, -1]
 
 
-def step_matrix(statement: Statement, index: int, step: Step) -> ca.Function:
+def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
     """The step matrix D of one matrix state over one substep, given the nominal at both ends of it.
 
     Returns:
@@ -119,13 +121,8 @@ def step_matrix(statement: Statement, index: int, step: Step) -> ca.Function:
     xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
     common = interval_symbols(statement, ca.MX)
     compose = _gauss_matrix if step == "gauss" else _strang_matrix
-    value = compose(inner(xa, xb, *common), size)
+    value = compose(inner(xa, xb, *common), size, solver)
     return ca.Function("step_matrix", [xa, xb, *common], [value])
-
-
-def _solve(matrix: ca.MX, right: Any) -> ca.MX:
-    """matrix^-1 right by LAPACK; faster than elimination written out in SX even for 2 x 2 covariances."""
-    return ca.solve(matrix, right, LINEAR_SOLVER)
 
 
 def _gauss_system(statement: Statement, index: int) -> ca.Function:
@@ -150,10 +147,10 @@ def _gauss_system(statement: Statement, index: int) -> ca.Function:
     return ca.Function("gauss_system", [xa, xb, *common], [left, ca.vertcat(first, second), h])
 
 
-def _gauss_matrix(system: Any, size: int) -> Any:
+def _gauss_matrix(system: Any, size: int, solver: str) -> Any:
     """D = I + h/2 (K1 + K2)."""
     left, right, h = system
-    stages = _solve(left, right)
+    stages = ca.solve(left, right, solver)
     return ca.DM.eye(2 * size) + h / 2 * (stages[: 2 * size, :] + stages[2 * size :, :])
 
 
@@ -183,13 +180,13 @@ def _strang_parts(statement: Statement, index: int) -> ca.Function:
     return ca.Function("strang_parts", [xa, xb, *common], [ca.densify(entry) for entry in outputs])
 
 
-def _strang_matrix(parts: Any, size: int) -> Any:
+def _strang_matrix(parts: Any, size: int, solver: str) -> Any:
     """Product of the elementary step matrices; update with W: [I W; 0 I], noise Q: [I 0; Q I]."""
     transition, noise_a, information_a, noise_b, information_b = parts
     unit, zero = ca.DM.eye(size), ca.DM(size, size)
     update_a, update_b = (ca.blockcat([[unit, w], [zero, unit]]) for w in (information_a, information_b))
     diffuse_a, diffuse_b = (ca.blockcat([[unit, zero], [q, unit]]) for q in (noise_a, noise_b))
-    move = ca.blockcat([[_solve(transition.T, unit), zero], [zero, transition]])
+    move = ca.blockcat([[ca.solve(transition.T, unit, solver), zero], [zero, transition]])
     return update_b @ diffuse_b @ move @ diffuse_a @ update_a
 
 
@@ -217,15 +214,15 @@ def hermite(start: Any, end: Any, slope_start: Any, slope_end: Any, c: Any) -> A
     )
 
 
-def apply_step(matrix: Any, half: Any, size: int) -> Any:
+def apply_step(matrix: Any, half: Any, size: int, solver: str = LINEAR_SOLVER) -> Any:
     """Half-vector of E+ = (D21 + D22 E)(D11 + D12 E)^-1, symmetrised."""
     covariance = unpack_symbolic(half, size)
     below = matrix[size:, :size] + matrix[size:, size:] @ covariance
     above = matrix[:size, :size] + matrix[:size, size:] @ covariance
-    return pack_symbolic(_solve(above.T, below.T))
+    return pack_symbolic(ca.solve(above.T, below.T, solver))
 
 
-def propagate_interval(statement: Statement, substeps: int) -> ca.Function:
+def propagate_interval(statement: Statement, substeps: int, solver: str = LINEAR_SOLVER) -> ca.Function:
     """All half-vectors over one control interval, given the step matrices of its substeps.
 
     Returns:
@@ -239,7 +236,7 @@ def propagate_interval(statement: Statement, substeps: int) -> ca.Function:
     for j in range(substeps):
         for i, block in enumerate(statement.matrices):
             width = 2 * block.size
-            halves[i] = apply_step(steps[i][:, j * width : (j + 1) * width], halves[i], block.size)
+            halves[i] = apply_step(steps[i][:, j * width : (j + 1) * width], halves[i], block.size, solver)
         columns.append(ca.vertcat(*halves))
     return ca.Function("propagate_interval", [e, *steps], [columns[-1], ca.horzcat(*columns)])
 
@@ -268,7 +265,7 @@ def simpson_interval(statement: Statement, substeps: int) -> ca.Function:
     return ca.Function("simpson_interval", [x, e, states, halves, *common], [duration * ds * total])
 
 
-def full_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
+def full_interval(statement: Statement, substeps: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 
     Returns:
@@ -283,7 +280,7 @@ def full_interval(statement: Statement, substeps: int, step: Step) -> ca.Functio
     ua, ub, s, ds, duration, p = common
     _, states, cost = nominal_interval(statement, substeps)(x, *common)
     starts = ca.horzcat(x, states[:, : substeps - 1])
-    matrices = [step_matrix(statement, i, step) for i in range(len(statement.matrices))]
+    matrices = [step_matrix(statement, i, step, solver) for i in range(len(statement.matrices))]
     columns: list[list[Any]] = [[] for _ in matrices]
     for j in range(substeps):
         c, d = j / substeps, (j + 1) / substeps
@@ -291,7 +288,7 @@ def full_interval(statement: Statement, substeps: int, step: Step) -> ca.Functio
         for i, matrix in enumerate(matrices):
             columns[i].append(matrix(starts[:, j], states[:, j], *ends))
     stacked = [ca.horzcat(*entry) for entry in columns]
-    _, halves = propagate_interval(statement, substeps)(e, *stacked)
+    _, halves = propagate_interval(statement, substeps, solver)(e, *stacked)
     if statement.running_uses_matrices:
         cost = simpson_interval(statement, substeps)(x, e, states, halves, *common)
     fine = ca.vertcat(states, halves)

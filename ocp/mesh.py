@@ -9,7 +9,7 @@ import numpy as np
 
 from covocp.checks import as_number
 from covocp.errors import ProblemError, describe
-from covocp.integrators import Step
+from covocp.integrators import LINEAR_SOLVER, Step
 from covocp.matrices import Array
 from covocp.statement import Statement
 
@@ -76,6 +76,7 @@ class Mesh:
         segments: lengths of the shooting segments, in intervals; they add up to N.
         eliminated: whether the matrices are propagated along the nominal instead of being variables.
         step: covariance step.
+        linear_solver: CasADi's linear solver of the covariance steps.
     """
 
     nodes: Array
@@ -84,6 +85,7 @@ class Mesh:
     segments: tuple[int, ...]
     eliminated: bool
     step: Step
+    linear_solver: str = LINEAR_SOLVER
 
     @property
     def intervals(self) -> int:

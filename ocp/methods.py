@@ -25,7 +25,7 @@ from covocp.statement import Statement
 METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
-COARSE_MESH = 1e-4
+COARSE_MESH = 2e-4
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
 NEGATIVE_CURVATURE = -1e-6

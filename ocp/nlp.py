@@ -148,7 +148,9 @@ class NLP:
         if "state_bounds" in by_kind:
             bounded = np.flatnonzero(np.isfinite(st.state_bounds[0]) | np.isfinite(st.state_bounds[1]))
             inside = sorted(set(range(mesh.intervals + 1)) - set(starts))
-            states[np.ix_(np.array(inside), bounded)] = by_kind["state_bounds"].reshape(len(inside), bounded.size)
+            states[np.ix_(np.array(inside, dtype=np.intp), bounded)] = by_kind["state_bounds"].reshape(
+                len(inside), bounded.size
+            )
         end = by_kind.get("end", zero.end)
         path = by_kind.get("path", zero.path.ravel()).reshape(zero.path.shape)
         costate = by_kind["gap_x"][-st.nx :]
@@ -181,7 +183,7 @@ class NLP:
         values = {
             "gap_x": costates[0][starts[1:]],
             "gap_e": costates[1][starts[1:]],
-            "state_bounds": multipliers.states[np.ix_(np.array(inside), bounded)],
+            "state_bounds": multipliers.states[np.ix_(np.array(inside, dtype=np.intp), bounded)],
             "path": multipliers.path,
             "start": multipliers.start,
             "end": multipliers.end,

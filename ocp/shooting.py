@@ -98,7 +98,7 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables) -> dict[str,
     common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
         start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
-        advance = full_interval(statement, mesh.substeps, mesh.step)
+        advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
     else:
         start, advance = variables.x, nominal_interval(statement, mesh.substeps)
     ends, fine, cost = _segments(mesh, advance, start, common)
@@ -178,9 +178,10 @@ def matrices_along(
         before = ca.reshape(before, statement.nx, n * m)
     ends_of = substep_columns(common, m, n)
     matrices = [
-        step_matrix(statement, i, mesh.step).map(n * m)(before, fine, *ends_of) for i in range(len(statement.matrices))
+        step_matrix(statement, i, mesh.step, mesh.linear_solver).map(n * m)(before, fine, *ends_of)
+        for i in range(len(statement.matrices))
     ]
-    ends, halves = propagate_interval(statement, m).mapaccum("propagate", n)(e0, *matrices)
+    ends, halves = propagate_interval(statement, m, mesh.linear_solver).mapaccum("propagate", n)(e0, *matrices)
     e = ca.horzcat(e0, ends)
     if not statement.running_uses_matrices:
         return e, ca.DM.zeros(1, n)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -12,6 +13,7 @@ import numpy as np
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
 from covocp.guess import choose_scales, stiffness
+from covocp.integrators import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
 from covocp.nlp import NLP
@@ -26,6 +28,8 @@ STRETCH = 10.0
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
+
+JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
 
 MESSAGES = {
     "Solve_Succeeded": "solved",
@@ -97,7 +101,8 @@ def prepare(
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
     if compile:
-        settings |= {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
+        settings |= JIT
+        mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
     for key, value in (plugin_options or {}).items():
         settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
     return ShootingSolver(statement, mesh, plugin, settings, limited)
@@ -111,6 +116,7 @@ class ShootingSolver:
         self._statement, self._mesh = statement, mesh
         self._plugin, self._settings, self._limited = plugin, settings, limited
         self._monitor: _Monitor | None = None
+        self._gradient: _KeptGradient | None = None
         self._nlp: NLP | None = None
         self._cold: ca.Function | None = None
         self._warm: ca.Function | None = None
@@ -192,6 +198,9 @@ class ShootingSolver:
         nlp = self._nlp
         assert nlp is not None
         settings = {**self._settings, **functions}
+        if self._limited and "grad_f" not in settings:
+            self._gradient = self._gradient or _KeptGradient(nlp, jit={k: v for k, v in settings.items() if k in JIT})
+            settings["grad_f"] = self._gradient
         if nlp.jacobian is not None and "jac_g" not in settings:
             settings["jac_g"] = nlp.jacobian
         if self._monitor is not None:
@@ -223,6 +232,52 @@ class ShootingSolver:
         second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+class _KeptGradient(ca.Callback):
+    """The gradient of the cost, with its last value kept.
+
+    With a limited-memory Hessian Ipopt asks for it twice at every iterate, and it is the dearest function by far.
+    """
+
+    def __init__(self, nlp: NLP, jit: dict[str, Any]) -> None:
+        ca.Callback.__init__(self)
+        outputs = [nlp.f, ca.densify(ca.gradient(nlp.f, nlp.w))]
+        self._function = ca.Function("gradient", [nlp.w, nlp.p], outputs, ["x", "p"], ["f", "grad_f_x"], jit)
+        self._at: tuple[bytes, ...] = ()
+        self._value: Any = None
+        self.construct("nlp_grad_f", {})
+
+    def get_n_in(self) -> int:
+        """Variables and parameters."""
+        return 2
+
+    def get_n_out(self) -> int:
+        """Cost and gradient."""
+        return 2
+
+    def get_name_in(self, i: int) -> str:
+        """The names that nlpsol asks for."""
+        return str(self._function.name_in(i))
+
+    def get_name_out(self, i: int) -> str:
+        """The names that nlpsol asks for."""
+        return str(self._function.name_out(i))
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Columns."""
+        return self._function.sparsity_in(i)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """A number and a column."""
+        return self._function.sparsity_out(i)
+
+    def eval(self, arg: Any) -> Any:
+        """Evaluate, unless it is the last point again."""
+        at = tuple(np.asarray(value).tobytes() for value in arg)
+        if at != self._at:
+            self._value, self._at = self._function.call(arg), at
+        return self._value
 
 
 class _Monitor(ca.Callback):
