@@ -13,9 +13,6 @@ from covocp.integrators import LINEAR_SOLVER, Step
 from covocp.matrices import Array
 from covocp.statement import Statement
 
-# Covariances that are not needed along the path are eliminated above this number of half-vector entries (measured by
-# benchmarks/formulations.py: the time of the limited-memory iterations against the exact Hessian's).
-LARGEST_STATES = 1
 ELIMINATED_SEGMENTS = 10
 LARGEST_SUBSTEPS = 64
 # h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
@@ -157,7 +154,10 @@ def choose_step(statement: Statement, options: Options) -> Step:
 
 
 def _choose_eliminated(statement: Statement, options: Options) -> bool:
-    """Whether the matrices are eliminated; the rules of the design's section Speed."""
+    """Whether the matrices are eliminated: always where they can be and no path constraint needs them.
+
+    Eliminated is faster for every problem of benchmarks/formulations.py, down to a single scalar variance.
+    """
     if not statement.matrices:
         return True
     initial = statement.boundary_values(statement.values)[2]
@@ -177,7 +177,7 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         )
     if options.covariances != "auto":
         return options.covariances == "eliminated"
-    return obstacle is None and not statement.path.uses_matrices and statement.ne > LARGEST_STATES
+    return obstacle is None and not statement.path.uses_matrices
 
 
 def _whole(name: str, value: Any) -> None:

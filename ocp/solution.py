@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +18,7 @@ from covocp.hamiltonian import Costates, discrete_costates, fine_trajectory
 from covocp.integrators import hermite
 from covocp.matrices import Array, is_semidefinite, smallest_eigenvalue, unpack, unpack_costate
 from covocp.mesh import Mesh
-from covocp.optimality import Optimality, assess
+from covocp.optimality import Optimality, assess, path_violations
 from covocp.statement import Block, Statement, entry_names
 from covocp.trajectory import Multipliers, Trajectory
 
@@ -352,38 +353,33 @@ class Solution:
         Returns:
             Violation by name, in the unit of the constraint; only those that are violated.
         """
-        from covocp.optimality import path_violations
-
         return path_violations(self.extremal, points)
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.plot_solutions`."""
-        from covocp.plot import plot_solutions
-
-        return plot_solutions([self], *names, **options)
+        return _later("plot").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
 
     def save(self, path: str | Path) -> Path:
         """Write the solution to a .npz or .json file; see `covocp.storage.save`."""
-        from covocp.storage import save
-
-        return save(self, path)
+        return _later("storage").save(self, path)  # type: ignore[no-any-return]
 
     def to_xarray(self) -> Any:
         """The solution as an xarray.Dataset; see `covocp.storage.to_xarray`."""
-        from covocp.storage import to_xarray
-
-        return to_xarray(self)
+        return _later("storage").to_xarray(self)
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        from covocp.report import summary
-
-        return summary(self)
+        return str(_later("report").summary(self))
 
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the entries of the state."""
         return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
+
+
+def _later(module: str) -> Any:
+    """A module that is built on solutions; imported when it is used."""
+    return importlib.import_module(f"covocp.{module}")
 
 
 def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
