@@ -33,10 +33,10 @@ def as_number(name: str, what: str, value: Any) -> Array:
     if isinstance(value, (ca.SX, ca.MX)):
         raise ProblemError(
             describe(
-                f"{what} of '{name}' is a symbol.",
+                f"The {what} of '{name}' is a symbol.",
                 expected="numbers",
                 received=str(value),
-                remedy="give numbers here; use Problem.parameter for numbers that change from solve to solve",
+                remedy="give numbers here" + ("; a bound that varies is a subject_to()" if "bound" in what else ""),
             )
         )
     try:
@@ -44,7 +44,7 @@ def as_number(name: str, what: str, value: Any) -> Array:
     except (TypeError, ValueError) as error:
         raise ProblemError(
             describe(
-                f"{what} of '{name}' is not a number.",
+                f"The {what} of '{name}' is not a number.",
                 expected="a number or an array of numbers",
                 received=repr(value),
                 remedy=f"check the {what} of '{name}'",
@@ -62,12 +62,12 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
     if numbers.size == 1:
         numbers = np.full(size, float(numbers.reshape(())))
     if numbers.size != size or numbers.ndim > 2 or (numbers.ndim == 2 and 1 not in numbers.shape):
-        raise shape_error(name, what, f"a number or {size} numbers", f"shape {numbers.shape}")
+        raise shape_error(name, what, _numbers(size), f"shape {numbers.shape}")
     numbers = numbers.reshape(size)
     if (not nan and np.isnan(numbers).any()) or (not inf and np.isinf(numbers).any()):
         raise ProblemError(
             describe(
-                f"{what} of '{name}' contains NaN or inf.",
+                f"The {what} of '{name}' contains NaN or inf.",
                 expected="finite numbers" + (" (NaN: free)" if nan else ""),
                 received=str(numbers),
                 remedy=f"correct the {what} of '{name}'",
@@ -92,7 +92,7 @@ def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
 
     Constant data are checked here: finite, symmetric, positive semidefinite.
     """
-    expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix"
+    expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix" if size > 1 else "a number"
     if is_symbolic(value):
         if value.shape == (size, size):
             return value
@@ -132,6 +132,7 @@ def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite:
 def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:
     """A numeric density or variance must be finite, symmetric and positive (semi)definite."""
     problem = None
+    scalar = numbers.size == 1
     if not np.isfinite(numbers).all():
         problem = "contains NaN or inf"
     elif not np.allclose(numbers, numbers.T, rtol=1e-9, atol=1e-12 * float(np.abs(numbers).max(initial=0.0))):
@@ -141,15 +142,18 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
         largest = float(np.abs(values).max(initial=0.0))
         if values.size and values[0] < -1e-12 * largest:
             problem = f"is not positive semidefinite (smallest eigenvalue {values[0]:.6g})"
+            problem = "is negative" if scalar else problem
         elif definite and values.size and values[0] <= 1e-14 * largest:
-            problem = f"is singular (smallest eigenvalue {values[0]:.6g})"
+            problem = "is zero" if scalar else f"is singular (smallest eigenvalue {values[0]:.6g})"
     if problem:
-        kind = "positive definite" if definite else "positive semidefinite"
+        number = f"a {'positive' if definite else 'nonnegative'} number"
+        matrix = f"a symmetric positive {'definite' if definite else 'semidefinite'} matrix"
+        text = np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12)
         raise ProblemError(
             describe(
-                f"{what} of '{name}' {problem}.",
-                expected=f"a symmetric {kind} matrix (or a {'positive' if definite else 'nonnegative'} number)",
-                received=np.array2string(numbers, max_line_width=100, threshold=25),
+                f"The {what} of '{name}' {problem}.",
+                expected=number if scalar else matrix,
+                received=f"{float(numbers.item()):g}" if scalar else text,
                 remedy=f"check the {what} given for '{name}'"
                 + (": every measurement needs some noise" if definite else ""),
             )
@@ -188,7 +192,14 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
 def check_size(name: str, size: Any) -> int:
     """The shape of a symbol must be a positive whole number."""
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
-        raise shape_error(name, "shape", "a positive whole number", repr(size))
+        raise ProblemError(
+            describe(
+                f"The shape of '{name}' is not a number of components.",
+                expected="a positive whole number",
+                received=repr(size),
+                remedy="give 1 for a scalar, n for a column of n",
+            )
+        )
     return int(size)
 
 
@@ -218,6 +229,10 @@ def check_times(guess: float, lower: float, upper: float) -> None:
                 remedy="correct the three numbers of Free(guess, lower, upper)",
             )
         )
+
+
+def _numbers(size: int) -> str:
+    return f"a number or {size} numbers" if size > 1 else "a number"
 
 
 def shape_error(name: str, what: str, expected: str, received: str) -> ProblemError:
@@ -305,6 +320,8 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
 def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
     """The value as an expression of the given shape (a scalar zero fits every shape)."""
     try:
+        if isinstance(value, ca.SX):
+            raise TypeError("symbols of another kind")
         expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
     except (TypeError, ValueError, NotImplementedError) as error:
         raise ProblemError(
@@ -312,7 +329,8 @@ def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> c
                 f"The {what} of '{name}' is not an expression.",
                 expected="an expression of the symbols of this problem",
                 received=repr(value),
-                remedy="use casadi functions on the symbols (casadi.sin, @, *), not numpy arrays of objects",
+                remedy="use casadi functions on the symbols (casadi.vertcat, casadi.sin, @, *), not lists, arrays "
+                "of symbols or symbols made by casadi.SX.sym",
             )
         ) from error
     if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():

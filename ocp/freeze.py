@@ -161,12 +161,15 @@ def _check_symbols(problem: Problem) -> None:
     for what, expression in expressions:
         for symbol in ca.symvar(expression):
             if symbol.__hash__() not in hashes:
+                twin = symbol.name() in known
                 raise ProblemError(
                     describe(
                         f"There is an unknown symbol '{symbol.name()}' in {what}.",
                         expected="symbols of this problem: " + ", ".join(known),
-                        received=str(expression)[:200],
-                        remedy=f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
+                        received=str(expression)[:200] + (" with a symbol of another problem" if twin else ""),
+                        remedy=f"use the '{symbol.name()}' that was declared in this problem"
+                        if twin
+                        else f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
                     )
                 )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
@@ -176,7 +179,7 @@ def _check_symbols(problem: Problem) -> None:
             describe(
                 "The cost depends on nothing that can be chosen.",
                 expected="a cost of states, controls, matrix states or the free duration",
-                received=str(expressions[-1][1]),
+                received="running = {}, terminal = {}".format(*problem.cost or ()),
                 remedy="check the arguments of minimize()",
             )
         )

@@ -161,13 +161,16 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
         ProblemError: names the rate, the cost, the constraint or the measurement.
     """
     arguments = (x, u, e, 0.0, duration, parameters)
+    if statement.measurement is not None:
+        density = np.asarray(statement.measurement(x, u, 0.0, duration, parameters)[2].full())
+        check_density(", ".join(statement.measurement_names), "measurement noise density", density, definite=True)
     rates, matrix_rates, running = (np.asarray(v.full()).ravel() for v in statement.rates(*arguments))
     terminal = np.asarray(statement.terminal(x, e, duration, parameters).full()).ravel()
     groups = [
         ("rate of", statement.state_names, rates),
         ("rate of", statement.matrix_names, matrix_rates),
-        ("running cost", ("minimize",), running),
-        ("terminal cost", ("minimize",), terminal),
+        ("cost", ("running",), running),
+        ("cost", ("terminal",), terminal),
     ]
     for conditions in (statement.path, statement.start):
         groups.append(("constraint", conditions.names, np.asarray(conditions.function(*arguments).full()).ravel()))
@@ -182,9 +185,6 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
                         remedy="give another guess or initial value, or bounds that keep the model in its domain",
                     )
                 )
-    if statement.measurement is not None:
-        density = np.asarray(statement.measurement(x, u, 0.0, duration, parameters)[2].full())
-        check_density(", ".join(statement.measurement_names), "measurement noise density", density, definite=True)
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
         if form is not None and block.estimation:
             noise = np.asarray(form(x, u, 0.0, duration, parameters)[1].full())
