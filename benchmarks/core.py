@@ -12,6 +12,7 @@ cases are left out.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import sys
 from collections.abc import Sequence
@@ -49,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = {"a": oscillator_cases(), "b": chain_cases(sizes), "c": building_cases(sizes[-1])}
     cases = [case for part, members in parts.items() if options.only in (None, part) for case in members]
     repeats = 1 if options.quick else REPEATS
+    load = os.getloadavg()[0]
     measure(cases, repeats)
     figures = judge(cases)
     print(figures_table(figures))
@@ -61,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if folder is not None:
         import report  # matplotlib
 
-        report.write(folder, cases, figures, repeats)
+        report.write(folder, cases, figures, repeats, load)
     return 0
 
 

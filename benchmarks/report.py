@@ -74,7 +74,7 @@ def git(*arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
-def heading(repeats: int) -> str:
+def heading(repeats: int, load: float) -> str:
     """Where and how it was measured."""
     changed = " with changes" if git("status", "--porcelain", "--", "ocp", "solvers", "models", "benchmarks") else ""
     return f"""# Benchmarks
@@ -85,7 +85,7 @@ included, imports left out. The peak memory is that of the whole process.
 
 - commit {git("rev-parse", "--short=12", "HEAD") or "unknown"}{changed}, {datetime.date.today().isoformat()}
 - Python {platform.python_version()}, {", ".join(version(package) for package in PACKAGES)}
-- {processor()}, {platform.system()}
+- {processor()}, {platform.system()}; one thread for linear algebra; load at the start {load:.1f}
 
 The oscillator is that of Schmidt, section 5.4, with C33 = 1000 (100 intervals); the chain of masses has n = 2 m + 2
 augmented states for m masses (50 intervals). The controls are linear over each interval; rockit's is constant, its
@@ -117,10 +117,10 @@ def picture(path: Path, cases: Sequence[Case]) -> None:
     pyplot.close(chart)
 
 
-def write(folder: Path, cases: Sequence[Case], figures: Sequence[Figure], repeats: int) -> None:
+def write(folder: Path, cases: Sequence[Case], figures: Sequence[Figure], repeats: int, load: float) -> None:
     """Write benchmarks.md and benchmarks.png."""
     folder.mkdir(parents=True, exist_ok=True)
-    sections = [heading(repeats), "## Targets", figures_table(figures), "## All cases", cases_table(cases)]
+    sections = [heading(repeats, load), "## Targets", figures_table(figures), "## All cases", cases_table(cases)]
     if any(case.part == "b" for case in cases):
         picture(folder / "benchmarks.png", cases)
         sections.append("![Time and memory over the size of the covariance](benchmarks.png)")
