@@ -33,8 +33,12 @@ class Costates:
     matrices: Array
 
 
-def hamiltonian(statement: Statement) -> Callable[[str, Callable[..., list[Any]]], ca.Function]:
+def hamiltonian(statement: Statement, *, cost: bool = True) -> Callable[[str, Callable[..., list[Any]]], ca.Function]:
     """Maker of functions of (x, u, e, t, T, p, costate of x, costate of e) built on the Hamiltonian.
+
+    Args:
+        statement: the problem.
+        cost: whether the running cost is in it; influence functions of terminal conditions are costates without.
 
     Returns:
         make(name, select): `select(H, x, u, e, t)` gives the outputs, expressions in the statement's own symbols.
@@ -44,7 +48,7 @@ def hamiltonian(statement: Statement) -> Callable[[str, Callable[..., list[Any]]
     symbols = {name: symbolic.sym(name, size) for name, size in sizes.items()}
     costate_x, costate_e = symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)
     rates, matrix_rates, running = statement.rates(*symbols.values())
-    value = running + ca.dot(costate_x, rates) + ca.dot(costate_e, matrix_rates)
+    value = ca.dot(costate_x, rates) + ca.dot(costate_e, matrix_rates) + (running if cost else 0)
 
     def make(name: str, select: Callable[..., list[Any]]) -> ca.Function:
         outputs = select(value, symbols["x"], symbols["u"], symbols["e"], symbols["t"])
@@ -174,8 +178,12 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Ar
     return values, np.asarray(end.full()).T - first[1:], np.asarray(cost.full()).ravel()
 
 
-def backward_interval(statement: Statement) -> ca.Function:
+def backward_pair(statement: Statement, *, cost: bool = True) -> ca.Function:
     """Classical Runge-Kutta step of the adjoint equations p' = -H_x, P' = -H_E backward over a pair of substeps.
+
+    Args:
+        statement: the problem.
+        cost: False for an influence function, R' = -f_x' R: the adjoint of the rates alone.
 
     Returns:
         (costates at the end, stacked x and e at start, middle and end, *common of the pair) -> costates at the start.
@@ -186,7 +194,7 @@ def backward_interval(statement: Statement) -> ca.Function:
     points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
     common = interval_symbols(statement, symbolic)
     ua, ub, s, ds, duration, p = common
-    slope = hamiltonian(statement)("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
+    slope = state_slope(statement, cost=cost)
 
     def rate(costate: Any, c: float) -> Any:
         z = points[round(2 * c)]
@@ -201,6 +209,45 @@ def backward_interval(statement: Statement) -> ca.Function:
     return ca.Function("backward", [after, *points, *common], [after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
 
 
+def state_slope(statement: Statement, *, cost: bool = True) -> ca.Function:
+    """H_x and H_E stacked, as a function made by `hamiltonian`."""
+    make = hamiltonian(statement, cost=cost)
+    return make("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
+
+
+def part_of(common: tuple[Any, ...], c: float, d: float) -> tuple[Any, ...]:
+    """The common arguments of the part [c, d] of an interval, 0 <= c < d <= 1."""
+    ua, ub, s, ds, duration, p = common
+    return ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, (d - c) * ds, duration, p
+
+
+def backward_interval(statement: Statement, pairs: int, influences: int = 0) -> ca.Function:
+    """Costates and influence functions backward over the pairs of substeps of one control interval.
+
+    Args:
+        statement: the problem.
+        pairs: Runge-Kutta steps.
+        influences: number of influence functions, columns beside the costates.
+
+    Returns:
+        (columns at the end (size, 1 + influences), impulse at the start, x and e stacked at the starts, middles and
+        ends of the pairs (size, 2 pairs + 1), *common) -> columns at the start with the impulse on the first, columns
+        at the starts of the pairs without it (size, pairs (1 + influences)).
+    """
+    size = statement.nx + statement.ne
+    after, impulse = ca.MX.sym("after", size, 1 + influences), ca.MX.sym("impulse", size)
+    z = ca.MX.sym("z", size, 2 * pairs + 1)
+    common = interval_symbols(statement, ca.MX)
+    steps = [backward_pair(statement)] + [backward_pair(statement, cost=False)] * bool(influences)
+    columns, passed = ca.horzsplit(after), []
+    for j in range(pairs - 1, -1, -1):
+        points = (z[:, 2 * j], z[:, 2 * j + 1], z[:, 2 * j + 2], *part_of(common, j / pairs, (j + 1) / pairs))
+        columns = [steps[min(k, 1)](column, *points) for k, column in enumerate(columns)]
+        passed.append(ca.horzcat(*columns))
+    start = ca.horzcat(columns[0] + impulse, *columns[1:])
+    return ca.Function("backward_interval", [after, impulse, z, *common], [start, ca.horzcat(*passed[::-1])])
+
+
 def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     """Costates by integrating the adjoint equations backward, independently of the discrete steps.
 
@@ -213,22 +260,11 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     """
     st, n, size = extremal.statement, extremal.mesh.intervals, extremal.statement.nx + extremal.statement.ne
     values, _, _ = fine_trajectory(extremal, 2 * pairs)
-    ua, ub, s, ds, duration, p = _columns(extremal)
-    step = backward_interval(st)
-    after, impulse = ca.MX.sym("after", size), ca.MX.sym("impulse", size)
-    z = ca.MX.sym("z", size, 2 * pairs + 1)
-    common = interval_symbols(st, ca.MX)
-    value = after
-    for j in range(pairs - 1, -1, -1):
-        c, d = j / pairs, (j + 1) / pairs
-        start, end = common[0] + c * (common[1] - common[0]), common[0] + d * (common[1] - common[0])
-        ends = (start, end, common[2] + c * common[3], common[3] / pairs, common[4], common[5])
-        value = step(value, z[:, 2 * j], z[:, 2 * j + 1], z[:, 2 * j + 2], *ends)
-    sweep = ca.Function("sweep", [after, impulse, z, *common], [value + impulse]).mapaccum("sweep", n)
+    sweep = backward_interval(st, pairs).mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
     last = np.concatenate(terminal_costates(extremal))
     stacked = ca.DM(values[::-1].transpose(2, 0, 1).reshape(size, -1))
-    columns = [column[:, backward] for column in (ua, ub, s, ds, duration, p)]
-    result = sweep(last, ca.DM(impulses(extremal)[:-1][::-1].T), stacked, *columns)
+    columns = [column[:, backward] for column in _columns(extremal)]
+    result, _ = sweep(last, ca.DM(impulses(extremal)[:-1][::-1].T), stacked, *columns)
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
