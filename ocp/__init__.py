@@ -18,3 +18,4 @@ from covocp.methods import methods as methods
 from covocp.methods import solve as solve
 from covocp.problem import Problem as Problem
 from covocp.solution import Solution as Solution
+from covocp.storage import load as load

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,13 +43,9 @@ def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]
                 remedy="make the folder, or write elsewhere",
             )
         )
-    part: Path | None = None
+    part = target.with_name(f".{uuid.uuid4().hex}{target.suffix.lower()}")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix.lower(), dir=target.parent)
-        os.close(handle)
-        part = Path(name)
         yield part
-        part.chmod(0o666 & ~_umask())
         part.replace(target)
     except OSError as error:
         raise ExportError(
@@ -62,12 +57,4 @@ def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]
             )
         ) from error
     finally:
-        if part is not None:
-            part.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    """The permissions that new files do not get."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+        part.unlink(missing_ok=True)
