@@ -33,7 +33,6 @@ LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
 
 GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
-GAUSS_MATRIX = ((0.25, 0.25 - np.sqrt(3.0) / 6.0), (0.25 + np.sqrt(3.0) / 6.0, 0.25))
 COMMON = ("start", "end", "s", "ds", "duration", "parameters")
 
 
@@ -48,6 +47,14 @@ def interval_symbols(statement: Statement, symbolic: Any) -> tuple[Any, ...]:
         symbolic.sym("T"),
         symbolic.sym("p", statement.np),
     )
+
+
+def _slopes(statement: Statement, count: int) -> dict[str, Any]:
+    """Option of a function of `count` values and the common arguments: what it is never differentiated by.
+
+    The adjoint of a step is the dearest function of all; slopes by the mesh and the parameters would add a third.
+    """
+    return {"is_diff_in": [True] * (count + 2) + [False, False, statement.duration.free, False]}
 
 
 def nominal_interval(statement: Statement, substeps: int) -> ca.Function:
@@ -70,7 +77,7 @@ def nominal_interval(statement: Statement, substeps: int) -> ca.Function:
         return ca.vertcat(*outputs)
 
     states, cost = _runge_kutta(rate, ca.vertcat(x, 0), duration * ds, substeps)
-    return ca.Function("nominal_interval", [x, *common], [states[:, -1], states, cost])
+    return ca.Function("nominal_interval", [x, *common], [states[:, -1], states, cost], _slopes(statement, 1))
 
 
 def joint_interval(statement: Statement, substeps: int) -> ca.Function:
@@ -91,7 +98,7 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
         return ca.vertcat(*statement.rates(value[:nx], control, value[nx:-1], time, duration, p))
 
     stacked, cost = _runge_kutta(rate, ca.vertcat(z, 0), duration * ds, substeps)
-    return ca.Function("joint_interval", [z, *common], [stacked[:, -1], stacked, cost])
+    return ca.Function("joint_interval", [z, *common], [stacked[:, -1], stacked, cost], _slopes(statement, 1))
 
 
 def _runge_kutta(rate: Callable[[Any, Any], Any], start: Any, h: Any, substeps: int) -> tuple[Any, Any]:
@@ -117,16 +124,16 @@ def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINE
         (xa, xb, *common of the substep) -> D, shape (2n, 2n); it does not depend on E.
     """
     size = statement.matrices[index].size
-    inner = _gauss_system(statement, index) if step == "gauss" else _strang_parts(statement, index)
+    inner = _gauss_points(statement, index) if step == "gauss" else _strang_parts(statement, index)
     xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
     common = interval_symbols(statement, ca.MX)
     compose = _gauss_matrix if step == "gauss" else _strang_matrix
     value = compose(inner(xa, xb, *common), size, solver)
-    return ca.Function("step_matrix", [xa, xb, *common], [value])
+    return ca.Function("step_matrix", [xa, xb, *common], [value], _slopes(statement, 2))
 
 
-def _gauss_system(statement: Statement, index: int) -> ca.Function:
-    """The linear system A [K1; K2] = B of the two stages, and the step h."""
+def _gauss_points(statement: Statement, index: int) -> ca.Function:
+    """h H at the two Gauss points, H = [-F' W; Q F], the nominal between the ends by a cubic Hermite polynomial."""
     form = _form(statement, index)
     symbolic: Any = statement.symbolic
     xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
@@ -135,23 +142,32 @@ def _gauss_system(statement: Statement, index: int) -> ca.Function:
     h = duration * ds
     fa = _slope(statement, xa, ua, s, duration, p)
     fb = _slope(statement, xb, ub, s + ds, duration, p)
-    stages = []
+    points = []
     for c in GAUSS_NODES:
         x = hermite(xa, xb, h * fa, h * fb, c)
         drift, noise, information = form(x, ua + c * (ub - ua), duration * (s + c * ds), duration, p)
-        stages.append(ca.blockcat([[-drift.T, information], [noise, drift]]))
-    (a11, a12), (a21, a22) = GAUSS_MATRIX
-    first, second = stages
-    unit = ca.DM.eye(first.shape[0])
-    left = ca.blockcat([[unit - h * a11 * first, -h * a12 * first], [-h * a21 * second, unit - h * a22 * second]])
-    return ca.Function("gauss_system", [xa, xb, *common], [left, ca.vertcat(first, second), h])
+        points.append(h * ca.blockcat([[-drift.T, information], [noise, drift]]))
+    return ca.Function("gauss_points", [xa, xb, *common], points, _slopes(statement, 2))
 
 
-def _gauss_matrix(system: Any, size: int, solver: str) -> Any:
-    """D = I + h/2 (K1 + K2)."""
-    left, right, h = system
-    stages = ca.solve(left, right, solver)
-    return ca.DM.eye(2 * size) + h / 2 * (stages[: 2 * size, :] + stages[2 * size :, :])
+def _gauss_matrix(points: Any, size: int, solver: str) -> Any:
+    """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
+
+    With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a
+    solve, and inserting it leaves one system of size 2n instead of 4n:
+
+        [(I - g h H2)(I - g h H1) - a h/2 (H1 + H2)] Y1 = I - g h H2.
+
+    Its matrix is regular where the Gauss method is (for constant H it is I - hH/2 + (hH)^2/12), and its factors keep
+    the sparsity of F.
+    """
+    first, second = points
+    g = np.sqrt(3.0) / 6.0
+    a = 0.5 - 2.0 * g
+    unit = ca.DM.eye(2 * size)
+    left, right = unit - g * second, unit - g * first
+    stage = ca.solve(left @ right - a / 2 * (first + second), ca.densify(left), solver)
+    return unit + (right @ stage - unit) / a
 
 
 def _strang_parts(statement: Statement, index: int) -> ca.Function:
@@ -177,7 +193,8 @@ def _strang_parts(statement: Statement, index: int) -> ca.Function:
     _, noise_a, information_a = form(xa, ua, duration * s, duration, p)
     _, noise_b, information_b = form(xb, ub, duration * (s + ds), duration, p)
     outputs = [transition, *(h / 2 * entry for entry in (noise_a, information_a, noise_b, information_b))]
-    return ca.Function("strang_parts", [xa, xb, *common], [ca.densify(entry) for entry in outputs])
+    dense = [ca.densify(entry) for entry in outputs]
+    return ca.Function("strang_parts", [xa, xb, *common], dense, _slopes(statement, 2))
 
 
 def _strang_matrix(parts: Any, size: int, solver: str) -> Any:
@@ -262,7 +279,7 @@ def simpson_interval(statement: Statement, substeps: int) -> ca.Function:
         xj, ej = (x, e) if j == 0 else (states[:, j - 1], halves[:, j - 1])
         cost = statement.rates(xj, ua + c * (ub - ua), ej, duration * (s + c * ds), duration, p)[2]
         total = total + weight * cost
-    return ca.Function("simpson_interval", [x, e, states, halves, *common], [duration * ds * total])
+    return ca.Function("simpson_interval", [x, e, states, halves, *common], [duration * ds * total], _slopes(statement, 4))
 
 
 def full_interval(statement: Statement, substeps: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
@@ -292,4 +309,4 @@ def full_interval(statement: Statement, substeps: int, step: Step, solver: str =
     if statement.running_uses_matrices:
         cost = simpson_interval(statement, substeps)(x, e, states, halves, *common)
     fine = ca.vertcat(states, halves)
-    return ca.Function("full_interval", [z, *common], [fine[:, -1], fine, cost])
+    return ca.Function("full_interval", [z, *common], [fine[:, -1], fine, cost], _slopes(statement, 1))

@@ -96,6 +96,7 @@ def prepare(
     mesh = choose_mesh(statement, options, stiff)
     limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+    settings["calc_lam_p"] = False
     if plugin == "ipopt":
         settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
         if limited:
