@@ -28,7 +28,15 @@ read dP/dt.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm, solve_continuous_lyapunov
+
 import covocp as co
+
+Array = npt.NDArray[np.float64]
 
 DURATION = 10.0  # s
 FINAL = 10.0  # [y]
@@ -55,7 +63,7 @@ def problem(
 
     Returns:
         The problem, with states "y" and "rate", unknowns "a" and "b", control "u", measurement "position" and
-        covariance "E" of (y, rate, a, b).
+        covariance "E" of (y, rate, a, b). The guess of the control is the one of least energy, as in the source [5.5].
 
     Raises:
         ProblemError: where the naming is unknown, or the measurement noise not positive.
@@ -73,11 +81,36 @@ def problem(
     y = ocp.state("y", initial=0.0, final=FINAL, variance=INITIAL_VARIANCE)
     rate = ocp.state("rate", initial=0.0, final=0.0, variance=INITIAL_VARIANCE)
     a, b = (ocp.unknown(name, mean=mean, variance=PARAMETER_VARIANCE) for name, mean in MEANS.items())
-    u = ocp.control("u")
     damping, stiffness = (a, b) if naming == "table" else (b, a)
+    u = ocp.control("u", guess=least_energy_control(naming))
     ocp.dynamics(y, rate)
     ocp.dynamics(rate, -stiffness * y - damping * rate + u, noise=PROCESS_NOISE)
     ocp.measurement("position", y, noise=measurement_noise)
     E = ocp.estimation_covariance()
     ocp.minimize(running=0.5 * u**2, terminal=C33 * E[a, a] + C44 * E[b, b])
     return ocp
+
+
+def least_energy_control(naming: str = "table") -> Callable[[Array], Array]:
+    """Control that reaches the final state of the nominal with least energy, Schmidt [5.5].
+
+    u(t) = B' exp(A' (T - t)) W^-1 x(T), W the controllability Gramian.
+
+    Args:
+        naming: as for `problem`.
+
+    Returns:
+        The control as a function of s = t/T, of the shape of s.
+    """
+    damping, stiffness = MEANS.values() if naming == "table" else reversed(MEANS.values())
+    A, B = np.array([[0.0, 1.0], [-stiffness, -damping]]), np.array([[0.0], [1.0]])
+    final = expm(A * DURATION) @ B
+    gramian = solve_continuous_lyapunov(A, final @ final.T - B @ B.T)
+    multiplier = np.linalg.solve(gramian, np.array([FINAL, 0.0]))
+
+    def control(s: Array) -> Array:
+        """At the fractions s of the duration."""
+        remaining = DURATION * (1 - np.asarray(s, dtype=float))
+        return np.asarray((expm(A * remaining[..., None, None]) @ B)[..., 0] @ multiplier)
+
+    return control
