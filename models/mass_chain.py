@@ -28,7 +28,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 import covocp as co
 
@@ -91,7 +91,7 @@ def problem(masses: int = 1, weight: float = 20.0) -> co.Problem:
 def least_energy_control(masses: int, duration: float) -> Callable[[Array], Array]:
     """Control that moves the last mass of the chain without cubic forces from rest to its target with least energy.
 
-    u(t) = B' exp(A' (T - t)) c, with c such that the last mass arrives; the Gramian by Van Loan's matrix exponential.
+    u(t) = B' exp(A' (T - t)) c, with c such that the last mass arrives, from the controllability Gramian.
 
     Args:
         masses: m.
@@ -105,15 +105,14 @@ def least_energy_control(masses: int, duration: float) -> Callable[[Array], Arra
     A = np.block([[np.zeros((m, m)), np.eye(m)], [-STIFFNESS * D.T @ D, -DAMPING * D.T @ D]])
     B = np.eye(2 * m)[:, m : m + 1]
     arrival = np.eye(2 * m)[[m - 1, 2 * m - 1]]  # rows of y_m and v_m
-    block = expm(duration * np.block([[-A, B @ B.T], [np.zeros_like(A), A.T]]))
-    gramian = block[2 * m :, 2 * m :].T @ block[: 2 * m, 2 * m :]
+    final = expm(A * duration) @ B
+    gramian = solve_continuous_lyapunov(A, final @ final.T - B @ B.T)
     multiplier = arrival.T @ np.linalg.solve(arrival @ gramian @ arrival.T, np.array([TARGET, 0.0]))
 
     def control(s: Array) -> Array:
         """At the fractions s of the duration."""
-        fractions = np.asarray(s, dtype=float)
-        values = [float((expm(A * duration * (1 - f)) @ B)[:, 0] @ multiplier) for f in fractions.ravel()]
-        return np.array(values).reshape(fractions.shape)
+        remaining = duration * (1 - np.asarray(s, dtype=float))
+        return np.asarray((expm(A * remaining[..., None, None]) @ B)[..., 0] @ multiplier)
 
     return control
 
