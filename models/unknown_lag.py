@@ -121,7 +121,8 @@ def exact(
 ) -> Exact:
     """Exact solution for x(T) = 0, Schmidt [5.2], by the eigenvalue that the information on b leads to.
 
-    Without correlation at the start, 1/E_bb(T) = 1/E_bb(0) + int S^2 dt, where S obeys a linear equation driven by x:
+    Without correlation at the start, 1/E_bb(T) = 1/E_bb(0) + int S^2 dt, where S obeys a linear equation driven by x
+    (for the densities of the source, both 1):
 
         dS/dt = -(b + e) S - x,   E_xb = S E_bb,   E_xx = e + S^2 E_bb,   de/dt = -2 b e - e^2 + 1
 
@@ -148,17 +149,18 @@ def exact(
     S_of_u = -np.linalg.solve(identity + integral * decay, integral @ x_of_u)
     # In the coordinates sqrt(weights) u the norm is int u^2 dt; controls that change x(T) are projected out.
     root = np.sqrt(weights)
-    information = root[:, None] * S_of_u / root
+    information = root[:, None] * S_of_u / root / np.sqrt(MEASUREMENT_NOISE)
     final = weights @ (identity - MEAN * x_of_u) / root
     information -= np.outer(information @ final, final) / (final @ final)
     values, shapes = np.linalg.svd(information)[1:]
     eigenvalue, prior = float(values[0] ** 2), 1 / parameter_variance
     energy = max(0.0, float(np.sqrt(2 * eigenvalue * weight) - prior) / (2 * eigenvalue))
     u = np.sqrt(2 * energy) * shapes[0] / root
-    u *= -1.0 if _at(u, np.ones(())) > 0 else 1.0
+    end = np.ones(())
+    u *= -1.0 if _at(u, end) > 0 else 1.0
     S = S_of_u @ u
-    E_bb = 1 / (prior + _at(integral @ S**2, times / duration))
-    S_at, last = _at(S, times / duration), float(_at(u, np.ones(())))
+    E_bb = 1 / (prior + _at(integral @ S**2, times / duration) / MEASUREMENT_NOISE)
+    S_at, last = _at(S, times / duration), float(_at(u, end))
     E_bb_final = 1 / (prior + 2 * eigenvalue * energy)
     return Exact(
         eigenvalue=eigenvalue,
@@ -166,18 +168,18 @@ def exact(
         t=times,
         x=_at(x_of_u @ u, times / duration),
         u=_at(u, times / duration),
-        E_xx=_filter_rate(times, initial_variance) - MEAN + S_at**2 * E_bb,
+        E_xx=(_filter_rate(times, initial_variance) - MEAN) * MEASUREMENT_NOISE + S_at**2 * E_bb,
         E_xb=S_at * E_bb,
         E_bb=E_bb,
         ell=-last,
-        hamiltonian=float(-0.5 * last**2 - weight * (_at(S, np.ones(())) * E_bb_final) ** 2),
+        hamiltonian=float(-0.5 * last**2 - weight * (_at(S, end) * E_bb_final) ** 2 / MEASUREMENT_NOISE),
         cost=weight * E_bb_final + energy,
         energy=energy,
     )
 
 
 def _filter_rate(t: Array, initial_variance: float) -> Array:
-    """Decay rate b + e of the filter's error where b is known; dy/dt = b^2 + Q/U - y^2."""
+    """Decay rate y = b + e/U of the filter's error where b is known; dy/dt = b^2 + Q/U - y^2."""
     steady = np.sqrt(MEAN**2 + PROCESS_NOISE / MEASUREMENT_NOISE)
     start, slope = MEAN + initial_variance / MEASUREMENT_NOISE, np.tanh(steady * t)
     return np.asarray(steady * (start + steady * slope) / (steady + start * slope))

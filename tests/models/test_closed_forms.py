@@ -233,6 +233,16 @@ def test_lag_satisfies_the_necessary_conditions(data):
     assert -(exact.u[0] ** 2) / 2 + np.trace(P @ V) == pytest.approx(exact.hamiltonian, abs=1e-7)
 
 
+@pytest.mark.parametrize(("noise", "cost", "E_bb"), [(1e-3, 4.5802190, 0.2345105), (1e-6, 4.5777677, 0.2343819)])
+def test_lag_accurate_measurement(monkeypatch, noise, cost, E_bb):
+    monkeypatch.setattr(unknown_lag, "MEASUREMENT_NOISE", noise)
+    exact = unknown_lag.exact(10.0)
+    assert exact.cost == pytest.approx(cost, abs=6e-8)
+    assert exact.E_bb[-1] == pytest.approx(E_bb, abs=6e-8)
+    if noise == 1e-6:
+        assert exact.E_xx[-1] == pytest.approx(9.9900e-4, abs=6e-9)
+
+
 def test_lag_small_weights_do_not_move():
     exact = unknown_lag.exact(0.045)
     assert exact.cost == pytest.approx(5 * 0.045, rel=1e-14)
