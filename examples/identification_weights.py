@@ -8,9 +8,8 @@ solutions = []
 for weight in (0.1, 1.0, 10.0):
     solution = co.solve(unknown_lag.problem(weight=weight, final=1.0))
     variance = solution.covariance("b")[-1, 0, 0]
-    print(
-        f"weight {weight:4g}: J = {solution.cost:.6f}, energy {solution.cost_terms['running']:.4f}, var b {variance:.4f}"
-    )
+    energy = solution.cost_terms["running"]
+    print(f"weight {weight:4g}: J = {solution.cost:.6f}, energy {energy:.4f}, final variance of b {variance:.4f}")
     print(" ", co.certify(solution))
     solutions.append(solution)
 plot_solutions(solutions, labels=["weight 0.1", "weight 1", "weight 10"], path="identification_weights.png")

@@ -303,7 +303,6 @@ def stiffness(statement: Statement, nodes: Array, control: str, parameters: Arra
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
     x, e = _starts(statement, mesh, parameters)
     duration = statement.duration.guess
-    check_model(statement, x, u, e, duration, parameters)
     largest = _radius(_state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
     if matrices and statement.ne:
         for block, form in zip(statement.matrices, statement.riccati, strict=True):

@@ -18,6 +18,7 @@ rk4 is the classical Runge-Kutta step of nominal and half-vectors together, for 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, Literal
 
 import casadi as ca
@@ -31,6 +32,8 @@ Step = Literal["gauss", "strang", "rk4"]
 # Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
+# Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
+KEPT = 16
 
 GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
 COMMON = ("start", "end", "s", "ds", "duration", "parameters")
@@ -57,6 +60,7 @@ def _slopes(statement: Statement, count: int) -> dict[str, Any]:
     return {"is_diff_in": [True] * (count + 2) + [False, False, statement.duration.free, False]}
 
 
+@lru_cache(maxsize=KEPT)
 def nominal_interval(statement: Statement, substeps: int) -> ca.Function:
     """The nominal over one control interval by classical Runge-Kutta steps.
 
@@ -80,6 +84,7 @@ def nominal_interval(statement: Statement, substeps: int) -> ca.Function:
     return ca.Function("nominal_interval", [x, *common], [states[:, -1], states, cost], _slopes(statement, 1))
 
 
+@lru_cache(maxsize=KEPT)
 def joint_interval(statement: Statement, substeps: int) -> ca.Function:
     """Nominal and half-vectors together by classical Runge-Kutta steps (covariance step rk4).
 
@@ -117,6 +122,7 @@ def _runge_kutta(rate: Callable[[Any, Any], Any], start: Any, h: Any, substeps: 
     return stacked[:-1, :], stacked[-1, -1]
 
 
+@lru_cache(maxsize=KEPT)
 def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
     """The step matrix D of one matrix state over one substep, given the nominal at both ends of it.
 
@@ -132,6 +138,7 @@ def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINE
     return ca.Function("step_matrix", [xa, xb, *common], [value], _slopes(statement, 2))
 
 
+@lru_cache(maxsize=KEPT)
 def _gauss_points(statement: Statement, index: int) -> ca.Function:
     """h H at the two Gauss points, H = [-F' W; Q F], the nominal between the ends by a cubic Hermite polynomial."""
     form = _form(statement, index)
@@ -170,6 +177,7 @@ def _gauss_matrix(points: Any, size: int, solver: str) -> Any:
     return unit + (right @ stage - unit) / a
 
 
+@lru_cache(maxsize=KEPT)
 def _strang_parts(statement: Statement, index: int) -> ca.Function:
     """Transition matrix of the Runge-Kutta step, noise and information at both ends (times h/2)."""
     form = _form(statement, index)
@@ -239,6 +247,7 @@ def apply_step(matrix: Any, half: Any, size: int, solver: str = LINEAR_SOLVER) -
     return pack_symbolic(ca.solve(above.T, below.T, solver))
 
 
+@lru_cache(maxsize=KEPT)
 def propagate_interval(statement: Statement, substeps: int, solver: str = LINEAR_SOLVER) -> ca.Function:
     """All half-vectors over one control interval, given the step matrices of its substeps.
 
@@ -258,6 +267,7 @@ def propagate_interval(statement: Statement, substeps: int, solver: str = LINEAR
     return ca.Function("propagate_interval", [e, *steps], [columns[-1], ca.horzcat(*columns)])
 
 
+@lru_cache(maxsize=KEPT)
 def simpson_interval(statement: Statement, substeps: int) -> ca.Function:
     """Integral of a running cost that depends on the matrices, by Simpson's rule over pairs of substeps.
 
@@ -279,9 +289,12 @@ def simpson_interval(statement: Statement, substeps: int) -> ca.Function:
         xj, ej = (x, e) if j == 0 else (states[:, j - 1], halves[:, j - 1])
         cost = statement.rates(xj, ua + c * (ub - ua), ej, duration * (s + c * ds), duration, p)[2]
         total = total + weight * cost
-    return ca.Function("simpson_interval", [x, e, states, halves, *common], [duration * ds * total], _slopes(statement, 4))
+    return ca.Function(
+        "simpson_interval", [x, e, states, halves, *common], [duration * ds * total], _slopes(statement, 4)
+    )
 
 
+@lru_cache(maxsize=KEPT)
 def full_interval(statement: Statement, substeps: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.checks import column
 from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
-from covocp.extremal import Outcome, Prepared
+from covocp.extremal import Guess, Outcome, Prepared
 from covocp.matrices import Array
 from covocp.mesh import Options
 from covocp.problem import Problem
@@ -28,6 +28,8 @@ METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient
 COARSE_MESH = 2e-4
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
+# A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
+UNMOVED = 1e-6
 NEGATIVE_CURVATURE = -1e-6
 ESCAPES = (1.0, -1.0)
 STARTS = 8
@@ -103,7 +105,7 @@ class Solver:
             seed: of the random starts.
 
         Returns:
-            The solution.
+            The solution. After Ctrl-C the last iterate, with a warning; its `converged` is false.
 
         Raises:
             ProblemError: a name or a guess is wrong.
@@ -116,8 +118,8 @@ class Solver:
             else:
                 start = make_guess(self.statement, self._prepared.mesh, values, guess)
                 outcome = self._prepared.solve(values, start, reporter)
-                outcome = self._leave_saddle(outcome, values, reporter, warm=start.warm)
-        return self._finish(outcome, allow_failure)
+                outcome = self._leave_saddle(outcome, values, reporter, start)
+        return self._finish(outcome, allow_failure, interrupted=reporter.stop)
 
     def _values(self, parameters: Mapping[str, Any]) -> Array:
         """The stacked parameters with some of them replaced."""
@@ -160,11 +162,14 @@ class Solver:
         assert best is not None
         return _with_stats(best, starts=costs)
 
-    def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, *, warm: bool) -> Outcome:
-        """Where a run ended as soon as it began, look at the curvature, and leave a saddle along it."""
+    def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
+        """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it."""
         iterations = outcome.stats.get("iterations", -1)
         exact = outcome.stats.get("hessian") == "exact"
-        if not outcome.converged or iterations > SUSPICIOUS_ITERATIONS or (exact and not warm and iterations > 0):
+        few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
+        before, after = start.trajectory.u, outcome.extremal.trajectory.u
+        stayed = before.size > 0 and bool(np.abs(after - before).max() <= UNMOVED * np.abs(before).max() + UNMOVED)
+        if not outcome.converged or not (few or stayed):
             return outcome
         from covocp.curvature import smallest_curvature
 
@@ -173,8 +178,9 @@ class Solver:
             return outcome
         candidates = []
         for sign in ESCAPES:
-            start = make_guess(self.statement, self._prepared.mesh, values, curvature.displaced(outcome.extremal, sign))
-            candidates.append(self._prepared.solve(values, start, reporter))
+            moved = curvature.displaced(outcome.extremal, sign)
+            displaced = make_guess(self.statement, self._prepared.mesh, values, moved)
+            candidates.append(self._prepared.solve(values, displaced, reporter))
         better = [
             c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())
         ]
@@ -187,11 +193,14 @@ class Solver:
         )
         return _with_stats(min(better, key=lambda c: sum(c.cost_terms.values())), left_saddle=True)
 
-    def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
+    def _finish(self, outcome: Outcome, allow_failure: bool, interrupted: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         solution = Solution.of(outcome, self.method)
         if not outcome.converged:
-            if allow_failure:
+            if interrupted:
+                message = "Interrupted: this is the last iterate, not a solution."
+                warnings.warn(message, CovocpWarning, stacklevel=3)
+            if allow_failure or interrupted:
                 return solution
             lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
@@ -251,7 +260,7 @@ def solve(
         options: of the mesh and of the method; see `Solver`.
 
     Returns:
-        The solution.
+        The solution. After Ctrl-C the last iterate, with a warning; its `converged` is false.
 
     Raises:
         ProblemError: the statement or an option is wrong.

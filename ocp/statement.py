@@ -82,7 +82,7 @@ class Duration:
         return self.lower < self.upper
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Statement:
     """A vector-matrix optimal control problem, ready for any method.
 
