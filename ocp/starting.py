@@ -66,7 +66,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
     duration = solution.duration if statement.duration.free else statement.duration.guess
     own = solution.mesh
-    same = own.nodes.shape == mesh.nodes.shape and np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
+    same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
     sample = solution.at(mesh.nodes * solution.duration)
     at_controls = sample
     if mesh.control == "constant":
@@ -102,16 +102,14 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
 
 def _resample(values: Array, old: Array, new: Array) -> Array:
     """Columns interpolated linearly from old nodes to new ones."""
-    if old.shape == new.shape and np.array_equal(old, new):
+    if np.array_equal(old, new):
         return values
     return np.stack([np.interp(new, old, column) for column in values.T], axis=1).reshape(new.size, values.shape[1])
 
 
 def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh, statement: Statement) -> Multipliers:
     """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
-    if old == new or (
-        old.nodes.shape == new.nodes.shape and np.array_equal(old.nodes, new.nodes) and old.control == new.control
-    ):
+    if np.array_equal(old.nodes, new.nodes) and old.control == new.control:
         return multipliers
     before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
 
