@@ -12,7 +12,7 @@ import numpy as np
 
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import choose_scales, stiffness
+from covocp.guess import choose_scales, first_guess, stiffness
 from covocp.integrators import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
@@ -20,6 +20,7 @@ from covocp.nlp import NLP
 from covocp.progress import Progress
 from covocp.shooting import transcribe
 from covocp.statement import Statement
+from covocp.trajectory import Trajectory
 
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
@@ -179,7 +180,10 @@ class ShootingSolver:
         """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts."""
         if self._nlp is None or self._cold is None:
             stretch = STRETCH if self._limited else 1.0
-            scales = choose_scales(self._statement, guess.trajectory, parameters, stretch=stretch)
+            typical = guess.trajectory
+            if guess.warm:  # a solution may rest at zero, which says nothing about magnitudes
+                typical = _larger(typical, first_guess(self._statement, self._mesh, parameters))
+            scales = choose_scales(self._statement, typical, parameters, stretch=stretch)
             self._nlp = transcribe(self._statement, self._mesh, scales)
             if self._plugin == "ipopt":
                 self._monitor = _Monitor(self._nlp)
@@ -233,6 +237,12 @@ class ShootingSolver:
         second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+def _larger(one: Trajectory, two: Trajectory) -> Trajectory:
+    """The larger magnitudes of two trajectories on one mesh."""
+    x, u, e = (np.maximum(np.abs(getattr(one, n)), np.abs(getattr(two, n))) for n in ("x", "u", "e"))
+    return Trajectory(x=x, u=u, e=e, duration=one.duration)
 
 
 class _KeptGradient(ca.Callback):
