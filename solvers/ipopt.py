@@ -100,6 +100,8 @@ def prepare(
     settings["calc_lam_p"] = False
     if plugin == "ipopt":
         settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
+        # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
+        settings["ipopt"]["fixed_variable_treatment"] = "make_parameter_nodual"
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
     if compile:
@@ -118,7 +120,6 @@ class ShootingSolver:
         self._statement, self._mesh = statement, mesh
         self._plugin, self._settings, self._limited = plugin, settings, limited
         self._monitor: _Monitor | None = None
-        self._gradient: _KeptGradient | None = None
         self._nlp: NLP | None = None
         self._cold: ca.Function | None = None
         self._warm: ca.Function | None = None
@@ -203,9 +204,6 @@ class ShootingSolver:
         nlp = self._nlp
         assert nlp is not None
         settings = {**self._settings, **functions}
-        if self._limited and "grad_f" not in settings:
-            self._gradient = self._gradient or _KeptGradient(nlp, jit={k: v for k, v in settings.items() if k in JIT})
-            settings["grad_f"] = self._gradient
         if nlp.jacobian is not None and "jac_g" not in settings:
             settings["jac_g"] = nlp.jacobian
         if self._monitor is not None:
@@ -243,52 +241,6 @@ def _larger(one: Trajectory, two: Trajectory) -> Trajectory:
     """The larger magnitudes of two trajectories on one mesh."""
     x, u, e = (np.maximum(np.abs(getattr(one, n)), np.abs(getattr(two, n))) for n in ("x", "u", "e"))
     return Trajectory(x=x, u=u, e=e, duration=one.duration)
-
-
-class _KeptGradient(ca.Callback):
-    """The gradient of the cost, with its last value kept.
-
-    With a limited-memory Hessian Ipopt asks for it twice at every iterate, and it is the dearest function by far.
-    """
-
-    def __init__(self, nlp: NLP, jit: dict[str, Any]) -> None:
-        ca.Callback.__init__(self)
-        outputs = [nlp.f, ca.densify(ca.gradient(nlp.f, nlp.w))]
-        self._function = ca.Function("gradient", [nlp.w, nlp.p], outputs, ["x", "p"], ["f", "grad_f_x"], jit)
-        self._at: tuple[bytes, ...] = ()
-        self._value: Any = None
-        self.construct("nlp_grad_f", {})
-
-    def get_n_in(self) -> int:
-        """Variables and parameters."""
-        return 2
-
-    def get_n_out(self) -> int:
-        """Cost and gradient."""
-        return 2
-
-    def get_name_in(self, i: int) -> str:
-        """The names that nlpsol asks for."""
-        return str(self._function.name_in(i))
-
-    def get_name_out(self, i: int) -> str:
-        """The names that nlpsol asks for."""
-        return str(self._function.name_out(i))
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Columns."""
-        return self._function.sparsity_in(i)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """A number and a column."""
-        return self._function.sparsity_out(i)
-
-    def eval(self, arg: Any) -> Any:
-        """Evaluate, unless it is the last point again."""
-        at = tuple(np.asarray(value).tobytes() for value in arg)
-        if at != self._at:
-            self._value, self._at = self._function.call(arg), at
-        return self._value
 
 
 class _Monitor(ca.Callback):
