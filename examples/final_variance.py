@@ -14,5 +14,5 @@ ocp.minimize(running=0.5 * u**2)
 
 solution = co.solve(ocp)
 print(f"energy {solution.cost:.5f}, final variance of b {solution[E[b, b]][-1]:.6f}")
-print(f"one unit less variance would cost {solution.multipliers.end[0]:.3f} more (multiplier of 'accuracy of b')")
+print(f"one unit less variance would cost {solution.multiplier('accuracy of b'):.3f} more (its multiplier)")
 solution.plot(path="final_variance.png")

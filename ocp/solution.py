@@ -64,6 +64,7 @@ class Solution:
         stats: iterations, times, what the method counts.
         blocks: where each symbol lies.
         augmented: names of the rows of the estimation covariance.
+        constraints: names of the rows of the inequalities, by place: "path", "start", "end".
         statement: the problem solved; None for a solution read from a file.
     """
 
@@ -84,6 +85,7 @@ class Solution:
     stats: Mapping[str, Any]
     blocks: tuple[Block, ...]
     augmented: tuple[str, ...]
+    constraints: Mapping[str, tuple[str, ...]]
     statement: Statement | None = field(default=None, repr=False)
     stored_optimality: Optimality | None = field(default=None, repr=False)
 
@@ -119,6 +121,7 @@ class Solution:
             stats=dict(outcome.stats),
             blocks=st.blocks,
             augmented=st.augmented,
+            constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             statement=st,
         )
 
@@ -301,6 +304,34 @@ class Solution:
             return unpack_costate(self.costates.matrices[:, b.span], b.size)
         values = self.costates.state[:, b.span]
         return np.asarray(values[:, 0] if b.size == 1 else values)
+
+    def multiplier(self, key: Any) -> Array:
+        """Multiplier of a constraint, by its name, or of the terminal values of a state or a matrix.
+
+        The multiplier of an inequality is positive at its upper bound: the cost falls by it for one unit more room. For
+        terminal values it is l of p(T) = k_x + l, zero where they are free; the cost rises by -l for one unit more.
+
+        Args:
+            key: the name of a constraint, or the symbol or name of a state or a matrix.
+
+        Returns:
+            Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes; of terminal and
+            initial ones () or (rows,); of a state () or (n,); of a matrix (n, n).
+
+        Raises:
+            ProblemError: where there is no such constraint or symbol.
+        """
+        for place, names in self.constraints.items():
+            rows = [i for i, n in enumerate(names) if isinstance(key, str) and (n == key or n.startswith(f"{key}["))]
+            if rows:
+                values = getattr(self.multipliers, place)[..., rows]
+                return np.asarray(values[..., 0] if len(rows) == 1 else values)
+        name = name_of(key, self.symbols, tuple(b.name for b in self.blocks if b.kind in ("state", "matrix")))
+        b = self.block(name)
+        if b.kind == "matrix":
+            return unpack_costate(self.multipliers.final_matrices[b.span], b.size)
+        values = self.multipliers.final[b.span]
+        return np.asarray(values[0] if b.size == 1 else values)
 
     def covariance(self, a: Any, b: Any = None) -> Array:
         """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).
