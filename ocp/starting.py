@@ -94,7 +94,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     costates = _resample(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
     return Guess(
         trajectory=trajectory,
-        multipliers=_multipliers(solution.multipliers, own, mesh, statement),
+        multipliers=_multipliers(solution.multipliers, own, mesh),
         costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
         warm=True,
     )
@@ -104,10 +104,11 @@ def _resample(values: Array, old: Array, new: Array) -> Array:
     """Columns interpolated linearly from old nodes to new ones."""
     if np.array_equal(old, new):
         return values
-    return np.stack([np.interp(new, old, column) for column in values.T], axis=1).reshape(new.size, values.shape[1])
+    columns = [np.interp(new, old, column) for column in values.T]
+    return np.array(columns).reshape(values.shape[1], new.size).T
 
 
-def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh, statement: Statement) -> Multipliers:
+def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
     """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
     if np.array_equal(old.nodes, new.nodes) and old.control == new.control:
         return multipliers
@@ -116,14 +117,12 @@ def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh, statement: Stat
     def at_nodes(values: Array) -> Array:
         return _resample(values / before, old.nodes, new.nodes) * after
 
-    controls = multipliers.controls
-    own = controls / quadrature_weights(old)[:, None]
     places = [m.nodes if m.control == "linear" else 0.5 * (m.nodes[1:] + m.nodes[:-1]) for m in (old, new)]
-    resampled = np.stack([np.interp(places[1], places[0], c) for c in own.T], axis=1) if statement.nu else own[:0]
+    controls = _resample(multipliers.controls / quadrature_weights(old)[:, None], *places)
     return replace(
         multipliers,
         path=at_nodes(multipliers.path),
         states=at_nodes(multipliers.states),
         matrices=at_nodes(multipliers.matrices),
-        controls=resampled.reshape(new.control_nodes, statement.nu) * quadrature_weights(new)[:, None],
+        controls=controls * quadrature_weights(new)[:, None],
     )
