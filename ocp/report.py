@@ -171,7 +171,11 @@ def _matrix(solution: Solution, block: Block) -> str:
         text = render_table([f"{kind} {block.name} at T", *labels], rows)
     multipliers = solution.multipliers.final_matrices[block.span]
     pairs = zip(*half_indices(block.size), multipliers, strict=True)
-    fixed = [[f"{block.name}[{labels[i]}, {labels[j]}]", number(value)] for i, j, value in pairs if value != 0]
+    fixed = [
+        [f"{block.name}[{labels[min(i, j)]}, {labels[max(i, j)]}]", number(value)]
+        for i, j, value in pairs
+        if value != 0
+    ]
     return text + ("\n" + render_table(["fixed at T", "multiplier"], fixed) if fixed else "")
 
 
