@@ -19,8 +19,9 @@ Converged values (the weight is C22; ell is the multiplier of x(T), H the consta
 | 1    | 10     | 7.08523968 | 3.78785027 | 0.5525941 | -0.2136105 | 0.3297389 | -1.4158328 | -0.04275282 |
 
 x(T) = 0: (x, u, E_xb) may change sign together. u = 0 is stationary for every weight, J = 5 C22, and a saddle for
-C22 > 0.0459816. x(T) = 1: above a weight between 1.7 and 1.8 there is a second local minimum, which moves x below zero
-first; for C22 = 10 it has J = 7.71199239, energy 4.22580786, E_bb(T) = 0.34861845, E_xx(T) = 0.46377416.
+C22 > 0.0459816. x(T) = 1: for C22 > 1.537619, where it meets a saddle, there is a second local minimum, which moves x
+below zero first; for C22 = 1.6 it has J = 3.48601114, for C22 = 10 J = 7.71199239, energy 4.22580786,
+E_bb(T) = 0.34861845, E_xx(T) = 0.46377416.
 
 Errata: in [5.2-22] read dE22/dt = -E12^2. The source's E_bb(T) = 2.7 and 0.69 for C22 = 0.1 and 1 in 5.2 are not
 optimal: every control with these values costs at least J = 0.466 and 2.126.

@@ -130,6 +130,17 @@ def test_unknown_lag_second_minimum():
     assert last(solution.covariance("x")) == pytest.approx(0.46377416, rel=ENTRY)
 
 
+def test_unknown_lag_second_minimum_ends():
+    """It exists above C22 = 1.537619, the least C22 = s/E_bb(T)^2 of the solutions of (I - 2 s G) u = -ell R, x(T) = 1."""
+    second = solve(unknown_lag.problem(1.6, 1.0), guess={"u": lambda s: -np.sin(np.pi * s)})
+    assert second.cost == pytest.approx(3.48601114, rel=COST)
+    assert second.optimality.curvature > 0
+    above = solve(unknown_lag.problem(1.55, 1.0), guess=second)
+    below = solve(unknown_lag.problem(1.5, 1.0), guess=second)
+    assert above.cost > solve(unknown_lag.problem(1.55, 1.0)).cost + 0.3
+    assert below.cost == pytest.approx(solve(unknown_lag.problem(1.5, 1.0)).cost, rel=COST)
+
+
 def test_unknown_lag_weights_without_rebuilding():
     """The weight is a parameter of the built problem."""
     problem = unknown_lag.problem(weight=10.0, final=1.0)
