@@ -131,7 +131,7 @@ def test_unknown_lag_second_minimum():
 
 
 def test_unknown_lag_second_minimum_ends():
-    """It exists above C22 = 1.537619, the least C22 = s/E_bb(T)^2 of the solutions of (I - 2 s G) u = -ell R, x(T) = 1."""
+    """It exists above C22 = 1.537619, the least C22 = s/E_bb(T)^2 along (I - 2 s G) u = -ell R with x(T) = 1."""
     second = solve(unknown_lag.problem(1.6, 1.0), guess={"u": lambda s: -np.sin(np.pi * s)})
     assert second.cost == pytest.approx(3.48601114, rel=COST)
     assert second.optimality.curvature > 0
