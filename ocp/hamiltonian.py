@@ -10,7 +10,7 @@ values (`discrete_costates`), and by integrating the continuous adjoint equation
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,12 +33,15 @@ class Costates:
     matrices: Array
 
 
-def hamiltonian(statement: Statement, *, cost: bool = True) -> Callable[[str, Callable[..., list[Any]]], ca.Function]:
+def hamiltonian(
+    statement: Statement, *, cost: bool = True, matrices: bool = True
+) -> Callable[[str, Callable[..., list[Any]]], ca.Function]:
     """Maker of functions of (x, u, e, t, T, p, costate of x, costate of e) built on the Hamiltonian.
 
     Args:
         statement: the problem.
         cost: whether the running cost is in it; influence functions of terminal conditions are costates without.
+        matrices: whether tr(P V) is in it; it is zero for conditions on the nominal alone.
 
     Returns:
         make(name, select): `select(H, x, u, e, t)` gives the outputs, expressions in the statement's own symbols.
@@ -48,7 +51,7 @@ def hamiltonian(statement: Statement, *, cost: bool = True) -> Callable[[str, Ca
     symbols = {name: symbolic.sym(name, size) for name, size in sizes.items()}
     costate_x, costate_e = symbolic.sym("lx", statement.nx), symbolic.sym("le", statement.ne)
     rates, matrix_rates, running = statement.rates(*symbols.values())
-    value = ca.dot(costate_x, rates) + ca.dot(costate_e, matrix_rates) + (running if cost else 0)
+    value = ca.dot(costate_x, rates) + (ca.dot(costate_e, matrix_rates) if matrices else 0) + (running if cost else 0)
 
     def make(name: str, select: Callable[..., list[Any]]) -> ca.Function:
         outputs = select(value, symbols["x"], symbols["u"], symbols["e"], symbols["t"])
@@ -141,23 +144,43 @@ def adjoint_interval(statement: Statement, substeps: int, step: Step) -> ca.Func
 def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     """Costates of the discretised problem, by the adjoint sweep from the multipliers at the end.
 
+    Where the problem was shot in segments, each is swept from the multipliers of the continuity at its end: a nominal
+    that is unstable would amplify the error of those at the end of all.
+
     Returns:
         Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
         multipliers of control bounds; its slope by T through the intervals.
     """
     st, mesh = extremal.statement, extremal.mesh
     n = mesh.intervals
-    last = np.concatenate(terminal_costates(extremal))
-    jumps = impulses(extremal)
-    sweep = adjoint_interval(st, mesh.substeps, mesh.step).mapaccum("sweep", n)
-    backward = list(range(n - 1, -1, -1))
-    columns = [column[:, backward] for column in (ca.DM(jumps[:-1].T), _stack(extremal)[:, :n], *_columns(extremal))]
-    values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in sweep(last, *columns))
-    costates = np.vstack([values.T, last])
+    step = adjoint_interval(st, mesh.substeps, mesh.step)
+    columns = (ca.DM(impulses(extremal)[:-1].T), _stack(extremal)[:, :n], *_columns(extremal))
+    parts, costates = [], [np.concatenate(terminal_costates(extremal))[:, None]]
+    for first, after, known in _segments_backward(extremal):
+        end = costates[0][:, 0].copy()
+        end[: known.size] = known
+        backward = list(range(after - 1, first - 1, -1))
+        outputs = step.mapaccum("sweep", len(backward))(end, *(column[:, backward] for column in columns))
+        values, *rest = (np.asarray(v.full())[:, ::-1] for v in outputs)
+        costates.insert(0, values)
+        parts.insert(0, rest)
+    by_start, by_end, by_duration = (np.hstack(entry) for entry in zip(*parts, strict=True))
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start.T
     slopes[int(mesh.control == "linear") :][:n] += by_end.T
-    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, float(by_duration.sum())
+    stacked = np.hstack(costates).T
+    return Costates(state=stacked[:, : st.nx], matrices=stacked[:, st.nx :]), slopes, float(by_duration.sum())
+
+
+def _segments_backward(extremal: Extremal) -> Iterator[tuple[int, int, Array]]:
+    """First and last node of each shooting segment, from the last to the first, and the costates known at its end."""
+    mesh, gaps = extremal.mesh, extremal.multipliers.gaps
+    if gaps.shape[0] != len(mesh.segments):
+        yield 0, mesh.intervals, np.zeros(0)
+        return
+    for k in range(len(mesh.segments) - 1, -1, -1):
+        inside = k < len(mesh.segments) - 1
+        yield mesh.starts[k], mesh.starts[k + 1], gaps[k] if inside else np.zeros(0)
 
 
 def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:
@@ -178,12 +201,13 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Ar
     return values, np.asarray(end.full()).T - first[1:], np.asarray(cost.full()).ravel()
 
 
-def backward_pair(statement: Statement, *, cost: bool = True) -> ca.Function:
+def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
     """Classical Runge-Kutta step of the adjoint equations p' = -H_x, P' = -H_E backward over a pair of substeps.
 
     Args:
         statement: the problem.
         cost: False for an influence function, R' = -f_x' R: the adjoint of the rates alone.
+        matrices: False where the costates of the half-vectors are zero.
 
     Returns:
         (costates at the end, stacked x and e at start, middle and end, *common of the pair) -> costates at the start.
@@ -194,7 +218,7 @@ def backward_pair(statement: Statement, *, cost: bool = True) -> ca.Function:
     points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
     common = interval_symbols(statement, symbolic)
     ua, ub, s, ds, duration, p = common
-    slope = state_slope(statement, cost=cost)
+    slope = state_slope(statement, cost=cost, matrices=matrices)
 
     def rate(costate: Any, c: float) -> Any:
         z = points[round(2 * c)]
@@ -209,25 +233,26 @@ def backward_pair(statement: Statement, *, cost: bool = True) -> ca.Function:
     return ca.Function("backward", [after, *points, *common], [after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
 
 
-def state_slope(statement: Statement, *, cost: bool = True) -> ca.Function:
+def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
     """H_x and H_E stacked, as a function made by `hamiltonian`."""
-    make = hamiltonian(statement, cost=cost)
+    make = hamiltonian(statement, cost=cost, matrices=matrices)
     return make("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
 
 
 def part_of(common: tuple[Any, ...], c: float, d: float) -> tuple[Any, ...]:
-    """The common arguments of the part [c, d] of an interval, 0 <= c < d <= 1."""
+    """The common arguments of the part [c, d] of an interval, 0 <= c <= d <= 1."""
     ua, ub, s, ds, duration, p = common
     return ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, (d - c) * ds, duration, p
 
 
-def backward_interval(statement: Statement, pairs: int, influences: int = 0) -> ca.Function:
+def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, matrices: bool = True) -> ca.Function:
     """Costates and influence functions backward over the pairs of substeps of one control interval.
 
     Args:
         statement: the problem.
         pairs: Runge-Kutta steps.
         influences: number of influence functions, columns beside the costates.
+        matrices: whether the influence functions have costates of the half-vectors that are not zero.
 
     Returns:
         (columns at the end (size, 1 + influences), impulse at the start, x and e stacked at the starts, middles and
@@ -238,7 +263,7 @@ def backward_interval(statement: Statement, pairs: int, influences: int = 0) -> 
     after, impulse = ca.MX.sym("after", size, 1 + influences), ca.MX.sym("impulse", size)
     z = ca.MX.sym("z", size, 2 * pairs + 1)
     common = interval_symbols(statement, ca.MX)
-    steps = [backward_pair(statement)] + [backward_pair(statement, cost=False)] * bool(influences)
+    steps = [backward_pair(statement), backward_pair(statement, cost=False, matrices=matrices)]
     columns, passed = ca.horzsplit(after), []
     for j in range(pairs - 1, -1, -1):
         points = (z[:, 2 * j], z[:, 2 * j + 1], z[:, 2 * j + 2], *part_of(common, j / pairs, (j + 1) / pairs))
@@ -258,13 +283,18 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     Returns:
         Costates at the nodes.
     """
-    st, n, size = extremal.statement, extremal.mesh.intervals, extremal.statement.nx + extremal.statement.ne
+    st, size = extremal.statement, extremal.statement.nx + extremal.statement.ne
     values, _, _ = fine_trajectory(extremal, 2 * pairs)
-    sweep = backward_interval(st, pairs).mapaccum("sweep", n)
-    backward = list(range(n - 1, -1, -1))
-    last = np.concatenate(terminal_costates(extremal))
-    stacked = ca.DM(values[::-1].transpose(2, 0, 1).reshape(size, -1))
-    columns = [column[:, backward] for column in _columns(extremal)]
-    result, _ = sweep(last, ca.DM(impulses(extremal)[:-1][::-1].T), stacked, *columns)
-    costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
-    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
+    step = backward_interval(st, pairs)
+    impulse, columns = ca.DM(impulses(extremal)[:-1].T), _columns(extremal)
+    costates = [np.concatenate(terminal_costates(extremal))[:, None]]
+    for first, after, known in _segments_backward(extremal):
+        end = costates[0][:, 0].copy()
+        end[: known.size] = known
+        backward = list(range(after - 1, first - 1, -1))
+        points = ca.DM(values[backward].transpose(2, 0, 1).reshape(size, -1))
+        chosen = (impulse[:, backward], points, *(column[:, backward] for column in columns))
+        result, _ = step.mapaccum("sweep", len(backward))(end, *chosen)
+        costates.insert(0, np.asarray(result.full())[:, ::-1])
+    stacked = np.hstack(costates).T
+    return Costates(state=stacked[:, : st.nx], matrices=stacked[:, st.nx :])

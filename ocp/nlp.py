@@ -156,6 +156,7 @@ class NLP:
         costate = by_kind["gap_x"][-st.nx :]
         slope_x, slope_e = terminal_slopes(st, trajectory, parameters, end, path[-1], mesh)
         final_matrices = zero.final_matrices.copy()
+        gaps = [by_kind[kind].reshape(len(mesh.segments), -1) for kind in ("gap_x", "gap_e") if kind in by_kind]
         if "e" in parts:
             matrices[starts[1:-1]] = (parts["e"] / self.scales.e)[1:-1]
             final_matrices = by_kind["gap_e"][-st.ne :] - slope_e
@@ -171,6 +172,7 @@ class NLP:
             states=states,
             matrices=matrices,
             controls=parts["u"] / self.scales.u,
+            gaps=np.hstack(gaps),
         )
 
     def pack_multipliers(self, multipliers: Multipliers, costates: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -31,6 +31,8 @@ class Multipliers:
     path: of the path inequalities at the nodes, shape (N + 1, rows).
     states, matrices: of the bounds on states and half-vectors at the nodes, shapes (N + 1, nx), (N + 1, ne).
     controls: of the bounds on the controls, shape (N + 1 or N, nu).
+    gaps: of the continuity at the ends of the shooting segments: the costates there, a row for each segment, shape
+        (segments, nx) or, where half-vectors are variables, (segments, nx + ne); no row where nothing was shot.
 
     Multipliers at nodes belong to the discretised problem: divided by the weight of the node in the time integral they
     approximate the densities of the continuous problem.
@@ -44,6 +46,7 @@ class Multipliers:
     states: Array = field(default_factory=lambda: np.zeros((0, 0)))
     matrices: Array = field(default_factory=lambda: np.zeros((0, 0)))
     controls: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    gaps: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @staticmethod
     def zero(statement: Statement, mesh: Mesh) -> Multipliers:
