@@ -73,14 +73,16 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         at_controls = solution.at(0.5 * (mesh.nodes[:-1] + mesh.nodes[1:]) * solution.duration)
     plain = first_guess(statement, mesh, parameters)
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
-    matched = True
+    t, m = solution.trajectory, solution.multipliers
+    matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
     for block in (*statement.states, *statement.controls, *statement.matrices):
         other = next(
             (b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None
         )
+        matched = matched and other is not None and other.offset == block.offset
         if other is None:
-            matched = False
-        elif block.kind == "state":
+            continue
+        if block.kind == "state":
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
         elif block.kind == "control":
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
@@ -89,12 +91,13 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     if same and matched and solution.trajectory.u.shape == u.shape:
         u = solution.trajectory.u.copy()
     trajectory = Trajectory(x=x, u=u, e=e, duration=duration)
-    if not matched or not solution.converged or solution.multipliers.path.shape[1] != statement.path.size:
+    constraints = (statement.path.size, statement.start.size, statement.end.size)
+    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
         return Guess(trajectory=trajectory, warm=True)
     costates = _resample(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
     return Guess(
         trajectory=trajectory,
-        multipliers=_multipliers(solution.multipliers, own, mesh),
+        multipliers=_multipliers(m, own, mesh),
         costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
         warm=True,
     )
