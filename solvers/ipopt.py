@@ -12,7 +12,7 @@ import numpy as np
 
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import choose_scales, first_guess, stiffness
+from covocp.guess import choose_scales, stiffness
 from covocp.integrators import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
@@ -20,7 +20,6 @@ from covocp.nlp import NLP
 from covocp.progress import Progress
 from covocp.shooting import transcribe
 from covocp.statement import Statement
-from covocp.trajectory import Trajectory
 
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
@@ -96,6 +95,7 @@ def prepare(
     stiff = stiffness(statement, options.nodes(), options.control, statement.values, matrices=step == "rk4")
     mesh = choose_mesh(statement, options, stiff)
     limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
+    limited = limited and plugin == "ipopt"
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
     settings["calc_lam_p"] = False
     if plugin == "ipopt":
@@ -180,11 +180,9 @@ class ShootingSolver:
     def _build(self, parameters: Array, guess: Guess) -> tuple[NLP, ca.Function]:
         """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts."""
         if self._nlp is None or self._cold is None:
-            stretch = STRETCH if self._limited else 1.0
-            typical = guess.trajectory
-            if guess.warm:  # a solution may rest at zero, which says nothing about magnitudes
-                typical = _larger(typical, first_guess(self._statement, self._mesh, parameters))
-            scales = choose_scales(self._statement, typical, parameters, stretch=stretch)
+            scales = choose_scales(self._statement, self._mesh, guess.trajectory, parameters)
+            if self._limited:
+                scales = replace(scales, x=STRETCH * scales.x)
             self._nlp = transcribe(self._statement, self._mesh, scales)
             if self._plugin == "ipopt":
                 self._monitor = _Monitor(self._nlp)
@@ -222,25 +220,23 @@ class ShootingSolver:
     def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Array) -> float:
         """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
 
-        Never above the size of cost and gradient, so that the tolerance keeps its meaning.
+        Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
         """
+        if not solver.has_function("nlp_grad_f"):  # another plugin
+            return 1.0
         gradient = solver.get_function("nlp_grad_f")
         p = np.append(parameters, 1.0)
         value, first = (np.asarray(v.full()).ravel() for v in gradient(w0, p))
         size = float(np.linalg.norm(first))
-        largest = max(abs(float(value[0])), float(np.abs(first).max(initial=0.0)))
-        if not np.isfinite(largest) or size == 0.0:
+        count = self._mesh.control_nodes * self._statement.nu + int(self._statement.duration.free)
+        largest = max(abs(float(value[0])), float(np.abs(first[first.size - count :]).max(initial=0.0)))
+        if not np.isfinite(size) or size == 0.0:
             return 1.0
+        largest = largest if largest > 0.0 else size
         step = PROBE / size
         second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
-
-
-def _larger(one: Trajectory, two: Trajectory) -> Trajectory:
-    """The larger magnitudes of two trajectories on one mesh."""
-    x, u, e = (np.maximum(np.abs(getattr(one, n)), np.abs(getattr(two, n))) for n in ("x", "u", "e"))
-    return Trajectory(x=x, u=u, e=e, duration=one.duration)
 
 
 class _Monitor(ca.Callback):
