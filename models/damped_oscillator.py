@@ -28,15 +28,7 @@ read dP/dt.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
-import numpy.typing as npt
-from scipy.linalg import expm, solve_continuous_lyapunov
-
 import covocp as co
-
-Array = npt.NDArray[np.float64]
 
 DURATION = 10.0  # s
 FINAL = 10.0  # [y]
@@ -63,7 +55,7 @@ def problem(
 
     Returns:
         The problem, with states "y" and "rate", unknowns "a" and "b", control "u", measurement "position" and
-        covariance "E" of (y, rate, a, b). The guess of the control is the one of least energy, as in the source [5.5].
+        covariance "E" of (y, rate, a, b).
 
     Raises:
         ProblemError: where the naming is unknown, or the measurement noise not positive.
@@ -82,7 +74,7 @@ def problem(
     rate = ocp.state("rate", initial=0.0, final=0.0, variance=INITIAL_VARIANCE)
     a, b = (ocp.unknown(name, mean=mean, variance=PARAMETER_VARIANCE) for name, mean in MEANS.items())
     damping, stiffness = (a, b) if naming == "table" else (b, a)
-    u = ocp.control("u", guess=least_energy_control(naming))
+    u = ocp.control("u")
     ocp.dynamics(y, rate)
     ocp.dynamics(rate, -stiffness * y - damping * rate + u, noise=PROCESS_NOISE)
     ocp.measurement("position", y, noise=measurement_noise)
@@ -91,26 +83,15 @@ def problem(
     return ocp
 
 
-def least_energy_control(naming: str = "table") -> Callable[[Array], Array]:
-    """Control that reaches the final state of the nominal with least energy, Schmidt [5.5].
-
-    u(t) = B' exp(A' (T - t)) W^-1 x(T), W the controllability Gramian.
-
-    Args:
-        naming: as for `problem`.
-
-    Returns:
-        The control as a function of s = t/T, of the shape of s.
-    """
-    damping, stiffness = MEANS.values() if naming == "table" else reversed(MEANS.values())
-    A, B = np.array([[0.0, 1.0], [-stiffness, -damping]]), np.array([[0.0], [1.0]])
-    final = expm(A * DURATION) @ B
-    gramian = solve_continuous_lyapunov(A, final @ final.T - B @ B.T)
-    multiplier = np.linalg.solve(gramian, np.array([FINAL, 0.0]))
-
-    def control(s: Array) -> Array:
-        """At the fractions s of the duration."""
-        remaining = DURATION * (1 - np.asarray(s, dtype=float))
-        return np.asarray((expm(A * remaining[..., None, None]) @ B)[..., 0] @ multiplier)
-
-    return control
+def figures() -> dict[str, list[tuple[str, co.Problem]]]:
+    """What the figures of Schmidt 5.4 and 5.5 show: no weight, one on the damping, one on the stiffness; by title."""
+    weights = {
+        "no weight": (0.0, 0.0),
+        "weight on the damping": (1000.0, 0.0),
+        "weight on the stiffness": (0.0, 1000.0),
+    }
+    return {
+        "Schmidt 5.4: identification of damping and stiffness": [
+            (label, problem(damping_weight=a, stiffness_weight=b)) for label, (a, b) in weights.items()
+        ]
+    }

@@ -91,8 +91,7 @@ def problem(
             "duration_weight").
 
     Returns:
-        The problem, with state "x", unknown "b", control "u", measurement "position" and covariance "E" of (x, b). The
-        guess of the control is a sine: u = 0 would be a stationary point.
+        The problem, with state "x", unknown "b", control "u", measurement "position" and covariance "E" of (x, b).
 
     Raises:
         ProblemError: where a variance is negative, or the duration not positive.
@@ -102,7 +101,7 @@ def problem(
     terminal_weight = ocp.parameter("weight", weight)
     x = ocp.state("x", initial=0.0, final=final, variance=initial_variance)
     b = ocp.unknown("b", mean=MEAN, variance=parameter_variance)
-    u = ocp.control("u", guess=lambda s: np.sin(np.pi * s))
+    u = ocp.control("u")
     ocp.dynamics(x, -b * x + u, noise=PROCESS_NOISE)
     ocp.measurement("position", x, noise=MEASUREMENT_NOISE)
     E = ocp.estimation_covariance()
@@ -204,3 +203,12 @@ def _coefficients(values: Array) -> Array:
 def _at(values: Array, fractions: Array) -> Array:
     """The polynomial through values at the Gauss-Legendre nodes of [0, 1], at other fractions."""
     return np.asarray(legendre.legval(2 * fractions - 1, _coefficients(values)))
+
+
+def figures() -> dict[str, list[tuple[str, co.Problem]]]:
+    """What the figures of Schmidt 5.2 and 5.3 show: three weights each; by title, with the labels of the curves."""
+    weights = (0.1, 1.0, 10.0)
+    return {
+        "Schmidt 5.2: identification at equilibrium": [(f"weight {w:g}", problem(w, final=0.0)) for w in weights],
+        "Schmidt 5.3: identification during a transient": [(f"weight {w:g}", problem(w, final=1.0)) for w in weights],
+    }

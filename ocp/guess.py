@@ -23,6 +23,7 @@ from covocp.trajectory import Trajectory
 BENDING = 1.0
 RANDOM_AMPLITUDE = 1.0
 STEERING_STEPS = 4
+RESPONSE_STEP = 1e-3
 STEERING_TOLERANCE = 1e-6
 
 
@@ -334,22 +335,47 @@ def _jacobian(statement: Statement, select: Callable[[list[Any], list[Any]], Any
     return ca.Function("jacobian", symbols, [select(symbols, list(statement.rates(*symbols)))])
 
 
-def choose_scales(statement: Statement, trajectory: Trajectory, parameters: Array, *, stretch: float = 1.0) -> Scales:
-    """Magnitudes from the given scales, bounds, boundary values and guess; those of the states times `stretch`."""
-    x0, xf, _, _ = statement.boundary_values(parameters)
+def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
+    """Magnitudes from the given scales, bounds, boundary values, standard deviations and the guess."""
+    x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
-    candidates = [np.abs(trajectory.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
+    candidates = [np.abs(guess.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
+    for block in statement.matrices:
+        if block.estimation:
+            diagonal = np.diagonal(unpack(np.nan_to_num(e0[block.span]), block.size))
+            candidates.append(np.sqrt(np.maximum(diagonal[: statement.nx], 0.0)))
     span = upper - lower
     x = np.max(candidates, axis=0)
-    x = np.where(np.isfinite(span) & (span > 0), np.maximum(np.where(x > 0, np.minimum(x, span), span), 1e-3 * span), x)
-    x = np.where(x > 0, x, 1.0)
-    u = np.ones(statement.nu)
+    bounded = np.isfinite(span) & (span > 0)
+    x = np.where(bounded, np.clip(x, 1e-3 * span, np.where(x > 0, span, np.inf)), x)
+    x = np.where(x > 0, x, np.where(bounded, span, 1.0))
     for block in statement.states:
         if block.name in statement.scales:
             x[block.span] = statement.scales[block.name]
+    u = np.ones(statement.nu)
+    response = None
     for block in statement.controls:
-        u[block.span] = control_scale(statement, block, trajectory.u[:, block.span])
-    return Scales(x=stretch * x, u=u, e=_matrix_scales(statement, trajectory.e), duration=statement.duration.guess)
+        u[block.span] = control_scale(statement, block, guess.u[:, block.span])
+        bounds = np.concatenate([bound[block.span] for bound in statement.control_bounds])
+        if block.name not in statement.scales and not np.isfinite(bounds).all() and not statement.coupled:
+            response = _needed_controls(statement, mesh, guess, x, parameters) if response is None else response
+            magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
+            u[block.span] = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
+    return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+
+
+def _needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
+    """Constant changes of each control that move some state by its scale, to first order; 0 where none does."""
+    needed = np.zeros(statement.nu)
+    base = simulate_states(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
+    for i in range(statement.nu):
+        changed = guess.u.copy()
+        step = RESPONSE_STEP * max(1.0, float(np.abs(guess.u[:, i]).max(initial=0.0)))
+        changed[:, i] += step
+        moved = simulate_states(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
+        response = float((np.abs(moved - base).max(axis=0, initial=0.0) / scale).max(initial=0.0)) / step
+        needed[i] = 1.0 / response if np.isfinite(response) and response > 0 else 0.0
+    return needed
 
 
 def _matrix_scales(statement: Statement, e: Array) -> Array:
