@@ -10,19 +10,18 @@ from pathlib import Path
 from covocp.errors import ExportError, describe
 
 
-@contextmanager
-def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
-    """A temporary file in the folder of `path`, renamed to `path` at the end and removed after an error.
+def check_target(path: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """The path, where a file could be written.
 
     Args:
-        path: where the file is wanted; its folder must exist.
+        path: where a file is wanted.
         suffixes: the ones that can be written, such as ".npz".
 
-    Yields:
-        The path to write to, with the same suffix.
+    Returns:
+        The path.
 
     Raises:
-        ExportError: unknown suffix, folder missing, or the file cannot be written.
+        ExportError: unknown suffix, or no such folder.
     """
     target = Path(path)
     if target.suffix.lower() not in suffixes:
@@ -43,6 +42,24 @@ def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]
                 remedy="make the folder, or write elsewhere",
             )
         )
+    return target
+
+
+@contextmanager
+def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
+    """A temporary file in the folder of `path`, renamed to `path` at the end and removed after an error.
+
+    Args:
+        path: where the file is wanted; its folder must exist.
+        suffixes: the ones that can be written, such as ".npz".
+
+    Yields:
+        The path to write to, with the same suffix.
+
+    Raises:
+        ExportError: unknown suffix, folder missing, or the file cannot be written.
+    """
+    target = check_target(path, suffixes)
     part = target.with_name(f".{uuid.uuid4().hex}{target.suffix.lower()}")
     try:
         yield part

@@ -1,0 +1,259 @@
+"""The command `covocp`: list, solve, compare and plot models and the user's own problems."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import covocp as co
+from covocp.catalogue import find_model, models, parse_value, split_setting
+from covocp.errors import CovocpError, ProblemError, SolveError, describe
+from covocp.files import check_target
+from covocp.plot import SUFFIXES as FIGURES
+from covocp.storage import SUFFIXES as FILES
+
+FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
+# Arguments of `solve` that have an option of their own here.
+TAKEN = ("problem", "method", "intervals", "progress", "allow_failure", "parameters", "methods", "method_options")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Args:
+        arguments: those of the command line without the command; None: of this process.
+
+    Returns:
+        0; 1 where a solve failed, 2 where the input is wrong, 130 where it was interrupted before an iterate existed.
+    """
+    parsed = _parser().parse_args(arguments)
+    try:
+        with _plain_warnings():
+            return int(parsed.run(parsed))
+    except SolveError as error:
+        return _complain(error, FAILED)
+    except CovocpError as error:
+        return _complain(error, WRONG_INPUT)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of the output has gone: `covocp list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing left to flush at the end
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The options of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="covocp", description="Optimal control of a trajectory together with its uncertainty."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    listing = commands.add_parser("list", help="show the models with their parameters")
+    listing.set_defaults(run=_list)
+    solve = commands.add_parser("solve", help="solve a model and print what came out")
+    _common(solve)
+    solve.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
+    solve.add_argument("--plot", "--output", metavar="FILE", help="write a figure (" + ", ".join(FIGURES) + ")")
+    solve.add_argument("--save", metavar="FILE", help="write the solution (" + ", ".join(FILES) + ")")
+    solve.set_defaults(run=_solve)
+    compare = commands.add_parser("compare", help="solve a model by several methods and print a table")
+    _common(compare)
+    compare.add_argument(
+        "--method",
+        action="append",
+        help="may be given several times; all methods by default: " + ", ".join(co.methods()),
+    )
+    compare.add_argument("--plot", "--output", metavar="FILE", help="write a figure of all solutions")
+    compare.set_defaults(run=_compare)
+    plot = commands.add_parser("plot", help="solve a model and draw its figures")
+    _common(plot)
+    plot.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
+    plot.add_argument("--plot", "--output", metavar="FILE", help="name of the figures; MODEL.png by default")
+    plot.set_defaults(run=_plot)
+    return parser
+
+
+def _common(parser: argparse.ArgumentParser) -> None:
+    """Options of every command that solves."""
+    parser.add_argument("model", metavar="MODEL", help="a name from `covocp list`, or path/to/script.py:function")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the model; may be repeated"
+    )
+    parser.add_argument("--intervals", type=_whole, default=100, metavar="N", help="control intervals (100)")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="an option of the solver; may be repeated"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print errors only")
+
+
+def _whole(text: str) -> int:
+    """A positive whole number of the command line."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive whole number")
+    return number
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    """covocp list."""
+    for model in models():
+        words = " ".join(f"{name}={value}" for name, value in model.defaults().items())
+        print(f"{model.name}\n    {model.description}")
+        print(f"    --set {words}\n" if words else "    no parameters\n")
+    return 0
+
+
+def _solve(arguments: argparse.Namespace) -> int:
+    """covocp solve MODEL."""
+    _check_targets((arguments.plot, FIGURES), (arguments.save, FILES))
+    problem = find_model(arguments.model).build(arguments.set)
+    solution, code = _solved(problem, arguments)
+    if solution is None:
+        return code
+    if not arguments.quiet:
+        print(solution)
+    if arguments.plot:
+        solution.plot(path=arguments.plot)
+        _say(arguments, f"figure: {arguments.plot}")
+    if arguments.save:
+        solution.save(arguments.save)
+        _say(arguments, f"solution: {arguments.save}")
+    return code
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    """covocp compare MODEL."""
+    _check_targets((arguments.plot, FIGURES))
+    problem = find_model(arguments.model).build(arguments.set)
+    methods = arguments.method or list(co.methods())
+    shared, own = _options(arguments.option, co.methods())
+    comparison = co.compare(
+        problem, methods, intervals=arguments.intervals, progress=not arguments.quiet, method_options=own, **shared
+    )
+    if not arguments.quiet:
+        print(comparison)
+    if arguments.plot and comparison.solutions:
+        comparison.plot(path=arguments.plot)
+        _say(arguments, f"figure: {arguments.plot}")
+    return 0 if comparison.converged else FAILED
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    """covocp plot MODEL."""
+    model = find_model(arguments.model)
+    target = check_target(arguments.plot or f"{model.name}.png", FIGURES)
+    figures = model.figures() if not arguments.set else {}
+    figures = figures or {"": [("", model.build(arguments.set))]}
+    worst = 0
+    for number, (title, problems) in enumerate(figures.items(), start=1):
+        path = target if len(figures) == 1 else target.with_name(f"{target.stem}-{number}{target.suffix}")
+        worst = max(worst, _figure(title, problems, path, arguments))
+    return worst
+
+
+def _figure(title: str, problems: list[tuple[str, Any]], path: Path, arguments: argparse.Namespace) -> int:
+    """Solve the problems of one figure and draw it."""
+    from covocp.plot import plot_solutions
+
+    worst, labels, solutions = 0, [], []
+    for label, problem in problems:
+        solution, code = _solved(problem, arguments)
+        worst = max(worst, code)
+        if solution is not None:
+            labels.append(label)
+            solutions.append(solution)
+    if solutions:
+        plot_solutions(solutions, labels=labels, title=title or None, path=path)
+        _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
+    return worst
+
+
+def _solved(problem: Any, arguments: argparse.Namespace) -> tuple[Any, int]:
+    """The solution, or the last iterate, and the exit code; a failure is told on the standard error."""
+    shared, own = _options(arguments.option, (arguments.method,))
+    options = {**shared, **own.get(arguments.method, {})}
+    try:
+        solution = co.solve(
+            problem, arguments.method, intervals=arguments.intervals, progress=not arguments.quiet, **options
+        )
+    except SolveError as error:
+        _complain(error, FAILED)
+        return error.solution, FAILED
+    except CovocpError:
+        raise
+    except (RuntimeError, TypeError, ValueError, ArithmeticError, ImportError) as error:
+        raise ProblemError(
+            describe(
+                f"The problem could not be given to {arguments.method}.",
+                expected="options that it understands, and a model that can be evaluated",
+                received=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
+                remedy="check the values of --option and --set",
+            )
+        ) from error
+    return solution, 0
+
+
+def _options(given: list[str], methods: Sequence[str]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Options of the solver: for all methods, and by method where they are written method.name=value."""
+    shared: dict[str, Any] = {}
+    own: dict[str, dict[str, Any]] = {}
+    for entry in given:
+        name, value = split_setting("--option", entry)
+        method, dot, rest = name.partition(".")
+        if dot and method in methods:
+            own.setdefault(method, {})[rest] = parse_value(value)
+        elif name in TAKEN:
+            raise ProblemError(
+                describe(
+                    f"'{name}' is not an option of the solver.",
+                    expected="an option of the method or the mesh, such as control=constant",
+                    received=f"--option {entry}",
+                    remedy=f"use --{name}" if name in ("method", "intervals") else "remove it",
+                )
+            )
+        else:
+            shared[name] = parse_value(value)
+    return shared, own
+
+
+def _check_targets(*targets: tuple[str | None, tuple[str, ...]]) -> None:
+    """Complain about files that cannot be written before anything is solved."""
+    for path, suffixes in targets:
+        if path is not None:
+            check_target(path, suffixes)
+
+
+def _say(arguments: argparse.Namespace, text: str) -> None:
+    if not arguments.quiet:
+        print(f"\n{text}")
+
+
+def _complain(error: object, code: int) -> int:
+    """A message on the standard error."""
+    print(f"covocp: {error}", file=sys.stderr)
+    return code
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings as lines without the place in the code."""
+
+    def show(message: Warning | str, *place: Any) -> None:
+        print(f"covocp: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", co.CovocpWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
+if __name__ == "__main__":
+    sys.exit(main())
