@@ -95,17 +95,3 @@ def figures() -> dict[str, list[tuple[str, co.Problem]]]:
             (label, problem(damping_weight=a, stiffness_weight=b)) for label, (a, b) in weights.items()
         ]
     }
-
-
-def figures() -> dict[str, list[tuple[str, co.Problem]]]:
-    """What the figures of Schmidt 5.4 and 5.5 show: no weight, one on the damping, one on the stiffness; by title."""
-    weights = {
-        "no weight": (0.0, 0.0),
-        "weight on the damping": (1000.0, 0.0),
-        "weight on the stiffness": (0.0, 1000.0),
-    }
-    return {
-        "Schmidt 5.4: identification of damping and stiffness": [
-            (label, problem(damping_weight=a, stiffness_weight=b)) for label, (a, b) in weights.items()
-        ]
-    }

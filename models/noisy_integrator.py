@@ -131,13 +131,3 @@ def figures() -> dict[str, list[tuple[str, co.Problem]]]:
             (label, problem(alpha, beta)) for label, (alpha, beta) in weights.items()
         ]
     }
-
-
-def figures() -> dict[str, list[tuple[str, co.Problem]]]:
-    """What Schmidt 3.4 compares: no weight, one on the integral of E, one on E(1); by title, with labels."""
-    weights = {"a: energy only": (0.0, 0.0), "b: integral of E": (0.0, 1.0), "c: E at the end": (1.0, 0.0)}
-    return {
-        "Schmidt 3.4: integrator with state-dependent noise": [
-            (label, problem(alpha, beta)) for label, (alpha, beta) in weights.items()
-        ]
-    }

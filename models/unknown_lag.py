@@ -212,12 +212,3 @@ def figures() -> dict[str, list[tuple[str, co.Problem]]]:
         "Schmidt 5.2: identification at equilibrium": [(f"weight {w:g}", problem(w, final=0.0)) for w in weights],
         "Schmidt 5.3: identification during a transient": [(f"weight {w:g}", problem(w, final=1.0)) for w in weights],
     }
-
-
-def figures() -> dict[str, list[tuple[str, co.Problem]]]:
-    """What the figures of Schmidt 5.2 and 5.3 show: three weights each; by title, with the labels of the curves."""
-    weights = (0.1, 1.0, 10.0)
-    return {
-        "Schmidt 5.2: identification at equilibrium": [(f"weight {w:g}", problem(w, final=0.0)) for w in weights],
-        "Schmidt 5.3: identification during a transient": [(f"weight {w:g}", problem(w, final=1.0)) for w in weights],
-    }
