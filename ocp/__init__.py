@@ -10,6 +10,8 @@ if __name__ != "covocp":
         "This folder is the source of the package 'covocp'. Install it (pip install -e .) and import covocp instead."
     )
 
+from covocp.certify import Certificate as Certificate
+from covocp.certify import certify as certify
 from covocp.declarations import Free as Free
 from covocp.errors import CovocpError as CovocpError
 from covocp.errors import CovocpWarning as CovocpWarning
