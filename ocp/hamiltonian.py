@@ -10,15 +10,16 @@ values (`discrete_costates`), and by integrating the continuous adjoint equation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.extremal import Extremal
-from covocp.integrators import Step, full_interval, interval_symbols
+from covocp.integrators import KEPT, Step, full_interval, interval_symbols
 from covocp.matrices import Array
 from covocp.nlp import terminal_slopes
 from covocp.shooting import common_columns
@@ -123,22 +124,25 @@ def _stack(extremal: Extremal) -> Any:
     return ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
 
 
+@lru_cache(maxsize=KEPT)
 def adjoint_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
     """Adjoint of one discrete control interval.
 
     Returns:
-        (costates at the end, impulse at the start, x and e stacked, *common) -> costates at the start, slopes of the
-        Lagrangian by the control at the start, by that at the end, by T.
+        (costates at the end, which of them to keep (1 or 0), values in place of the others, impulse at the start,
+        x and e stacked, *common) -> costates at the start, slopes of the Lagrangian by the control at the start, by
+        that at the end, by T.
     """
     interval = full_interval(statement, substeps, step)
     symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
     size = statement.nx + statement.ne
-    after, impulse, z = symbolic.sym("after", size), symbolic.sym("impulse", size), symbolic.sym("z", size)
+    after, keep, known, impulse, z = (symbolic.sym(name, size) for name in ("after", "keep", "known", "impulse", "z"))
     common = interval_symbols(statement, symbolic)
     end, _, cost = interval(z, *common)
-    value = ca.dot(after, end) + cost
-    slopes = [ca.gradient(value, symbol) for symbol in (z, common[0], common[1], common[4])]
-    return ca.Function("adjoint", [after, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
+    value = ca.dot(keep * after + known, end) + cost
+    by = (z, common[0], common[1], *([common[4]] if statement.duration.free else []))
+    slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
+    return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
 
 
 def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
@@ -153,34 +157,17 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     """
     st, mesh = extremal.statement, extremal.mesh
     n = mesh.intervals
-    step = adjoint_interval(st, mesh.substeps, mesh.step)
-    columns = (ca.DM(impulses(extremal)[:-1].T), _stack(extremal)[:, :n], *_columns(extremal))
-    parts, costates = [], [np.concatenate(terminal_costates(extremal))[:, None]]
-    for first, after, known in _segments_backward(extremal):
-        end = costates[0][:, 0].copy()
-        end[: known.size] = known
-        backward = list(range(after - 1, first - 1, -1))
-        outputs = step.mapaccum("sweep", len(backward))(end, *(column[:, backward] for column in columns))
-        values, *rest = (np.asarray(v.full())[:, ::-1] for v in outputs)
-        costates.insert(0, values)
-        parts.insert(0, rest)
-    by_start, by_end, by_duration = (np.hstack(entry) for entry in zip(*parts, strict=True))
+    last = np.concatenate(terminal_costates(extremal))
+    sweep = adjoint_interval(st, mesh.substeps, mesh.step).mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    stacked = (*_restarts(extremal), impulses(extremal)[:-1].T, _stack(extremal)[:, :n], *_columns(extremal))
+    outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
+    values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
+    costates = np.vstack([values.T, last])
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start.T
     slopes[int(mesh.control == "linear") :][:n] += by_end.T
-    stacked = np.hstack(costates).T
-    return Costates(state=stacked[:, : st.nx], matrices=stacked[:, st.nx :]), slopes, float(by_duration.sum())
-
-
-def _segments_backward(extremal: Extremal) -> Iterator[tuple[int, int, Array]]:
-    """First and last node of each shooting segment, from the last to the first, and the costates known at its end."""
-    mesh, gaps = extremal.mesh, extremal.multipliers.gaps
-    if gaps.shape[0] != len(mesh.segments):
-        yield 0, mesh.intervals, np.zeros(0)
-        return
-    for k in range(len(mesh.segments) - 1, -1, -1):
-        inside = k < len(mesh.segments) - 1
-        yield mesh.starts[k], mesh.starts[k + 1], gaps[k] if inside else np.zeros(0)
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, float(by_duration.sum())
 
 
 def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:
@@ -283,18 +270,33 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     Returns:
         Costates at the nodes.
     """
-    st, size = extremal.statement, extremal.statement.nx + extremal.statement.ne
+    st, n = extremal.statement, extremal.mesh.intervals
+    size = st.nx + st.ne
     values, _, _ = fine_trajectory(extremal, 2 * pairs)
-    step = backward_interval(st, pairs)
-    impulse, columns = ca.DM(impulses(extremal)[:-1].T), _columns(extremal)
-    costates = [np.concatenate(terminal_costates(extremal))[:, None]]
-    for first, after, known in _segments_backward(extremal):
-        end = costates[0][:, 0].copy()
-        end[: known.size] = known
-        backward = list(range(after - 1, first - 1, -1))
-        points = ca.DM(values[backward].transpose(2, 0, 1).reshape(size, -1))
-        chosen = (impulse[:, backward], points, *(column[:, backward] for column in columns))
-        result, _ = step.mapaccum("sweep", len(backward))(end, *chosen)
-        costates.insert(0, np.asarray(result.full())[:, ::-1])
-    stacked = np.hstack(costates).T
-    return Costates(state=stacked[:, : st.nx], matrices=stacked[:, st.nx :])
+    interval = backward_interval(st, pairs)
+    after, *rest = interval.mx_in()
+    keep, known = ca.MX.sym("keep", size), ca.MX.sym("known", size)
+    start, _ = interval(keep * after + known, *rest)
+    sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    points = values[backward].transpose(2, 0, 1).reshape(size, -1)
+    stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
+    last = np.concatenate(terminal_costates(extremal))
+    result = sweep(last, *stacked, points, *(column[:, backward] for column in _columns(extremal)))
+    costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
+
+
+def _restarts(extremal: Extremal) -> tuple[Array, Array]:
+    """Which costates to keep at the ends of the intervals (1 or 0) and the values in place of the others, (size, N).
+
+    Inside, where a shooting segment ends, the multipliers of its continuity are the costates.
+    """
+    mesh, gaps = extremal.mesh, extremal.multipliers.gaps
+    size = extremal.statement.nx + extremal.statement.ne
+    keep, known = np.ones((size, mesh.intervals)), np.zeros((size, mesh.intervals))
+    if gaps.shape[0] == len(mesh.segments):
+        inner = np.array(mesh.starts[1:-1], dtype=np.intp) - 1
+        keep[: gaps.shape[1], inner] = 0.0
+        known[: gaps.shape[1], inner] = gaps[:-1].T
+    return keep, known
