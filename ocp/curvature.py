@@ -18,7 +18,7 @@ from covocp.shooting import common_columns, matrices_along, repeat
 from covocp.trajectory import Trajectory
 
 # A constraint whose multiplier is above this share of the largest one is active.
-ACTIVE = 1e-8
+ACTIVE = 1e-5
 LANCZOS_STEPS = 30
 DISPLACEMENT = 0.3
 
@@ -53,7 +53,7 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     weights = np.tile(quadrature_weights(mesh)[:, None] * extremal.trajectory.duration, (1, st.nu)).ravel()
     root = np.sqrt(weights)
     multipliers = extremal.multipliers.controls.ravel()
-    free = np.abs(multipliers) <= ACTIVE * max(1.0, float(np.abs(multipliers).max(initial=0.0)))
+    free = np.abs(multipliers) <= ACTIVE * max(1e-300, float(np.abs(multipliers).max(initial=0.0)))
     u = extremal.trajectory.u.ravel()
     rows = np.asarray(jacobian(u).full())[:, free] / root[free]
     basis = _null_space(rows)

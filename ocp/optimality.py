@@ -24,7 +24,7 @@ from covocp.hamiltonian import (
 from covocp.matrices import Array
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
-ACTIVE = 1e-9
+ACTIVE = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +218,7 @@ def _variation(values: Array) -> float:
 
 
 def _transversality(extremal: Extremal, by_duration: float, values: Array) -> float:
-    """k_T + end conditions' slope + H(T), relative to the terms of H(T)."""
+    """k_T + end conditions' slope + H(T), relative to the largest terms of H."""
     st, trajectory = extremal.statement, extremal.trajectory
     duration = ca.MX.sym("T")
     value = st.terminal(trajectory.x[-1], trajectory.e[-1], duration, extremal.parameters)
@@ -226,7 +226,7 @@ def _transversality(extremal: Extremal, by_duration: float, values: Array) -> fl
         arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
         value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
     slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
-    return float(abs(slope + values[-1, 0]) / max(values[-1, 1], abs(slope), np.finfo(float).tiny))
+    return float(abs(slope + values[-1, 0]) / max(float(values[:, 1].max()), abs(slope), np.finfo(float).tiny))
 
 
 def _curvature(extremal: Extremal) -> float | None:
