@@ -1,0 +1,76 @@
+"""Problems that several tests share, each with what is known about its solution without solving it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.stats import linregress
+
+import covocp as co
+
+# Largest eigenvalue of the information operator of the first-order lag for T = 10 s [specification, 6.4].
+LAG_EIGENVALUE = 0.43495704
+
+# Cost of the first-order lag, by (x(T), weight of E_bb(T)) [specification, 6.4].
+LAG_COSTS = {
+    (0.0, 0.1): 0.44818922,
+    (0.0, 1.0): 1.91442319,
+    (0.0, 10.0): 6.55106209,
+    (1.0, 0.1): 1.30521661,
+    (1.0, 1.0): 2.62300222,
+    (1.0, 10.0): 7.08523968,
+}
+
+TIGHT = {"rtol": 1e-11, "atol": 1e-12, "method": "DOP853"}
+
+
+@dataclass(frozen=True)
+class Lag:
+    """The first-order lag with unknown time constant [specification, 6.4], and its symbols."""
+
+    problem: co.Problem
+    x: Any
+    b: Any
+    u: Any
+    E: Any
+
+
+def lag(weight=10.0, final=1.0, *, noise=1.0, guess=0.0, duration=10.0):
+    """Parameters: "weight", "start", "final" (of x), "initial" (half-vector of E(0))."""
+    ocp = co.Problem(duration=duration, name="lag")
+    C22, start, end = ocp.parameter("weight", weight), ocp.parameter("start", 0.0), ocp.parameter("final", final)
+    half = ocp.parameter("initial", [1.0, 0.0, 5.0])
+    x = ocp.state("x", initial=start, final=end)
+    b = ocp.unknown("b", mean=1.0, variance=5.0)
+    u = ocp.control("u", guess=guess)
+    ocp.dynamics(x, -b * x + u, noise=1.0)
+    ocp.measurement("position", x, noise=noise)
+    E = ocp.estimation_covariance(initial=ca.blockcat([[half[0], half[1]], [half[1], half[2]]]))
+    ocp.minimize(running=0.5 * u**2, terminal=C22 * E[b, b])
+    return Lag(problem=ocp, x=x, b=b, u=u, E=E)
+
+
+def solve(problem, **options):
+    return co.solve(problem, **{"progress": False, **options})
+
+
+def order(counts, errors):
+    """Observed order of convergence: minus the slope of log error over log count."""
+    return -linregress(np.log(counts), np.log(np.abs(errors))).slope
+
+
+def simulate(rate, start, t, u):
+    """States at the nodes t of dz/dt = rate(t, z, u), u linear between the nodes, by scipy."""
+    z = [np.asarray(start, dtype=float)]
+    for i in range(t.size - 1):
+
+        def slope(s, value, i=i):
+            c = (s - t[i]) / (t[i + 1] - t[i])
+            return rate(s, value, u[i] + c * (u[i + 1] - u[i]))
+
+        z.append(solve_ivp(slope, (t[i], t[i + 1]), z[-1], **TIGHT).y[:, -1])
+    return np.array(z)
