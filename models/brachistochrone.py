@@ -54,10 +54,10 @@ def problem() -> co.Problem:
         The problem, with states "x" [m], "y" [m, down] and "v" [m/s] and control "theta" [rad].
     """
     ocp = co.Problem(duration=co.Free(guess=2.0), name="brachistochrone")
-    x = ocp.state("x", initial=0.0, final=DISTANCE)
-    y = ocp.state("y", initial=0.0, final=DROP)
-    v = ocp.state("v", initial=0.0)
-    theta = ocp.control("theta", lower=0.0, upper=np.pi, guess=lambda s: 2.0 * s)
+    x = ocp.state("x", initial=0.0, final=DISTANCE, unit="m")
+    y = ocp.state("y", initial=0.0, final=DROP, unit="m")
+    v = ocp.state("v", initial=0.0, unit="m/s")
+    theta = ocp.control("theta", lower=0.0, upper=np.pi, guess=lambda s: 2.0 * s, unit="rad")
     ocp.dynamics(x, v * ca.sin(theta))
     ocp.dynamics(y, v * ca.cos(theta))
     ocp.dynamics(v, GRAVITY * ca.cos(theta))

@@ -50,6 +50,7 @@ class State:
     symbol: ca.MX
     size: int
     where: str
+    unit: str
     initial: ca.MX
     final: ca.MX
     lower: Array
@@ -67,6 +68,7 @@ class Unknown:
     symbol: ca.MX
     size: int
     where: str
+    unit: str
     mean: Array
     variance: ca.MX
 
@@ -79,6 +81,7 @@ class Parameter:
     symbol: ca.MX
     size: int
     where: str
+    unit: str
     value: Array
 
 
@@ -90,6 +93,7 @@ class Control:
     symbol: ca.MX
     size: int
     where: str
+    unit: str
     lower: Array
     upper: Array
     guess: Guess
@@ -105,6 +109,7 @@ class Matrix:
     matrix: ca.MX
     size: int
     where: str
+    unit: str
     initial: ca.MX | None
     final: ca.MX | None
     lower: float | None

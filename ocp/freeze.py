@@ -327,6 +327,7 @@ def _blocks(problem: Problem) -> tuple[Block, ...]:
                     labels=entry.labels if isinstance(entry, Matrix) else (),
                     covariance=isinstance(entry, Matrix) and entry.covariance,
                     estimation=isinstance(entry, Matrix) and entry.estimation,
+                    unit=entry.unit,
                 )
             )
             offset += blocks[-1].length

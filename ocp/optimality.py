@@ -40,8 +40,7 @@ class Optimality:
             relative to the largest costate of each kind.
         hamiltonian_variation: (largest - smallest H) / (largest sum of the absolute terms of H); None where the problem
             depends on time explicitly.
-        transversality: k_T + H(T) with all multipliers, same normalisation as H times 1; None for a fixed duration.
-        terminal_violation: largest violated constraint, in its own unit.
+        transversality: k_T + H(T) with all multipliers, relative to the largest terms of H; None for a fixed duration.
         mesh_error: relative change of the cost by halving the integration steps.
         control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.

@@ -238,7 +238,9 @@ def _matrix(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
         owners = [block.labels[i].split("[")[0] for i in pairs[0]]
         group = f" of {owners[0]}" if block.estimation else ""
         label = names[0] if len(pairs) == 1 else f"{block.name}, diagonal{group}"
-        panels.append(Panel(label=label + _product(owners, units), entries=tuple(names), curves=tuple(curves)))
+        own = f" [{units[block.name]}]" if units.get(block.name) else ""
+        unit = _product(owners, units) if block.estimation else own
+        panels.append(Panel(label=label + unit, entries=tuple(names), curves=tuple(curves)))
     return panels
 
 

@@ -84,7 +84,7 @@ def plot_solutions(
         labels: of the solutions, for the legend; by default what tells them apart.
         costates: whether to draw the costates of the states and matrices drawn.
         sigmas: widths of the bands in standard deviations, such as (1, 3); (): none.
-        units: by name, for the axes, such as {"y": "m"}.
+        units: by name, for the axes, such as {"y": "m"}, where the problem does not say or says something else.
         title: of the figure; by default the name of the problem. A solution that did not converge is named below it.
         path: also write the figure there (.png, .pdf or .svg).
 
@@ -99,7 +99,8 @@ def plot_solutions(
 
     given = list(solutions)
     legend = _labels(given, labels)
-    panels = choose_panels(given, names, costates=costates, units=dict(units or {}))
+    known = {block.name: block.unit for solution in given for block in solution.blocks}
+    panels = choose_panels(given, names, costates=costates, units=known | dict(units or {}))
     rows, columns = _grid(len(panels))
     with matplotlib.rc_context(STYLE):
         figure = _figure((PANEL[0] * columns, PANEL[1] * rows + HEAD))

@@ -98,6 +98,7 @@ class Problem:
         guess: Guess = None,
         scale: Any = None,
         variance: Any = None,
+        unit: str = "",
     ) -> ca.MX:
         """Declare a nominal vector state.
 
@@ -111,6 +112,7 @@ class Problem:
             guess: a number, an array over the nodes, or a function of s = t/T; None: simulated from the controls.
             scale: typical magnitude; None: from bounds, guess and simulated trajectory.
             variance: of the error of the initial estimate: scalar, vector (diagonal) or matrix; None: zero.
+            unit: for the axes of plots.
 
         Returns:
             The symbol, shape (shape, 1).
@@ -134,6 +136,7 @@ class Problem:
             symbol=ca.MX.sym(name, size),
             size=size,
             where=caller(),
+            unit=unit,
             initial=data_column(name, "initial value", free if initial is None else initial, size, nan=True),
             final=data_column(name, "final value", free if final is None else final, size, nan=True),
             lower=low,
@@ -145,13 +148,14 @@ class Problem:
         self.states.append(declaration)
         return declaration.symbol
 
-    def unknown(self, name: str, mean: Any, variance: Any) -> ca.MX:
+    def unknown(self, name: str, mean: Any, variance: Any, *, unit: str = "") -> ca.MX:
         """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
 
         Args:
             name: unique name.
             mean: its expected value, a number or a vector.
             variance: of that value: scalar, vector (diagonal) or matrix; numbers or expressions in parameters.
+            unit: for the axes of plots.
 
         Returns:
             The symbol, shape (n, 1).
@@ -165,13 +169,14 @@ class Problem:
             symbol=ca.MX.sym(name, size),
             size=size,
             where=caller(),
+            unit=unit,
             mean=column(name, "mean", mean, size),
             variance=density_matrix(name, "variance", variance, size),
         )
         self.unknowns.append(declaration)
         return declaration.symbol
 
-    def parameter(self, name: str, value: Any) -> ca.MX:
+    def parameter(self, name: str, value: Any, *, unit: str = "") -> ca.MX:
         """Declare a known number (or vector) that may change from solve to solve without rebuilding.
 
         Raises:
@@ -183,6 +188,7 @@ class Problem:
             symbol=ca.MX.sym(name, size),
             size=size,
             where=caller(),
+            unit=unit,
             value=column(name, "value", value, size),
         )
         self.parameters.append(declaration)
@@ -197,8 +203,9 @@ class Problem:
         upper: Any = np.inf,
         guess: Guess = 0.0,
         scale: Any = None,
+        unit: str = "",
     ) -> ca.MX:
-        """Declare a control vector with its bounds, guess (as for states) and scale.
+        """Declare a control vector with its bounds, guess and scale (as for states), and unit for the axes of plots.
 
         Returns:
             The symbol, shape (shape, 1).
@@ -217,6 +224,7 @@ class Problem:
             symbol=ca.MX.sym(name, size),
             size=size,
             where=caller(),
+            unit=unit,
             lower=low,
             upper=high,
             guess=guess,
@@ -226,7 +234,15 @@ class Problem:
         return declaration.symbol
 
     def symmetric(
-        self, name: str, size: int, *, initial: Any, final: Any = None, lower: float | None = None, guess: Any = None
+        self,
+        name: str,
+        size: int,
+        *,
+        initial: Any,
+        final: Any = None,
+        lower: float | None = None,
+        guess: Any = None,
+        unit: str = "",
     ) -> ca.MX:
         """Declare a general symmetric matrix state, stored as its half-vector.
 
@@ -237,6 +253,7 @@ class Problem:
             final: as `initial`; None: free.
             lower: lower bound of the diagonal entries at the nodes; 0 or more also declares it positive semidefinite.
             guess: a matrix, used where the matrix is an NLP variable and cannot be simulated; None: simulated.
+            unit: of its entries, for the axes of plots.
 
         Returns:
             The full symmetric matrix, shape (size, size).
@@ -248,7 +265,7 @@ class Problem:
         size = self._declare(name, size)
         covariance = lower is not None and lower >= 0
         labels = tuple(str(i) for i in range(size))
-        declaration = self._add_matrix(name, size, initial, final, lower, guess, covariance, False, labels)
+        declaration = self._add_matrix(name, size, initial, final, lower, guess, covariance, False, labels, unit)
         return declaration.matrix
 
     def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
@@ -280,7 +297,9 @@ class Problem:
         size = self._declare("E", len(labels))
         if initial is None:
             initial = ca.diagcat(*(entry.variance for entry in entries))
-        return EstimationCovariance(entries, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels))
+        return EstimationCovariance(
+            entries, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels, "")
+        )
 
     def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
@@ -451,6 +470,7 @@ class Problem:
         covariance: bool,
         estimation: bool,
         labels: tuple[str, ...],
+        unit: str,
     ) -> Matrix:
         """Declare a matrix state; constant initial values are checked."""
         half = ca.MX.sym(name, half_length(size))
@@ -464,6 +484,7 @@ class Problem:
             matrix=unpack_symbolic(half, size),
             size=size,
             where=caller(),
+            unit=unit,
             initial=ends[0],
             final=ends[1],
             lower=lower,

@@ -37,6 +37,7 @@ class Block:
     labels: tuple[str, ...] = ()
     covariance: bool = False
     estimation: bool = False
+    unit: str = ""
 
     @property
     def length(self) -> int:
