@@ -1,0 +1,429 @@
+"""Unknowns of the gradient method: control values, free terminal time, free initial values; what holds at a point.
+
+A point stacks the control values (node by node), T where it is free, and the free entries of z(0) = (x(0), E(0)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from covocp.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
+from covocp.extremal import Guess
+from covocp.guess import choose_scales, quadrature_weights
+from covocp.influence import (
+    Run,
+    Slopes,
+    Sweeps,
+    control_curvature,
+    reweigh,
+    sweep_backward,
+    sweep_forward,
+)
+from covocp.matrices import Array
+from covocp.nlp import Scales
+from covocp.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
+from covocp.trajectory import Multipliers, Trajectory
+
+# Eigenvalues of H_uu, in units of the control scales, are not taken below this share of the largest.
+SMALLEST_CURVATURE = 1e-3
+# Relative change of T and of free initial values by which their curvature is measured, and of the controls in a probe.
+DIFFERENCE = 1e-4
+SMALLEST_EXTRA = 1e-3
+# T changes by no more than these shares of itself in one step.
+SHORTEN, LENGTHEN = 0.3, 0.5
+CHORD_STEPS = 60
+CHORD_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iterate:
+    """A point with its forward sweep and its penalties."""
+
+    point: Array
+    run: Run
+    penalty: Penalty
+
+    @property
+    def cost(self) -> float:
+        """J with the penalties."""
+        return self.run.cost + self.penalty.value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linear:
+    """First-order change at an iterate: slopes of cost with penalties (n,), of the terminal conditions (q, n).
+
+    sizes: sum of the absolute parts of the slopes by the controls, without the terminal conditions, (n,).
+    """
+
+    slope: Array
+    rows: Array
+    sizes: Array
+    slopes: Slopes
+
+    def lagrangian(self, ell: Array) -> Array:
+        """h_u + H_u' l."""
+        return np.asarray(self.slope + self.rows.T @ ell)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measures:
+    """What the stop test reads; none of it depends on the weighting of the step.
+
+    ell: least-squares multipliers; residual: slopes of the Lagrangian with them, (n,); active: entries at a bound that
+    the residual pushes outward; slope, miss: relative; transversality: dJ/dT of the Lagrangian.
+    """
+
+    ell: Array
+    residual: Array
+    active: Array
+    slope: float
+    miss: float
+    transversality: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Space:
+    """The unknowns, their scales and bounds, and the compiled sweeps.
+
+    Args:
+        sweeps: forward and backward.
+        groups: inequalities met by penalties.
+        weights: of the penalties.
+        parameters: of the statement.
+        start: z(0), free entries included.
+        free: the free entries of z(0).
+        scales: typical magnitudes of x, u, e, T.
+        unit: typical magnitudes of the entries of a point.
+        lower, upper: bounds of the entries of a point.
+        fixed_metric: diagonal of the metric of the stop test, int |du/s|^2 dt.
+        miss_scale: magnitudes of the terminal conditions.
+        extra: weights of T and of the free initial values in the metric of the step, b.
+    """
+
+    sweeps: Sweeps
+    groups: tuple[Group, ...]
+    weights: Weights
+    parameters: Array
+    start: Array
+    free: Indices
+    scales: Scales
+    unit: Array
+    lower: Array
+    upper: Array
+    fixed_metric: Array
+    miss_scale: Array
+    extra: Array
+
+    @property
+    def conditions(self) -> int:
+        """Number of terminal conditions with influence functions."""
+        return len(self.sweeps.terminal.names)
+
+    @property
+    def controls(self) -> int:
+        """Number of control values, the first entries of a point."""
+        return self.sweeps.mesh.control_nodes * self.sweeps.statement.nu
+
+    def at(self, point: Array) -> Iterate:
+        """Forward sweep and penalties at a point."""
+        u, duration, start = self.split(point)
+        run = sweep_forward(self.sweeps, u, duration, start, self.parameters)
+        return Iterate(point=point, run=run, penalty=self._penalty(run))
+
+    def _penalty(self, run: Run) -> Penalty:
+        return evaluate_penalty(self.groups, self.sweeps.mesh, run, self.parameters, self.weights)
+
+    def split(self, point: Array) -> tuple[Array, float, Array]:
+        """Controls (K, nu), T, z(0) of a point."""
+        st = self.sweeps.statement
+        u = point[: self.controls].reshape(self.sweeps.mesh.control_nodes, st.nu)
+        rest = point[self.controls :]
+        duration = float(rest[0]) if st.duration.free else st.duration.guess
+        start = self.start.copy()
+        start[self.free] = rest[int(st.duration.free) :]
+        return u, duration, start
+
+    def first(self, guess: Guess) -> Iterate:
+        """The iterate of a guess: its controls, terminal time and free initial values."""
+        return self.at(_point(self, guess.trajectory))
+
+    def with_weights(self, weights: Weights) -> Space:
+        """The same with other penalties."""
+        return replace(self, weights=weights)
+
+    def linearise(self, iterate: Iterate) -> Linear:
+        """Backward sweep at an iterate."""
+        slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps)
+        return self._linear(iterate.penalty, slopes)
+
+    def _linear(self, penalty: Penalty, slopes: Slopes) -> Linear:
+        count, free = self.controls, self.sweeps.statement.duration.free
+        by_time = slopes.duration.copy()
+        by_time[0] += penalty.duration
+        control = slopes.control.copy()
+        control[0] += self._fold(penalty.control)
+        stacked = np.hstack(
+            [control.reshape(control.shape[0], count), by_time[:, None][:, : int(free)], slopes.start[:, self.free]]
+        )
+        cost = np.abs(slopes.cost).ravel()
+        sizes = np.abs(stacked[0])
+        sizes[:count] = cost + np.abs(control[0].ravel() - slopes.cost.ravel())
+        return Linear(slope=stacked[0], rows=stacked[1:], sizes=sizes, slopes=slopes)
+
+    def _fold(self, nodal: Array) -> Array:
+        """Values at the N + 1 nodes as values of the controls: with constant controls the last node has the last."""
+        if self.sweeps.mesh.control == "linear":
+            return nodal
+        folded = nodal[:-1].copy()
+        folded[-1] += nodal[-1]
+        return folded
+
+    def cost_size(self, iterate: Iterate) -> float:
+        """Sum of the absolute terms of the cost."""
+        return abs(iterate.run.running) + abs(iterate.run.terminal)
+
+    def violation(self, iterate: Iterate) -> Array:
+        """Largest relative violation of each group of inequalities."""
+        return violation(iterate.penalty, self.weights)
+
+    def measure(self, iterate: Iterate, linear: Linear) -> Measures:
+        """Norms of the stop test, with the multiplier that makes the first of them least."""
+        inverse = 1.0 / self.fixed_metric
+        at_lower, at_upper = iterate.point <= self.lower, iterate.point >= self.upper
+        active = np.zeros(iterate.point.size, dtype=bool)
+        ell = np.zeros(self.conditions)
+        for _ in range(10):
+            weight = np.where(active, 0.0, inverse)
+            ell = solve_gram((linear.rows * weight) @ linear.rows.T, -(linear.rows * weight) @ linear.slope)
+            residual = linear.lagrangian(ell)
+            new = (at_lower & (residual > 0)) | (at_upper & (residual < 0))
+            if (new == active).all():
+                break
+            active = new
+        residual = linear.lagrangian(ell)
+        left = np.where(active, 0.0, residual)
+        count = self.controls
+        sizes = (linear.sizes + np.abs(linear.rows).T @ np.abs(ell))[:count]
+        norm = np.sqrt(np.sum(inverse[:count] * left[:count] ** 2))
+        size = np.sqrt(np.sum(inverse[:count] * sizes**2))
+        slope = float(norm / size) if size > 0 else 0.0
+        total = max(self.cost_size(iterate), np.finfo(float).tiny)
+        extra = np.abs(left[count:] * self.unit[count:]).max(initial=0.0) / total
+        return Measures(
+            ell=ell,
+            residual=residual,
+            active=active,
+            slope=max(slope, float(extra)),
+            miss=float((np.abs(iterate.run.miss) / self.miss_scale).max(initial=0.0)),
+            transversality=float(residual[count]) if self.sweeps.statement.duration.free else 0.0,
+        )
+
+    def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Any) -> Any:
+        """Matrix of int du' W du dt + b dT^2 + ...: W = H_uu made positive definite, or the given one."""
+        return self._metric(iterate.run, iterate.run.u, linear, ell, weight, iterate.penalty.curvature)
+
+    def _metric(self, run: Run, u: Array, linear: Linear, ell: Array, weight: Any, penalty: Array) -> Any:
+        st, mesh = self.sweeps.statement, self.sweeps.mesh
+        if isinstance(weight, str):
+            blocks = control_curvature(self.sweeps, run, u, linear.slopes.columns, ell, self.parameters)
+            unit = max(abs(run.running) + abs(run.terminal), np.finfo(float).tiny) / run.duration
+            blocks = positive_definite(blocks, self.scales.u, unit, SMALLEST_CURVATURE)
+        else:
+            given = np.asarray(weight, dtype=float)
+            given = given * np.eye(st.nu) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
+            blocks = np.broadcast_to(given, (mesh.intervals + 1, st.nu, st.nu))
+        metric = control_metric(mesh, run.duration, blocks)
+        if penalty.any():
+            metric = metric + _block_diagonal(self._fold(penalty))
+        return with_extra(metric, self.extra)
+
+    def room(self, iterate: Iterate) -> tuple[Array, Array]:
+        """Bounds of a step: to the bounds of the point; T changes by no more than a share of itself."""
+        lower, upper = self.lower - iterate.point, self.upper - iterate.point
+        if self.sweeps.statement.duration.free:
+            at, duration = self.controls, iterate.run.duration
+            lower[at], upper[at] = max(lower[at], -SHORTEN * duration), min(upper[at], LENGTHEN * duration)
+        return lower, upper
+
+    def with_extra_weights(self, linear: Linear, iterate: Iterate, ell: Array) -> Space:
+        """b of T and of the free initial values from the curvature of the Lagrangian by each of them."""
+        extra = self.extra.copy()
+        for i in range(extra.size):
+            at = self.controls + i
+            change = DIFFERENCE * self.unit[at] * (1.0 if iterate.point[at] < self.upper[at] else -1.0)
+            moved = iterate.point.copy()
+            moved[at] += change
+            other = self.at(moved)
+            if not other.run.finite:
+                continue
+            turned = (self.linearise(other).lagrangian(ell) - linear.lagrangian(ell))[at] / change
+            extra[i] = max(abs(float(turned)), SMALLEST_EXTRA * extra[i]) if np.isfinite(turned) else extra[i]
+        return replace(self, extra=extra)
+
+    def probe(self, iterate: Iterate, linear: Linear, metric: Any, ell: Array) -> float:
+        """Curvature of the Lagrangian along the step that the metric would take, in units of the metric."""
+        lower, upper = self.room(iterate)
+        step = solve_step(metric, linear.slope, linear.rows, np.zeros(self.conditions), lower, upper)
+        size = (np.abs(step.change) / self.unit).max(initial=0.0)
+        if size == 0:
+            return 1.0
+        change = min(1.0, DIFFERENCE / size) * step.change
+        other = self.at(iterate.point + change)
+        if not other.run.finite:
+            return 1.0
+        turned = self.linearise(other).lagrangian(step.ell) - linear.lagrangian(step.ell)
+        value = abs(float(turned @ change)) / float(change @ (metric @ change))
+        return value if np.isfinite(value) and value > 0 else 1.0
+
+    def chord(self, iterate: Iterate, linear: Linear, active: Array | None) -> Step:
+        """The change to u_c, which minimises the Hamiltonian along the present x, E, p, P [4.2-10].
+
+        Newton's method on H_u(x, E, p + R l, P, u_c) = 0 with int R' [f(u_c) - f(u)] dt = -dz to first order; T and
+        free initial values change as in the gradient step with w = 1.
+        """
+        total, lower, upper = np.zeros(iterate.point.size), *self.room(iterate)
+        present, ell, target = linear, np.zeros(self.conditions), -iterate.run.miss
+        step = None
+        u = iterate.run.u
+        for _ in range(CHORD_STEPS):
+            metric = self._metric(iterate.run, u, linear, ell, "curvature", iterate.penalty.curvature)
+            slope = present.slope.copy()
+            slope[self.controls :] = linear.slope[self.controls :] + self.extra * total[self.controls :]
+            step = solve_step(metric, slope, present.rows, target, lower - total, upper - total, active)
+            total = np.clip(total + step.change, lower, upper)
+            target, ell, active = target - present.rows @ step.change, step.ell, step.active
+            if (np.abs(step.change) / self.unit).max(initial=0.0) <= CHORD_TOLERANCE:
+                break
+            u = (iterate.point + total)[: self.controls].reshape(u.shape)
+            slopes = reweigh(self.sweeps, linear.slopes, u, iterate.run.duration, self.parameters)
+            present = self._linear(iterate.penalty, slopes)
+        assert step is not None
+        return replace(step, change=total)
+
+    def multipliers(self, iterate: Iterate, measures: Measures) -> Multipliers:
+        """Multipliers of the statement's constraints: l, penalties' slopes, slopes at active control bounds."""
+        st, mesh = self.sweeps.statement, self.sweeps.mesh
+        zero = Multipliers.zero(st, mesh)
+        terminal = self.sweeps.terminal
+        final = np.zeros(st.nx + st.ne)
+        final[list(terminal.fixed)] = measures.ell[: len(terminal.fixed)]
+        end, bounds = zero.end.copy(), np.zeros((mesh.intervals + 1, st.nx + st.ne))
+        end[list(terminal.rows)] = measures.ell[len(terminal.fixed) :]
+        path, start = zero.path, zero.start
+        for group, values in zip(self.groups, iterate.penalty.multipliers, strict=True):
+            if group.kind == "path":
+                path = values
+            elif group.kind == "start":
+                start = values[0]
+            elif group.kind == "end":
+                end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
+            else:
+                bounds[1:, self._bounded()] = values
+        final += bounds[-1]
+        bounds[-1] = 0.0
+        controls = -np.where(measures.active, measures.residual, 0.0)[: self.controls].reshape(zero.controls.shape)
+        return Multipliers(
+            final=final[: st.nx],
+            final_matrices=final[st.nx :],
+            end=end,
+            start=start,
+            path=path,
+            states=bounds[:, : st.nx],
+            matrices=bounds[:, st.nx :],
+            controls=controls,
+        )
+
+    def _bounded(self) -> Indices:
+        st = self.sweeps.statement
+        lower = np.concatenate([st.state_bounds[0], st.matrix_lower])
+        upper = np.concatenate([st.state_bounds[1], np.full(st.ne, np.inf)])
+        return np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+
+    def violations(self, iterate: Iterate, tolerance: float) -> dict[str, float]:
+        """Largest violation of each violated constraint, in its own unit, by name."""
+        miss = np.abs(iterate.run.miss)
+        result = {
+            name: float(value)
+            for name, value, scale in zip(self.sweeps.terminal.names, miss, self.miss_scale, strict=True)
+            if value > tolerance * scale
+        }
+        for group, excess, scales in zip(self.groups, iterate.penalty.excess, self.weights.scales, strict=True):
+            worst = np.abs(excess).max(axis=0)
+            result |= {
+                name: float(value)
+                for name, value, scale in zip(group.names, worst, scales, strict=True)
+                if value > tolerance * scale
+            }
+        return dict(sorted(result.items(), key=lambda entry: -entry[1]))
+
+
+def _block_diagonal(blocks: Array) -> Any:
+    """Sparse block-diagonal matrix."""
+    return sparse.block_diag(list(blocks), format="csc")
+
+
+def _point(space: Space, trajectory: Trajectory) -> Array:
+    """The point of a trajectory."""
+    duration = [trajectory.duration] if space.sweeps.statement.duration.free else []
+    start = np.concatenate([trajectory.x[0], trajectory.e[0]])
+    point = np.concatenate([trajectory.u.ravel(), duration, start[space.free]])
+    return np.asarray(np.clip(point, space.lower, space.upper))
+
+
+def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, guess: Guess) -> Space:
+    """The unknowns at a guess, which gives the scales.
+
+    Args:
+        sweeps: compiled.
+        groups: inequalities met by penalties.
+        parameters: of the statement.
+        guess: where the iterations start.
+    """
+    st, mesh = sweeps.statement, sweeps.mesh
+    x0, _, e0, _ = st.boundary_values(parameters)
+    known = np.concatenate([x0, e0])
+    free = np.flatnonzero(np.isnan(known))
+    guessed = np.concatenate([guess.trajectory.x[0], guess.trajectory.e[0]])
+    start = np.where(np.isnan(known), guessed, known)
+    u, duration = guess.trajectory.u, guess.trajectory.duration
+    run = sweep_forward(sweeps, u, duration, start, parameters)
+    finite = run.z if np.isfinite(run.z).all() else np.tile(start, (mesh.intervals + 1, 1))
+    trajectory = Trajectory(x=finite[:, : st.nx], u=u, e=finite[:, st.nx :], duration=duration)
+    scales = choose_scales(st, mesh, trajectory, parameters)
+    z_scale = np.concatenate([scales.x, scales.e])
+    timed = int(st.duration.free)
+    unit = np.concatenate([np.tile(scales.u, mesh.control_nodes), [scales.duration] * timed, z_scale[free]])
+    z_lower = np.concatenate([st.state_bounds[0], st.matrix_lower])
+    z_upper = np.concatenate([st.state_bounds[1], np.full(st.ne, np.inf)])
+    bounds = []
+    for control, time, z in (
+        (st.control_bounds[0], st.duration.lower, z_lower),
+        (st.control_bounds[1], st.duration.upper, z_upper),
+    ):
+        bounds.append(np.concatenate([np.tile(control, mesh.control_nodes), [time] * timed, z[free]]))
+    areas = np.repeat(quadrature_weights(mesh) * scales.duration, st.nu)
+    metric = np.concatenate([areas, np.full(timed + free.size, scales.duration)]) / unit**2
+    size = max(abs(run.running) + abs(run.terminal), np.finfo(float).tiny) if run.finite else 1.0
+    _, _, by_z, _ = sweeps.terminal.function(finite[-1], duration, parameters)
+    reach = np.abs(np.asarray(by_z.full()))[:, 1:].T @ z_scale
+    count = mesh.control_nodes * st.nu
+    return Space(
+        sweeps=sweeps,
+        groups=groups,
+        weights=first_weights(groups, mesh, replace(run, z=finite), parameters, scales, size),
+        parameters=parameters,
+        start=start,
+        free=free,
+        scales=scales,
+        unit=unit,
+        lower=bounds[0],
+        upper=bounds[1],
+        fixed_metric=metric,
+        miss_scale=np.where(reach > 0, reach, 1.0),
+        extra=size / unit[count:] ** 2,
+    )

@@ -1,0 +1,241 @@
+"""Inequalities as penalties d int c^2 1[c > 0] dt, with weights raised and shifts learnt (gradient method).
+
+Path conditions and bounds on states and matrices count at the nodes of the mesh, with the trapezoidal weights of the
+nodes; initial and final conditions count once. Each row lower <= c <= upper has its own weight d and its shift m/(2 d),
+
+    d { c + m/(2d) - clip(c + m/(2d)) }^2,
+
+so that the multiplier m is found without d growing without bound (M. J. D. Powell, in R. Fletcher (ed.), Optimization,
+1969; M. R. Hestenes, J. Optimization Theory and Applications 4, 1969). The first pass has m = 0: the plain penalty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.influence import Run, controls_at_nodes
+from covocp.matrices import Array
+from covocp.mesh import Mesh
+from covocp.nlp import Scales
+from covocp.statement import Statement
+
+Indices = NDArray[np.intp]
+
+# The first weight makes a violation by the typical magnitude of a row, everywhere, cost this many times the cost.
+FIRST_WEIGHT = 10.0
+# Weights are raised by this factor where a pass did not reduce the violation to this share of the last one.
+RAISE = 4.0
+EXPECTED_DECREASE = 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Rows of one kind: at which nodes they count, with which weights of the nodes.
+
+    function: (z, u, s, T, p, weights, shifts) -> penalty, its slopes by z, u and T, multipliers, violations,
+    second slopes by u (Gauss and Newton's part), sizes of the slopes by z and u in the given scales.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    nodes: Indices
+    shares: Array
+    function: ca.Function
+
+
+@dataclass(frozen=True, kw_only=True)
+class Penalty:
+    """Penalty and slopes at a run: by z at the nodes (N + 1, size), by u at the nodes (N + 1, nu), by T."""
+
+    value: float
+    jumps: Array
+    control: Array
+    duration: float
+    multipliers: tuple[Array, ...]
+    excess: tuple[Array, ...]
+    curvature: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Weights d and shifts m/(2 d) of each group, (nodes, rows), and the magnitudes of the rows, (rows,)."""
+
+    weights: tuple[Array, ...]
+    shifts: tuple[Array, ...]
+    scales: tuple[Array, ...]
+
+
+def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:
+    """The groups of a statement that have rows.
+
+    Args:
+        statement: the problem.
+        mesh: its nodes.
+        exact: rows of the final conditions that influence functions meet, not penalties.
+    """
+    n = mesh.intervals
+    steps = np.diff(mesh.nodes) * statement.duration.guess
+    shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    every, once = np.arange(n + 1), np.ones(1)
+    lower = np.concatenate([statement.state_bounds[0], statement.matrix_lower])
+    upper = np.concatenate([statement.state_bounds[1], np.full(statement.ne, np.inf)])
+    bounded = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    names = (*statement.state_names, *statement.matrix_names)
+    left = [i for i in range(statement.end.size) if i not in exact]
+    path, end, start = statement.path, statement.end, statement.start
+    candidates = [
+        _group(statement, "path", path.names, every, shares, path.function, path.lower, path.upper),
+        _group(statement, "start", start.names, every[:1], once, start.function, start.lower, start.upper),
+        _group(
+            statement,
+            "end",
+            tuple(end.names[i] for i in left),
+            every[-1:],
+            once,
+            lambda *arguments: end.function(*arguments)[left],
+            end.lower[left],
+            end.upper[left],
+        ),
+        _group(
+            statement,
+            "bounds",
+            tuple(f"bounds of {names[i]}" for i in bounded),
+            every[1:],
+            shares[1:],
+            lambda *arguments: _entries(arguments[0], arguments[2], bounded.tolist()),
+            lower[bounded],
+            upper[bounded],
+        ),
+    ]
+    return tuple(group for group in candidates if group is not None)
+
+
+def _entries(x: Any, e: Any, chosen: list[int]) -> Any:
+    return ca.vertcat(x, e)[chosen]
+
+
+def _group(
+    statement: Statement,
+    kind: str,
+    names: tuple[str, ...],
+    nodes: Indices,
+    shares: Array,
+    rows: Callable[..., Any],
+    lower: Array,
+    upper: Array,
+) -> Group | None:
+    if not names:
+        return None
+    symbolic: Any = statement.symbolic
+    nx, nu, size, count = statement.nx, statement.nu, statement.nx + statement.ne, len(names)
+    z, u, s, duration = symbolic.sym("z", size), symbolic.sym("u", nu), symbolic.sym("s"), symbolic.sym("T")
+    p, weights, shifts = symbolic.sym("p", statement.np), symbolic.sym("d", count), symbolic.sym("shift", count)
+    value = rows(z[:nx], u, z[nx:], s * duration, duration, p)
+
+    def excess(rows: Any) -> Any:
+        over = [rows[i] - upper[i] if np.isfinite(upper[i]) else -1.0 for i in range(count)]
+        under = [lower[i] - rows[i] if np.isfinite(lower[i]) else -1.0 for i in range(count)]
+        return ca.vertcat(*(ca.fmax(o, 0) - ca.fmax(b, 0) for o, b in zip(over, under, strict=True)))
+
+    shifted = excess(value + shifts)
+    penalty = ca.dot(weights, shifted**2)
+    by_control = ca.jacobian(value, u)
+    active = 2 * weights * (shifted != 0)
+    outputs = [
+        penalty,
+        ca.gradient(penalty, z),
+        ca.gradient(penalty, u),
+        ca.gradient(penalty, duration),
+        2 * weights * shifted,
+        excess(value),
+        by_control.T @ (ca.repmat(active, 1, nu) * by_control),
+        ca.fabs(ca.jacobian(value, z)),
+        ca.fabs(by_control),
+    ]
+    function = ca.Function("penalty", [z, u, s, duration, p, weights, shifts], [ca.densify(v) for v in outputs])
+    return Group(kind=kind, names=names, nodes=nodes, shares=shares, function=function.map(nodes.size))
+
+
+def first_weights(
+    groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters: Array, scales: Scales, size: float
+) -> Weights:
+    """Weights for the first pass: a violation by the magnitude of a row costs some times `size`; no shifts."""
+    weights, magnitudes = [], []
+    z_scale = np.concatenate([scales.x, scales.e])
+    for group in groups:
+        count, rows = group.nodes.size, len(group.names)
+        zero = np.zeros((count, rows))
+        outputs = _evaluate(group, mesh, run, parameters, zero, zero)
+        by_z, by_u = (v.reshape(rows, count, -1) for v in outputs[-2:])
+        magnitude = (by_z @ z_scale + by_u @ scales.u).max(axis=1, initial=0.0)
+        magnitude = np.where(magnitude > 0, magnitude, 1.0)
+        magnitudes.append(magnitude)
+        weights.append(FIRST_WEIGHT * size * group.shares[:, None] / group.shares.sum() / magnitude**2)
+    return Weights(weights=tuple(weights), shifts=tuple(np.zeros_like(w) for w in weights), scales=tuple(magnitudes))
+
+
+def _evaluate(group: Group, mesh: Mesh, run: Run, parameters: Array, weights: Array, shifts: Array) -> list[Array]:
+    count = group.nodes.size
+    controls = controls_at_nodes(run.u, mesh.intervals)[group.nodes]
+    outputs = group.function(
+        run.z[group.nodes].T,
+        controls.T,
+        mesh.nodes[group.nodes][None, :],
+        np.full((1, count), run.duration),
+        np.tile(parameters[:, None], (1, count)),
+        weights.T,
+        shifts.T,
+    )
+    return [np.asarray(v.full()) for v in outputs]
+
+
+def evaluate_penalty(groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters: Array, weights: Weights) -> Penalty:
+    """Penalty of a run, its slopes, multipliers and violations."""
+    nodes, nu = mesh.intervals + 1, run.u.shape[1]
+    value, by_duration = 0.0, 0.0
+    jumps, control, curvature = np.zeros_like(run.z), np.zeros((nodes, nu)), np.zeros((nodes, nu, nu))
+    multipliers, excess = [], []
+    for group, d, shift in zip(groups, weights.weights, weights.shifts, strict=True):
+        outputs = _evaluate(group, mesh, run, parameters, d, shift)
+        value += float(outputs[0].sum())
+        jumps[group.nodes] += outputs[1].T
+        control[group.nodes] += outputs[2].T
+        by_duration += float(outputs[3].sum())
+        multipliers.append(outputs[4].T)
+        excess.append(outputs[5].T)
+        curvature[group.nodes] += outputs[6].reshape(nu, group.nodes.size, nu).transpose(1, 0, 2)
+    return Penalty(
+        value=value,
+        jumps=jumps,
+        control=control,
+        duration=by_duration,
+        multipliers=tuple(multipliers),
+        excess=tuple(excess),
+        curvature=curvature,
+    )
+
+
+def violation(penalty: Penalty, weights: Weights) -> Array:
+    """Largest violation of each group, in units of the magnitudes of the rows."""
+    return np.array(
+        [
+            float((np.abs(excess) / scale).max(initial=0.0))
+            for excess, scale in zip(penalty.excess, weights.scales, strict=True)
+        ]
+    )
+
+
+def next_weights(penalty: Penalty, weights: Weights, before: Array, now: Array) -> Weights:
+    """Shifts from the multipliers of a pass, weights raised where the violation did not fall enough."""
+    raised = [
+        d * (RAISE if after > EXPECTED_DECREASE * earlier else 1.0)
+        for d, earlier, after in zip(weights.weights, before, now, strict=True)
+    ]
+    shifts = [m / (2 * d) if d.any() else np.zeros_like(m) for m, d in zip(penalty.multipliers, raised, strict=True)]
+    return Weights(weights=tuple(raised), shifts=tuple(shifts), scales=weights.scales)
