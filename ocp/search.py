@@ -1,0 +1,266 @@
+"""Step control of the gradient method: W by predicted against actual changes, and the passes of the penalties.
+
+G. T. Schmidt, Sc.D. thesis, M.I.T. 1971, [4.3]: W is raised where cost and terminal conditions do not change as
+predicted; see `covocp.solvers.gradient` for what is beyond the source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from covocp.descent import Step, solve_step, solve_tangent, unreachable
+from covocp.errors import ProblemError, describe
+from covocp.iterate import Iterate, Linear, Measures, Space
+from covocp.matrices import Array
+from covocp.penalty import next_weights
+from covocp.progress import Progress
+
+Variant = Literal["gradient", "chord"]
+# The share of the predicted decrease that must come true (Armijo), the number of past values that count as the largest.
+SUFFICIENT = 1e-4
+MEMORY = 8
+RAISE = 4.0
+TRIALS = 15
+# Changes of the cost below this share of it are lost in the integration errors: there the merit is not asked.
+COST_ACCURACY = 1e-7
+SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-4, 1e8
+# ABBmin: the larger curvature is taken where the ratio of the two is below this.
+CURVATURE_RATIO, CURVATURE_MEMORY = 0.8, 5
+# The multiplier's weight in the merit.
+MERIT_FACTOR = 2.0
+# Terminal conditions are met better than inequalities: every step corrects them.
+TERMINAL_SHARE = 1e-3
+LARGEST_PASSES = 30
+# Iterations in which the miss must fall by a tenth while it is above its tolerance.
+PATIENCE = 100
+RAISE_WEIGHT = "raise the weight, or weight_factor"
+# A fixed W that is too small lets the cost grow; above this multiple of the first cost there is no way back.
+DIVERGED = 1e8
+FIRST_PASS_TOLERANCE = 1e-2
+PASS_FACTOR = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Options of the method; see `prepare`."""
+
+    variant: Variant
+    weight: Any
+    weight_factor: float
+    fraction: float
+    tolerance: float
+    violation_tolerance: float
+    max_iterations: int
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether w follows predicted and actual changes."""
+        return isinstance(self.weight, str) and self.weight == "adaptive"
+
+
+@dataclass(kw_only=True)
+class _Control:
+    """What the step control remembers: w, d, curvatures, merit weights, past values of cost and miss."""
+
+    weight: float
+    fraction: float
+    merit: Array
+    curvatures: list[float] = field(default_factory=list)
+    past: list[tuple[float, Array]] = field(default_factory=list)
+    iterations: int = 0
+    nearest: tuple[float, int] = (np.inf, 0)
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+class Search:
+    """The iterations: passes of the penalties outside, gradient steps inside."""
+
+    def __init__(self, space: Space, settings: Settings, progress: Progress) -> None:
+        self.space, self.settings, self.progress = space, settings, progress
+        self.control = _Control(weight=1.0, fraction=settings.fraction, merit=np.zeros(space.conditions))
+        self.passes = 0
+
+    def run(self, current: Iterate) -> tuple[Iterate, Measures, str, bool]:
+        """All passes; returns the last iterate, its measures, how it ended, whether it converged."""
+        space, settings = self.space, self.settings
+        tolerance = settings.tolerance if not space.groups else max(settings.tolerance, FIRST_PASS_TOLERANCE)
+        before = np.full(len(space.groups), np.inf)
+        while True:
+            current, measures, message, done = self._pass(current, tolerance)
+            self.passes += 1
+            worst = space.violation(current)
+            if not done or not space.groups:
+                return current, measures, message, done
+            if worst.max(initial=0.0) <= settings.violation_tolerance and tolerance <= settings.tolerance:
+                return current, measures, message, True
+            if self.passes >= LARGEST_PASSES:
+                return current, measures, "the penalties do not remove the violations: they may contradict", False
+            factor = PASS_FACTOR if worst.any() else 0.0
+            tolerance = max(settings.tolerance, factor * tolerance)
+            space = self.space = space.with_weights(next_weights(current.penalty, space.weights, before, worst))
+            before = worst
+            current = space.at(current.point)
+            self.control.past.clear()
+
+    def _pass(self, current: Iterate, tolerance: float) -> tuple[Iterate, Measures, str, bool]:
+        """Gradient steps for the present penalties."""
+        space, settings, control = self.space, self.settings, self.control
+        linear = space.linearise(current)
+        measures = space.measure(current, linear)
+        ell = measures.ell
+        self._check_reachable(current, linear)
+        if not control.past and not control.iterations:
+            space = self.space = space.with_extra_weights(linear, current, ell)
+            self._probe(current, linear, ell)
+            control.merit = space.cost_size(current) / space.miss_scale
+        active: Array | None = None
+        while True:
+            self._record(current, measures)
+            if measures.slope <= tolerance and measures.miss <= TERMINAL_SHARE * settings.violation_tolerance:
+                return current, measures, "solved", True
+            if self.progress.stop:
+                return current, measures, "interrupted by the user", False
+            message = self._hopeless(measures)
+            if message:
+                return current, measures, message, False
+            metric = space.metric(current, linear, ell, settings.weight)
+            trial = self._try(current, linear, metric, ell, active)
+            if isinstance(trial, str):
+                return current, measures, trial, False
+            following, step = trial
+            after = space.linearise(following)
+            self._learn(following.point - current.point, linear, after, step, metric)
+            current, linear, ell, active = following, after, step.ell, step.active
+            measures = space.measure(current, linear)
+            control.iterations += 1
+
+    def _hopeless(self, measures: Measures) -> str:
+        """Why to give up, if so."""
+        control, settings = self.control, self.settings
+        if control.iterations >= settings.max_iterations:
+            return "stopped at the largest number of iterations: start closer, or allow more"
+        if measures.miss <= TERMINAL_SHARE * settings.violation_tolerance or measures.miss < 0.9 * control.nearest[0]:
+            control.nearest = (measures.miss, control.iterations)
+        if control.iterations - control.nearest[1] > PATIENCE:
+            remedy = "the bounds may forbid them, or start elsewhere" if settings.adaptive else RAISE_WEIGHT
+            return f"the terminal conditions do not come closer: {remedy}"
+        return ""
+
+    def _check_reachable(self, current: Iterate, linear: Linear) -> None:
+        """Terminal conditions that nothing changes (D is singular) and that are not met.
+
+        Raises:
+            ProblemError: names them.
+        """
+        space = self.space
+        gram = (linear.rows / space.fixed_metric) @ linear.rows.T
+        hopeless = np.abs(unreachable(gram, current.run.miss)) / space.miss_scale
+        names = [n for n, v in zip(space.sweeps.terminal.names, hopeless, strict=True) if v > 1e-6]
+        if names:
+            raise ProblemError(
+                describe(
+                    "Terminal conditions cannot be met: the controls have no influence on " + ", ".join(names) + ".",
+                    expected="D = int H_u H_u' dt invertible: influence functions of the terminal conditions that are "
+                    "linearly independent",
+                    received="a miss of "
+                    + ", ".join(
+                        f"{m:.4g} ({n})" for n, m in zip(space.sweeps.terminal.names, current.run.miss, strict=True)
+                    ),
+                    remedy="free one of these final values, or start where the controls act on them",
+                )
+            )
+
+    def _probe(self, current: Iterate, linear: Linear, ell: Array) -> None:
+        """The first w: the curvature along the step that w = 1 would take."""
+        control, settings = self.control, self.settings
+        control.weight = settings.weight_factor
+        if not settings.adaptive:
+            return
+        metric = self.space.metric(current, linear, ell, settings.weight)
+        value = self.space.probe(current, linear, metric, ell)
+        control.weight = float(np.clip(settings.weight_factor * value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
+
+    def _try(
+        self, current: Iterate, linear: Linear, metric: Any, ell: Array, active: Array | None
+    ) -> tuple[Iterate, Step] | str:
+        """A step that changes cost and miss about as predicted; raises w and lowers d until there is one."""
+        space, control, miss = self.space, self.control, current.run.miss
+        adaptive = self.settings.adaptive
+        control.past = [*control.past[1 - MEMORY :], (current.cost, miss)]
+        for _ in range(TRIALS if adaptive else 1):
+            step = self._step(current, linear, metric, active)
+            following = space.at(current.point + step.change)
+            if not adaptive:
+                kept = following.run.finite and abs(following.cost) <= DIVERGED * (
+                    1.0 + abs(self.control.history[0]["cost"])
+                )
+                return (following, step) if kept else f"the steps diverge: {RAISE_WEIGHT}"
+            if following.run.finite:
+                control.merit = np.maximum(control.merit, MERIT_FACTOR * np.abs(step.ell))
+                expected = miss + linear.rows @ step.change
+                gain = linear.slope @ step.change + control.merit @ (np.abs(expected) - np.abs(miss))
+                largest = max(cost + control.merit @ np.abs(z) for cost, z in control.past)
+                now = following.cost + control.merit @ np.abs(following.run.miss)
+                small = COST_ACCURACY * space.cost_size(current)
+                limit = largest + SUFFICIENT * min(gain, 0.0) + (small if abs(gain) <= 10 * small else 0.0)
+                off = np.abs(following.run.miss - expected) / space.miss_scale
+                agrees = not off.size or off.max() <= max(0.5 * (np.abs(miss) / space.miss_scale).max(), 1e-3)
+                if now <= limit:
+                    control.fraction = min(self.settings.fraction, 2 * control.fraction) if agrees else control.fraction
+                    return following, step
+                if not agrees:
+                    control.fraction /= 2
+            else:
+                control.fraction /= 2
+            control.weight = min(RAISE * control.weight, LARGEST_WEIGHT)
+        return "no step lowers the cost as predicted: the slopes may be wrong at this mesh; use more intervals"
+
+    def _step(self, current: Iterate, linear: Linear, metric: Any, active: Array | None) -> Step:
+        """Steps 5 and 6 of 4.2, or the chord step."""
+        control, space = self.control, self.space
+        lower, upper = space.room(current)
+        if self.settings.variant == "chord":
+            share = min(1.0, 1.0 / control.weight)
+            step = space.chord(current, linear, active)
+            return replace(step, change=share * step.change)
+        target = -control.fraction * current.run.miss
+        return solve_step(control.weight * metric, linear.slope, linear.rows, target, lower, upper, active)
+
+    def _learn(self, change: Array, before: Linear, after: Linear, step: Step, metric: Any) -> None:
+        """w for the next step: the curvature of the Lagrangian seen along this one, in units of the metric."""
+        control = self.control
+        if not self.settings.adaptive:
+            return
+        free = step.active == 0
+        moved = np.where(free, change, 0.0)
+        turned = np.where(free, after.lagrangian(step.ell) - before.lagrangian(step.ell), 0.0)
+        along, size = float(moved @ turned), float(moved @ (metric @ moved))
+        if size <= 0 or not np.isfinite(along):
+            return
+        if along <= 0:  # concave along the step: longer steps
+            control.weight = max(control.weight / RAISE, SMALLEST_WEIGHT)
+            return
+        tangent = solve_tangent(metric, turned, after.rows, step.active)
+        smaller, larger = along / size, max(float(turned @ tangent) / along, along / size)
+        control.curvatures = [*control.curvatures[1 - CURVATURE_MEMORY :], larger]
+        value = max(control.curvatures) if smaller < CURVATURE_RATIO * larger else smaller
+        control.weight = float(np.clip(value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
+
+    def _record(self, current: Iterate, measures: Measures) -> None:
+        worst = float(self.space.violation(current).max(initial=0.0))
+        self.control.history.append(
+            {
+                "cost": current.run.cost,
+                "penalty": current.penalty.value,
+                "slope": measures.slope,
+                "miss": measures.miss,
+                "transversality": measures.transversality,
+                "violation": worst,
+                "weight": self.control.weight,
+                "fraction": self.control.fraction,
+            }
+        )
+        self.progress.update(self.control.iterations, current.run.cost, max(worst, measures.miss))

@@ -1,0 +1,289 @@
+"""First-order gradient method in matrix form, G. T. Schmidt, Sc.D. thesis, M.I.T. 1971, chapter 4.
+
+One iteration: integrate x and E forward; integrate p, P and the influence functions R backward; step by
+-W^-1 (h_u + H_u' l) so that the terminal conditions are met to first order. It knows no NLP and needs the Hamiltonian
+only, H_u for the step and H_uu for its weighting: so it checks what shooting finds.
+
+Corrections to the source: the predicted miss is -I_kj - I_kk l [4.3-20]; with T free the miss changes by dx/dt dT too
+and the coefficient of dT is that of h, not of H (appendix D). The multiplier of an off-diagonal entry of E is 2 P_ij.
+
+Beyond the source:
+
+- W = w H_uu (made positive definite), with w from predicted against actual changes: raised fourfold where the cost and
+  the terminal conditions do not change as predicted (merit J + sum nu |dz|, largest of the last values), else the
+  curvature seen along the last step, J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 1988, in the form ABBmin of
+  G. Frassoldati, L. Zanni and G. Zanghirati, J. Ind. Manag. Optim. 4, 2008.
+- The step is taken in the space of the controls (piecewise linear or constant): the projection of the source's step.
+- Bounds on the controls and on T: projection of the step in the metric W. Inequalities: penalties (`covocp.penalty`).
+- Terminal conditions on matrices and equalities between final values have influence functions like those on x.
+- Free initial values: p(0) and P(0) are the slopes by them.
+
+The stop test does not depend on W; see `prepare`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse.linalg import splu
+
+from covocp.checks import as_number
+from covocp.descent import solve_step
+from covocp.errors import ProblemError, describe
+from covocp.extremal import Extremal, Guess, Outcome
+from covocp.guess import controls_guess, stiffness
+from covocp.influence import build_sweeps
+from covocp.iterate import Iterate, Measures, Space, make_space
+from covocp.matrices import Array
+from covocp.mesh import Mesh, Options, choose_mesh, choose_step
+from covocp.penalty import penalty_groups
+from covocp.progress import Progress
+from covocp.search import Search, Settings, Variant
+from covocp.statement import Statement
+from covocp.trajectory import Trajectory
+
+LARGEST_PAIRS = 64
+# Steps per interval of the backward integration: h times the rate of the costates stays below this (limit 2.78).
+STIFFNESS_PER_PAIR = 1.0
+
+
+def prepare(
+    statement: Statement,
+    options: Options,
+    *,
+    variant: Variant = "gradient",
+    weight: Any = "adaptive",
+    weight_factor: float = 1.0,
+    fraction: float = 1.0,
+    tolerance: float = 1e-6,
+    violation_tolerance: float = 1e-5,
+    max_iterations: int = 2000,
+) -> GradientSolver:
+    """Compile the sweeps of the gradient method.
+
+    The run has converged when
+
+    - sqrt(int |s H_u|^2 dt) <= tolerance sqrt(int |s (|L_u| + |h_u - L_u| + |H_u' l|)|^2 dt), s the magnitudes of the
+      controls (their `scale`), H_u projected on the controls' space and on the bounds, l the least-squares multiplier
+      in this metric;
+    - |dJ/dT| T and |dJ/dx_i(0)| s_i of a free duration and of free initial values <= tolerance (|k| + |int L dt|);
+    - the violation of every inequality / its magnitude <= violation_tolerance, and |dz_j| / (magnitude of z_j) <= a
+      thousandth of it.
+
+    Args:
+        statement: the problem.
+        options: mesh; `segments` and `covariances` mean nothing here.
+        variant: "gradient", or "chord": solve H_u(x, E, p, P, u_c) = 0 along the present x, E, p, P and step towards
+            u_c [4.2-10].
+        weight: W: "adaptive" (w H_uu, w from predicted and actual changes), "curvature" (H_uu, fixed factor), or a
+            number, a vector (nu,), a matrix (nu, nu) or matrices at the nodes (N + 1, nu, nu): as it is.
+        weight_factor: factor on W; with "adaptive" the first one is found by a probe and this multiplies it.
+        fraction: d of step 5, in (0, 1]: share of the miss of the terminal conditions removed by a step.
+        tolerance: on the slopes, see above.
+        violation_tolerance: on terminal conditions and inequalities, see above.
+        max_iterations: of all passes together.
+
+    Returns:
+        The solver; `solve` may be called often.
+
+    Raises:
+        ProblemError: an option is wrong.
+    """
+    _check_options(statement, variant, weight, weight_factor, fraction)
+    step = choose_step(statement, options)
+    nodes = options.nodes()
+    stiff = stiffness(statement, nodes, options.control, statement.values, matrices=step == "rk4")
+    mesh = choose_mesh(statement, options, stiff)
+    mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True)
+    stiff = stiffness(statement, nodes, options.control, statement.values, matrices=True)
+    pairs = int(np.clip(np.ceil(stiff / STIFFNESS_PER_PAIR), mesh.substeps, max(LARGEST_PAIRS, mesh.substeps)))
+    settings = Settings(
+        variant=variant,
+        weight=weight,
+        weight_factor=float(weight_factor),
+        fraction=float(fraction),
+        tolerance=float(tolerance),
+        violation_tolerance=float(violation_tolerance),
+        max_iterations=int(max_iterations),
+    )
+    return GradientSolver(statement, mesh, pairs, settings)
+
+
+def _check_options(statement: Statement, variant: Any, weight: Any, weight_factor: Any, fraction: Any) -> None:
+    """Refuse options that mean nothing."""
+    if variant not in ("gradient", "chord"):
+        raise _option_error("variant", "'gradient' or 'chord'", variant)
+    if isinstance(weight, str):
+        if weight not in ("adaptive", "curvature"):
+            raise _option_error("weight", "'adaptive', 'curvature', a number or an array", weight)
+    else:
+        values = as_number("weight", "option", weight)
+        nu = statement.nu
+        shapes = (values.shape in ((), (nu,), (nu, nu))) or (values.ndim == 3 and values.shape[1:] == (nu, nu))
+        if not shapes or not np.isfinite(values).all() or (values.ndim < 2 and (values <= 0).any()):
+            raise _option_error(
+                "weight", f"positive numbers of shape (), ({nu},), ({nu}, {nu}) or (N + 1, {nu}, {nu})", weight
+            )
+    if not weight_factor > 0:
+        raise _option_error("weight_factor", "a positive number", weight_factor)
+    if not 0 < fraction <= 1:
+        raise _option_error("fraction", "a number in (0, 1]", fraction)
+
+
+def _option_error(name: str, expected: str, received: Any) -> ProblemError:
+    return ProblemError(
+        describe(
+            f"The option '{name}' of the gradient method has an unknown value.",
+            expected=expected,
+            received=repr(received)[:100],
+            remedy=f"correct {name}=",
+        )
+    )
+
+
+class GradientSolver:
+    """The compiled sweeps with the settings of the method."""
+
+    def __init__(self, statement: Statement, mesh: Mesh, pairs: int, settings: Settings) -> None:
+        """Keep the settings; see `prepare`. The sweeps are compiled at the first call of `solve`."""
+        self._statement, self._mesh, self._pairs, self._settings = statement, mesh, pairs, settings
+        self._sweeps: Any = None
+        self._groups: Any = ()
+
+    @property
+    def mesh(self) -> Mesh:
+        """The resolved mesh: one segment, matrices propagated."""
+        return self._mesh
+
+    def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
+        """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
+        begin = time.perf_counter()
+        space = self.space(parameters, guess)
+        built = time.perf_counter()
+        current = space.first(guess)
+        if not current.run.finite:
+            raise ProblemError(
+                describe(
+                    "The trajectory of the first control is NaN or inf.",
+                    expected="a first control along which the model stays in its domain",
+                    received="a forward integration that diverges",
+                    remedy="give another guess of the controls, more intervals, or use method='ipopt'",
+                )
+            )
+        search = Search(space, self._settings, progress)
+        current, measures, message, converged = search.run(current)
+        return self._outcome(
+            space,
+            current,
+            measures,
+            message,
+            converged,
+            {
+                "iterations": search.control.iterations,
+                "build_seconds": built - begin,
+                "solve_seconds": time.perf_counter() - built,
+                "return_status": message,
+                "variant": self._settings.variant,
+                "weight": search.control.weight,
+                "passes": search.passes,
+                "backward_steps": self._pairs,
+                "history": tuple(search.control.history),
+            },
+        )
+
+    def space(self, parameters: Array, guess: Guess) -> Space:
+        """The unknowns of the method for these parameters, with the compiled sweeps."""
+        if self._sweeps is None:
+            self._sweeps = build_sweeps(self._statement, self._mesh, self._pairs)
+            self._groups = penalty_groups(self._statement, self._mesh, self._sweeps.terminal.rows)
+        return make_space(self._sweeps, self._groups, parameters, guess)
+
+    def _outcome(
+        self, space: Space, last: Iterate, measures: Measures, message: str, converged: bool, stats: dict[str, Any]
+    ) -> Outcome:
+        """The last iterate as data."""
+        run, nx = last.run, self._statement.nx
+        trajectory = Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
+        return Outcome(
+            extremal=Extremal(
+                statement=self._statement,
+                mesh=self._mesh,
+                trajectory=trajectory,
+                parameters=space.parameters,
+                multipliers=space.multipliers(last, measures),
+            ),
+            cost_terms={"terminal": run.terminal, "running": run.running},
+            converged=converged,
+            message=message,
+            violations=space.violations(last, self._settings.violation_tolerance),
+            stats=stats,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """One iteration of 4.2 or 4.3 and what it predicted; every number in the source's notation.
+
+    I_kk (q, q), I_kj (q,), I_jj: the integrals of step 4. ell (q,): step 5. change (K, nu): du of step 6 at the control
+    values; duration_change: dT. predicted_cost, actual_cost: dJ; predicted_miss, actual_miss: dz(T).
+    """
+
+    I_kk: Array
+    I_kj: Array
+    I_jj: float
+    ell: Array
+    change: Array
+    duration_change: float
+    predicted_cost: float
+    actual_cost: float
+    predicted_miss: Array
+    actual_miss: Array
+
+
+def one_iteration(
+    statement: Statement, options: Options, *, weight: Any = 1.0, fraction: float = 1.0, duration_weight: float = 1.0
+) -> Iteration:
+    """One gradient iteration from the guess of the controls as it stands, without step control.
+
+    Args:
+        statement: the problem; its guess must be arrays or functions (a number would be bent).
+        options: mesh.
+        weight: W, as in `prepare`.
+        fraction: d of step 5.
+        duration_weight: b of 4.3, for a free terminal time.
+
+    Returns:
+        Integrals, step, predicted and actual changes.
+    """
+    solver = prepare(statement, options, weight=weight, fraction=fraction)
+    mesh, parameters = solver.mesh, statement.values
+    x0, _, e0, _ = (np.nan_to_num(v) for v in statement.boundary_values(parameters))
+    u = controls_guess(statement, mesh.nodes, mesh.control)
+    nodes = np.ones((mesh.intervals + 1, 1))
+    start = Trajectory(x=nodes * x0, u=u, e=nodes * e0, duration=statement.duration.guess)
+    space = solver.space(parameters, Guess(trajectory=start))
+    space = replace(space, extra=np.full(space.extra.size, duration_weight))
+    current = space.first(Guess(trajectory=start))
+    linear = space.linearise(current)
+    metric = space.metric(current, linear, np.zeros(space.conditions), weight)
+    n = space.controls
+    inner = metric[:n][:, :n].tocsc()
+    target = -fraction * current.run.miss
+    step = solve_step(metric, linear.slope, linear.rows, target, *space.room(current))
+    following = space.at(current.point + step.change)
+    solved = splu(inner).solve(np.column_stack([linear.slope[:n], linear.rows[:, :n].T]))
+    return Iteration(
+        I_kk=linear.rows[:, :n] @ solved[:, 1:],
+        I_kj=linear.rows[:, :n] @ solved[:, 0],
+        I_jj=float(linear.slope[:n] @ solved[:, 0]),
+        ell=step.ell,
+        change=step.change[:n].reshape(u.shape),
+        duration_change=following.run.duration - current.run.duration,
+        predicted_cost=float(linear.slope @ step.change),
+        actual_cost=following.run.cost - current.run.cost,
+        predicted_miss=linear.rows @ step.change,
+        actual_miss=following.run.miss - current.run.miss,
+    )
