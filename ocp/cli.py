@@ -198,7 +198,7 @@ def _solved(problem: Any, arguments: argparse.Namespace) -> tuple[Any, int]:
                 remedy="check the values of --option and --set",
             )
         ) from error
-    return solution, 0
+    return solution, 0 if solution.converged else FAILED
 
 
 def _options(given: list[str], methods: Sequence[str]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:

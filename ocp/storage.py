@@ -6,6 +6,7 @@ A .npz file holds every array under its name ("trajectory.x", "mesh.nodes", ...)
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import zipfile
@@ -111,11 +112,10 @@ def _read(file: Path) -> Any:
         ProblemError: no file, or neither a complete .npz nor a complete .json file.
     """
     try:
-        with file.open("rb") as opened:
-            packed = opened.read(2) == b"PK"
-        if not packed:
-            return decode(json.loads(file.read_text(encoding="utf-8")))
-        with np.load(file, allow_pickle=False) as entries:
+        content = file.read_bytes()
+        if content[:2] != b"PK":
+            return decode(json.loads(content.decode("utf-8")))
+        with np.load(io.BytesIO(content), allow_pickle=False) as entries:
             arrays = {name: entries[name] for name in entries.files}
         if "document" not in arrays:
             raise _unreadable(file, "it has no entry 'document'", "give a file that Solution.save wrote")

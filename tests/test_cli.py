@@ -1,0 +1,274 @@
+"""The command: what it prints and writes, and how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+import covocp as co
+from covocp.cli import main
+from covocp.progress import Progress
+
+SCRIPT = """
+import covocp as co
+
+def make(weight=1.0, kind: str = "plain"):
+    '''Move a mass point. And more.'''
+    ocp = co.Problem(duration=1.0, name=f"script {weight:g} {kind}")
+    x = ocp.state("x", initial=0.0, final=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=0.5 * weight * u**2)
+    return ocp
+
+def needs(weight: float):
+    return make(weight)
+
+def anything(**parameters):
+    return make(**parameters)
+
+def number():
+    return 3
+
+def failing():
+    return 1 / 0
+
+def leaving():
+    raise SystemExit(5)
+"""
+
+
+@pytest.fixture
+def script(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    path = tmp_path / "my_script.py"
+    path.write_text(SCRIPT, encoding="utf-8")
+    return path
+
+
+def run(capsys, *arguments):
+    """Exit code, standard output, standard error."""
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as error:  # argparse
+        code = error.code
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_list_shows_every_model_with_its_parameters(capsys):
+    code, out, _ = run(capsys, "list")
+    assert code == 0
+    names = [line for line in out.splitlines() if line and not line.startswith(" ")]
+    modules = os.listdir(os.path.dirname(co.__file__) + "/../models")
+    assert names == sorted(name[:-3] for name in modules if name.endswith(".py") and name != "__init__.py")
+    assert "--set weight=10.0 final=0.0 duration=10.0" in out
+    entry = out[out.index("damped_oscillator") :]
+    assert "Damped oscillator with unknown damping and stiffness" in entry
+
+
+def test_solve_prints_the_solution_and_writes_files(capsys, tmp_path):
+    figure, file = tmp_path / "figure.png", tmp_path / "solution.json"
+    code, out, err = run(
+        capsys, "solve", "unknown_lag", "--set", "weight=1", "--set", "final=1.0", "--intervals", 60,
+        "--option", "control=constant", "--option", "substeps=2", "--plot", figure, "--save", file,
+    )  # fmt: skip
+    assert code == 0, err
+    assert out.startswith("first-order lag, unknown time constant: solved (ipopt)")
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    loaded = co.load(file)
+    assert loaded["weight"][0] == 1.0
+    assert loaded["x"][-1] == pytest.approx(1.0)
+    assert (loaded.mesh.intervals, loaded.mesh.control, loaded.mesh.substeps) == (60, "constant", 2)
+
+
+def test_quiet_prints_nothing(capsys, tmp_path):
+    code, out, err = run(
+        capsys, "solve", "noisy_integrator", "--intervals", 10, "--quiet", "--output", tmp_path / "f.pdf"
+    )
+    assert (code, out, err) == (0, "", "")
+    assert (tmp_path / "f.pdf").exists()
+
+
+def test_a_function_of_a_script_is_solved(capsys, script):
+    code, out, _ = run(capsys, "solve", f"{script}:make", "--set", "weight=2", "--set", "kind=3", "--intervals", 5)
+    assert code == 0
+    assert out.startswith("script 2 3: solved")
+    code, out, _ = run(capsys, "solve", f"{script}:needs", "--set", "weight=4", "--intervals", 5)
+    assert (code, out.split(":")[0]) == (0, "script 4 plain")
+    code, out, _ = run(capsys, "solve", f"{script}:anything", "--set", "kind=free", "--intervals", 5)
+    assert (code, out.split(":")[0]) == (0, "script 1 free")
+
+
+def test_a_solve_that_fails_tells_and_keeps_the_last_iterate(capsys, tmp_path):
+    file = tmp_path / "iterate.npz"
+    code, out, err = run(
+        capsys, "solve", "unknown_lag", "--intervals", 30, "--option", "max_iterations=3", "--save", file
+    )
+    assert code == 1
+    assert "was not solved by ipopt" in err
+    assert out.startswith("NOT CONVERGED")
+    assert not co.load(file).converged
+
+
+def test_an_interrupt_shows_the_last_iterate(capsys, monkeypatch):
+    def update(self, iteration, *rest):
+        if iteration == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Progress, "update", update)
+    code, out, err = run(capsys, "solve", "unknown_lag", "--intervals", 30)
+    assert code == 1
+    assert out.startswith("NOT CONVERGED: first-order lag, unknown time constant: interrupted")
+    assert "effort: " in out
+    assert "Traceback" not in err
+
+
+def test_compare_prints_a_table_and_writes_a_figure(capsys, tmp_path):
+    figure = tmp_path / "compare.png"
+    code, out, err = run(
+        capsys, "compare", "noisy_integrator", "--method", "ipopt", "--intervals", 10, "--plot", figure,
+        "--option", "ipopt.hessian=exact",
+    )  # fmt: skip
+    assert code == 0, err
+    assert out.splitlines()[2].split()[:3] == ["method", "cost", "gap"]
+    assert figure.exists()
+
+
+def test_compare_ends_with_one_where_a_run_failed(capsys):
+    code, out, _ = run(
+        capsys, "compare", "unknown_lag", "--method", "ipopt", "--intervals", 30, "--option", "ipopt.max_iterations=3"
+    )
+    assert code == 1
+    assert "ipopt: did not converge" in out
+
+
+def test_plot_draws_the_figures_of_the_source(capsys, tmp_path):
+    code, out, _ = run(capsys, "plot", "unknown_lag", "--intervals", 60, "--output", tmp_path / "lag.png")
+    assert code == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lag-1.png", "lag-2.png"]
+    assert "Schmidt 5.2" in out
+    assert "Schmidt 5.3" in out
+
+
+def test_plot_names_its_file_after_the_model(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(capsys, "plot", "noisy_integrator", "--intervals", 10, "--quiet")[0] == 0
+    assert run(capsys, "plot", "bryson_denham", "--intervals", 10, "--quiet")[0] == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bryson_denham.png", "noisy_integrator.png"]
+
+
+def test_plot_with_parameters_draws_that_problem(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(capsys, "plot", "unknown_lag", "--intervals", 60, "--set", "weight=3")
+    assert (code, out.strip()) == (0, "figure: unknown_lag.png")
+
+
+@pytest.mark.parametrize("name", ["unknown_lag", "damped_oscillator", "noisy_integrator"])
+def test_figures_of_models_are_labelled_problems(name):
+    from covocp.catalogue import find_model
+
+    figures = find_model(name).figures()
+    assert figures
+    for problems in figures.values():
+        labels = [label for label, _ in problems]
+        assert len(set(labels)) == len(labels) == 3
+        statements = [problem.statement() for _, problem in problems]
+        assert len({s.values.tobytes() for s in statements}) == 3
+
+
+def test_warnings_are_lines(capsys):
+    code, _, err = run(capsys, "solve", "mass_chain", "--intervals", 10)
+    assert code == 0
+    assert err.startswith("covocp: warning: The mesh is too coarse")
+    assert len(err.splitlines()) == 1
+
+
+# --- wrong input ------------------------------------------------------------------------------------------------------
+
+
+def assert_refused(outcome, words):
+    """Exit code 2 and one paragraph that begins with the command's name."""
+    code, out, err = outcome
+    assert (code, out) == (2, "")
+    assert words in err
+    assert err.startswith("covocp: ")
+    assert "\n\n" not in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nonsense"], "There is no model 'nonsense'"),
+        (["unknown_lag", "--set", "wait=1"], "'unknown_lag' has no parameter 'wait'"),
+        (["goddard_rocket", "--set", "mass=1"], "none: it has no parameters"),
+        (["unknown_lag", "--set", "weight=heavy"], "The value of 'weight' does not fit"),
+        (["unknown_lag", "--set", "weight=true"], "expected: a number"),
+        (["unknown_lag", "--set", "duration_weight=long"], "a number or none"),
+        (["mass_chain", "--set", "masses=1.5"], "a whole number"),
+        (["mass_chain", "--set", "masses=0"], "The chain needs a number of masses"),
+        (["unknown_lag", "--set", "weight"], "--set name=value"),
+        (["unknown_lag", "--set", "weight="], "--set name=value"),
+        (["unknown_lag", "--set", "duration=-1"], "'duration' must be positive"),
+        (["unknown_lag", "--set", "initial_variance=nan"], "contains NaN"),
+        (["damped_oscillator", "--set", "naming=mine"], "no such naming"),
+        (["unknown_lag", "--method", "simplex"], "There is no such method"),
+        (["unknown_lag", "--option", "colour=3"], "has no option 'colour'"),
+        (["unknown_lag", "--option", "control=wavy"], "The option 'control' has an unknown value"),
+        (["unknown_lag", "--option", "tolerance=small"], "check the values of --option"),
+        (["unknown_lag", "--option", "intervals=3"], "use --intervals"),
+        (["unknown_lag", "--option", "guess=magic"], "'magic'"),
+        (["unknown_lag", "--plot", "figure.doc"], "suffix names no format"),
+        (["unknown_lag", "--save", "solution.mat"], "suffix names no format"),
+        (["unknown_lag", "--save", "missing/solution.npz"], "folder does not exist"),
+        (["missing.py:make"], "There is no script 'missing.py'"),
+    ],
+)
+def test_wrong_input_is_refused(capsys, arguments, words):
+    assert_refused(run(capsys, "solve", *arguments), words)
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [
+        (":nothing", "has no function 'nothing'"),
+        ("", "the function one of make, needs"),
+        (":co", "has no function 'co'"),
+        (":number", "did not return a problem"),
+        (":failing", "ZeroDivisionError: division by zero"),
+        (":leaving", "SystemExit: 5"),
+        (":needs", "needs a value of weight"),
+    ],
+)
+def test_wrong_functions_of_scripts_are_refused(capsys, script, function, words):
+    assert_refused(run(capsys, "solve", f"{script}{function}"), words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = 1\nraise KeyError('lost')\n", "my_script.py:2"),
+        ("x = (\n", "SyntaxError"),
+        ("import nowhere\n", "nowhere"),
+    ],
+)
+def test_scripts_that_fail_are_refused_with_their_line(capsys, script, text, words):
+    script.write_text(text, encoding="utf-8")
+    assert_refused(run(capsys, "solve", f"{script}:make"), words)
+
+
+@pytest.mark.parametrize("arguments", [[], ["dance"], ["solve"], ["solve", "unknown_lag", "--intervals", "0"]])
+def test_wrong_commands_are_refused_by_the_parser(capsys, arguments):
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert "usage: covocp" in err
+
+
+def test_a_reader_that_has_gone_is_no_error():
+    command = f"{sys.executable} -m covocp.cli list | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "0"
+    assert done.stderr == ""
