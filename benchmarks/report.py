@@ -97,7 +97,7 @@ energy as their guess; the first two also simulate the states along it."""
 def picture(path: Path, cases: Sequence[Case]) -> None:
     """Draw time and peak memory over the size of the covariance, in logarithms."""
     chain = sorted((case for case in cases if case.part == "b"), key=lambda case: case.size)
-    chart, both = pyplot.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    chart, both = pyplot.subplots(1, 2, figsize=(11, 5), layout="constrained")
     ticks = sorted({case.size for case in chain})
     for axes, key, label in zip(
         both, ("seconds", "memory"), ("build and solve, s", "peak memory of the process, MB"), strict=True
@@ -111,7 +111,7 @@ def picture(path: Path, cases: Sequence[Case]) -> None:
         axes.set_xticks(ticks, [str(n) for n in ticks])
         axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
         axes.grid(alpha=0.3)
-    both[0].legend(fontsize="small")
+    chart.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
     chart.suptitle("Chain of masses, 50 intervals: first solve")
     chart.savefig(path, dpi=120)
     pyplot.close(chart)
