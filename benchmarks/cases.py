@@ -57,10 +57,12 @@ class Case:
     def run(self) -> dict[str, Any]:
         """Run once in a child process; the result, or the last line of its error."""
         command = [str(SCRIPT), json.dumps(self.options)] if self.options else ["-c", self.code]
+        # Compiled modules are kept, as in an installed package: else every import of the checkout compiles its sources.
+        environment = {name: text for name, text in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         settings: dict[str, Any] = {"capture_output": True, "text": True, "timeout": TIMEOUT, "check": False}
         start = time.perf_counter()
         try:
-            child = subprocess.run([sys.executable, *command], env={**os.environ, **ONE_THREAD}, **settings)
+            child = subprocess.run([sys.executable, *command], env=environment | ONE_THREAD, **settings)
         except subprocess.TimeoutExpired:
             return {"error": f"stopped after {TIMEOUT:.0f} s"}
         seconds = time.perf_counter() - start
