@@ -8,12 +8,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import eigh_tridiagonal
+from scipy.linalg import cholesky, eigh_tridiagonal, solve_triangular
 
 from covocp.extremal import Extremal
-from covocp.guess import quadrature_weights
 from covocp.integrators import full_interval, nominal_interval
 from covocp.matrices import Array
+from covocp.mesh import Mesh
 from covocp.shooting import common_columns, matrices_along, repeat
 from covocp.trajectory import Trajectory
 
@@ -50,30 +50,45 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     if not st.nu:
         return None
     product, jacobian = _functions(extremal)
-    weights = np.tile(quadrature_weights(mesh)[:, None] * extremal.trajectory.duration, (1, st.nu)).ravel()
-    root = np.sqrt(weights)
     multipliers = extremal.multipliers.controls.ravel()
     free = np.abs(multipliers) <= ACTIVE * max(1e-300, float(np.abs(multipliers).max(initial=0.0)))
-    u = extremal.trajectory.u.ravel()
-    rows = np.asarray(jacobian(u).full())[:, free] / root[free]
-    basis = _null_space(rows)
-    if basis.shape[1] == 0 or not np.isfinite(basis).all():
+    if not free.any():
         return None
+    root = cholesky(_mass_matrix(mesh, extremal.trajectory.duration, st.nu)[np.ix_(free, free)], lower=True)
+    u = extremal.trajectory.u.ravel()
+    rows = np.asarray(jacobian(u).full())[:, free]
+    if not np.isfinite(rows).all():
+        return None
+    basis = _null_space(solve_triangular(root, rows.T, lower=True).T)
+    size = basis.shape[1]
+
+    def direction(v: Array) -> Array:
+        full = np.zeros(u.size)
+        full[free] = solve_triangular(root.T, basis @ v, lower=False)
+        return full
 
     def apply(v: Array) -> Array:
-        full = np.zeros(u.size)
-        full[free] = (basis @ v) / root[free]
-        return np.asarray(basis.T @ (np.asarray(product(u, full).full()).ravel()[free] / root[free]))
+        image = np.asarray(product(u, direction(v)).full()).ravel()[free]
+        return np.asarray(basis.T @ solve_triangular(root, image, lower=True))
 
-    size = basis.shape[1]
-    if not np.isfinite(apply(np.ones(size))).all():
+    if size == 0 or not np.isfinite(np.asarray(product(u, direction(np.ones(size))).full())).all():
         return None
     values, vectors = lanczos(apply, size)
-    direction = np.zeros(u.size)
-    direction[free] = (basis @ vectors[:, 0]) / root[free]
     return Curvature(
-        value=float(values[0]), largest=float(np.abs(values).max()), direction=direction.reshape(-1, st.nu)
+        value=float(values[0]),
+        largest=float(np.abs(values).max()),
+        direction=direction(vectors[:, 0]).reshape(-1, st.nu),
     )
+
+
+def _mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:
+    """The matrix of int du' du dt for the control values, each of `count` entries."""
+    h = np.diff(mesh.nodes) * duration
+    if mesh.control == "constant":
+        matrix = np.diag(h)
+    else:
+        matrix = np.diag(np.append(h, 0.0) + np.append(0.0, h)) / 3.0 + (np.diag(h, 1) + np.diag(h, -1)) / 6.0
+    return np.asarray(np.kron(matrix, np.eye(count)))
 
 
 def lanczos(apply: Callable[[Array], Array], size: int) -> tuple[Array, Array]:

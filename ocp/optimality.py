@@ -25,6 +25,8 @@ from covocp.matrices import Array
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
+# Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
+QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,43 +156,48 @@ def _path_slopes(extremal: Extremal) -> Array:
 
 
 def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_]) -> float:
-    """Relative cost of the piecewise form of the control, from H_u at the middles of the intervals."""
-    st, mesh = extremal.statement, extremal.mesh
+    """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
+
+    H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
+    (not `free`, at the nodes) do not count; nan where H_uu is not positive definite.
+    """
+    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
     values, _, _ = fine_trajectory(extremal, 2 * mesh.substeps)
-    middle = values[:, mesh.substeps, :]
-    after = np.hstack([costates.state, costates.matrices])
-    rates = _costate_rates(extremal, costates)
     h = np.diff(extremal.time)[:, None]
-    mean = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
+    after, rates = np.hstack([costates.state, costates.matrices]), _costate_rates(extremal, costates)
+    middle = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
     u = extremal.controls
-    controls = u[:-1] if mesh.control == "constant" else 0.5 * (u[1:] + u[:-1])
-    make = hamiltonian(st)
-    function = make("middle", lambda v, x, w, e, t: [ca.gradient(v, w), ca.hessian(v, w)[0]])
-    n = mesh.intervals
-    time = 0.5 * (extremal.time[1:] + extremal.time[:-1])
-    arguments = (
-        middle[:, : st.nx].T,
-        controls.T,
-        middle[:, st.nx :].T,
-        time[None, :],
-        np.full((1, n), extremal.trajectory.duration),
-        np.tile(extremal.parameters[:, None], (1, n)),
-        mean[:, : st.nx].T,
-        mean[:, st.nx :].T,
-    )
-    slope, curvature = (np.asarray(v.full()) for v in function.map(n)(*arguments))
-    slope = np.where(free[:-1] & free[1:], slope.T, 0.0)
-    curvature = curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2)
-    smallest = np.linalg.eigvalsh(curvature)[:, 0]
-    if (smallest <= 0).any():
+    ends = u[:-1] if mesh.control == "constant" else u[1:]
+    function = hamiltonian(st)("point", lambda v, x, w, e, t: [ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
+    slopes, curvatures = [], []
+    for j, costate in enumerate((after[:-1], middle, after[1:])):
+        z = values[:, j * mesh.substeps, :]
+        arguments = (
+            z[:, : st.nx].T,
+            (u[:-1] + j / 2 * (ends - u[:-1])).T,
+            z[:, st.nx :].T,
+            extremal.time[None, :-1] + j / 2 * h.T,
+            np.full((1, n), extremal.trajectory.duration),
+            np.tile(extremal.parameters[:, None], (1, n)),
+            costate[:, : st.nx].T,
+            costate[:, st.nx :].T,
+        )
+        slope, curvature = (np.asarray(v.full()) for v in function(*arguments))
+        slopes.append(np.where(free[:-1] & free[1:], slope.T, 0.0))
+        curvatures.append(curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2))
+    if (np.linalg.eigvalsh(curvatures)[..., 0] <= 0).any():
         return float("nan")
-    steps = np.linalg.solve(curvature, slope[:, :, None])[:, :, 0]
-    terminal = st.terminal(
-        extremal.trajectory.x[-1], extremal.trajectory.e[-1], extremal.trajectory.duration, extremal.parameters
-    )
-    cost = st.rates.map(n)(*arguments[:6])[2]
-    total = abs(float(terminal)) + abs(float(np.sum(np.asarray(cost.full()).ravel() * h[:, 0])))
-    return float(0.5 * np.sum(h[:, 0] * np.sum(slope * steps, axis=1)) / max(total, np.finfo(float).tiny))
+    steps = np.linalg.solve(curvatures[1], np.array(slopes)[..., None])[..., 0]
+    total = np.einsum("jk,jni,kni,n->", QUADRATIC_PRODUCTS, slopes, steps, h[:, 0])
+    return float(0.5 * total / max(_absolute_cost(extremal), np.finfo(float).tiny))
+
+
+def _absolute_cost(extremal: Extremal) -> float:
+    """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
+    st, t = extremal.statement, extremal.trajectory
+    terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    running = np.asarray(st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())[2].full()).ravel()
+    return abs(terminal) + abs(float(np.trapezoid(running, extremal.time)))
 
 
 def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
