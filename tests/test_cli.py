@@ -146,7 +146,9 @@ def test_compare_ends_with_one_where_a_run_failed(capsys):
 
 
 def test_plot_draws_the_figures_of_the_source(capsys, tmp_path):
-    code, out, _ = run(capsys, "plot", "unknown_lag", "--intervals", 60, "--output", tmp_path / "lag.png")
+    code, out, _ = run(
+        capsys, "plot", "unknown_lag", "--intervals", 20, "--option", "substeps=3", "--output", tmp_path / "lag.png"
+    )
     assert code == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lag-1.png", "lag-2.png"]
     assert "Schmidt 5.2" in out

@@ -14,15 +14,15 @@ from covocp.models import noisy_integrator, unknown_lag
 from covocp.progress import Progress
 
 FORMULATIONS = [
-    "ipopt",
-    ("states", "ipopt", {"covariances": "states"}),
-    ("constant", "ipopt", {"control": "constant", "substeps": 2}),
+    ("ipopt", "ipopt", {"substeps": 2}),
+    ("states", "ipopt", {"covariances": "states", "substeps": 2}),
+    ("constant", "ipopt", {"control": "constant", "substeps": 3}),
 ]
 
 
 @pytest.fixture(scope="module")
 def formulations():
-    return co.compare(unknown_lag.problem(), FORMULATIONS, intervals=40, progress=False)
+    return co.compare(unknown_lag.problem(), FORMULATIONS, intervals=20, progress=False)
 
 
 def row_of(text, label):
