@@ -16,7 +16,15 @@ from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
 from covocp.hamiltonian import Costates, discrete_costates, fine_trajectory
 from covocp.integrators import hermite
-from covocp.matrices import Array, is_semidefinite, smallest_eigenvalue, unpack, unpack_costate
+from covocp.matrices import (
+    Array,
+    half_length,
+    is_semidefinite,
+    smallest_eigenvalue,
+    unpack,
+    unpack_costate,
+    unpack_indices,
+)
 from covocp.mesh import Mesh
 from covocp.optimality import Optimality, assess, path_violations
 from covocp.statement import Block, Statement, entry_names
@@ -203,8 +211,11 @@ class Solution:
 
     @cached_property
     def values(self) -> Mapping[str, Array]:
-        """Values of all symbols at the nodes by name."""
-        return self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
+        """Values of all symbols at the nodes by name; read-only."""
+        values = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
+        for array in values.values():
+            array.setflags(write=False)
+        return values
 
     @property
     def controls(self) -> Array:
@@ -425,12 +436,25 @@ def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, mis
         for name, symbol in symbols.items():
             if key.is_symbolic() and ca.is_equal(key, symbol) and name in names and key.shape == symbol.shape:
                 return name
+            if name in names and _is_matrix_of(key, symbol):
+                return name
     label = getattr(key, "labels", None)
     if label is not None and "E" in names:
         return "E"
     if missing_ok:
         return ""
     raise unknown_name(key, names)
+
+
+def _is_matrix_of(key: Any, half: Any) -> bool:
+    """Whether an expression is the full matrix of a half-vector's symbol."""
+    size = int(key.shape[0])
+    if size != key.shape[1] or half.shape[0] != half_length(size) or key.is_symbolic():
+        return False
+    if not all(ca.is_equal(symbol, half) for symbol in ca.symvar(key)):
+        return False
+    positions = np.asarray(ca.Function("positions", [half], [key])(np.arange(half.shape[0])).full())
+    return np.array_equal(positions, unpack_indices(size))
 
 
 def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:

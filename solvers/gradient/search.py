@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from covocp.descent import Step, solve_step, solve_tangent, unreachable
 from covocp.errors import ProblemError, describe
-from covocp.iterate import Iterate, Linear, Measures, Space
 from covocp.matrices import Array
-from covocp.penalty import next_weights
 from covocp.progress import Progress
+from covocp.solvers.gradient.descent import Step, solve_step, solve_tangent, unreachable
+from covocp.solvers.gradient.iterate import Iterate, Linear, Measures, Space
+from covocp.solvers.gradient.penalty import next_weights
 
 Variant = Literal["gradient", "chord"]
 # The share of the predicted decrease that must come true (Armijo), the number of past values that count as the largest.

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from covocp.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
 from covocp.extremal import Guess
 from covocp.guess import choose_scales, quadrature_weights
 from covocp.influence import (
@@ -25,7 +24,8 @@ from covocp.influence import (
 )
 from covocp.matrices import Array
 from covocp.nlp import Scales
-from covocp.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
+from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
+from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
 from covocp.trajectory import Multipliers, Trajectory
 
 # Eigenvalues of H_uu, in units of the control scales, are not taken below this share of the largest.

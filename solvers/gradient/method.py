@@ -14,7 +14,7 @@ Beyond the source:
   curvature seen along the last step, J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 1988, in the form ABBmin of
   G. Frassoldati, L. Zanni and G. Zanghirati, J. Ind. Manag. Optim. 4, 2008.
 - The step is taken in the space of the controls (piecewise linear or constant): the projection of the source's step.
-- Bounds on the controls and on T: projection of the step in the metric W. Inequalities: penalties (`covocp.penalty`).
+- Bounds on the controls and on T: projection of the step in the metric W. Inequalities: penalties (`penalty`).
 - Terminal conditions on matrices and equalities between final values have influence functions like those on x.
 - Free initial values: p(0) and P(0) are the slopes by them.
 
@@ -31,17 +31,17 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from covocp.checks import as_number
-from covocp.descent import solve_step
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
 from covocp.guess import controls_guess, stiffness
 from covocp.influence import build_sweeps
-from covocp.iterate import Iterate, Measures, Space, make_space
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
-from covocp.penalty import penalty_groups
 from covocp.progress import Progress
-from covocp.search import Search, Settings, Variant
+from covocp.solvers.gradient.descent import solve_step
+from covocp.solvers.gradient.iterate import Iterate, Measures, Space, make_space
+from covocp.solvers.gradient.penalty import penalty_groups
+from covocp.solvers.gradient.search import Search, Settings, Variant
 from covocp.statement import Statement
 from covocp.trajectory import Trajectory
 
