@@ -76,8 +76,8 @@ class Certificate:
         if self.smallest_eigenvalue is None:
             return f"{self.verdict}: {self.reason}"
         numbers = (
-            f"smallest eigenvalue {self.smallest_eigenvalue:.3g} (zero within the error of mesh and solver, "
-            f"{self.tolerance:.2g}), stationarity residual {self.stationarity:.2g}, "
+            f"smallest eigenvalue {self.smallest_eigenvalue:.3g} (known to {self.tolerance:.2g} by mesh and solver), "
+            f"stationarity residual {self.stationarity:.2g}, "
             f"Lambda^-1 against E_bb(T) {self.consistency:.2g}"
         )
         return f"{self.verdict}: {self.reason}; {numbers}"
