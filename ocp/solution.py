@@ -451,7 +451,8 @@ def _is_matrix_of(key: Any, half: Any) -> bool:
     size = int(key.shape[0])
     if size != key.shape[1] or half.shape[0] != half_length(size) or key.is_symbolic():
         return False
-    if not all(ca.is_equal(symbol, half) for symbol in ca.symvar(key)):
+    symbols = ca.symvar(key)
+    if len(symbols) != 1 or not ca.is_equal(symbols[0], half):
         return False
     positions = np.asarray(ca.Function("positions", [half], [key])(np.arange(half.shape[0])).full())
     return np.array_equal(positions, unpack_indices(size))
