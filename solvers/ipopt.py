@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.checks import check_positive
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
 from covocp.guess import choose_scales, stiffness
@@ -80,6 +81,16 @@ def prepare(
                 expected="'auto', 'exact' or 'limited-memory'",
                 received=repr(hessian),
                 remedy="correct hessian=",
+            )
+        )
+    check_positive("tolerance", tolerance)
+    if isinstance(max_iterations, bool) or not isinstance(max_iterations, (int, np.integer)) or max_iterations < 0:
+        raise ProblemError(
+            describe(
+                "The option 'max_iterations' is not a number of iterations.",
+                expected="0, 1, 2, ...",
+                received=repr(max_iterations),
+                remedy="correct max_iterations=",
             )
         )
     if not ca.has_nlpsol(plugin):
@@ -215,7 +226,17 @@ class ShootingSolver:
                 "warm_start_slack_bound_push": 1e-8,
                 "mu_init": 1e-6,
             }
-        return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+        try:
+            return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+        except RuntimeError as error:
+            raise ProblemError(
+                describe(
+                    f"The NLP plugin '{self._plugin}' refuses its settings.",
+                    expected="options that it has, in plugin_options; a C compiler where compile=True",
+                    received=str(error).strip().splitlines()[-1],
+                    remedy="correct plugin_options=, or leave compile= out",
+                )
+            ) from error
 
     def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Array) -> float:
         """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
