@@ -647,6 +647,16 @@ def unknown_plugin():
     solve(lag()[0], plugin="nosuch")
 
 
+@wrong("'tolerance'", "-1")
+def negative_tolerance():
+    solve(lag()[0], tolerance=-1)
+
+
+@wrong("'max_iterations'", "-1")
+def negative_number_of_iterations():
+    solve(lag()[0], max_iterations=-1)
+
+
 @wrong("'intervals'", "positive whole number", "10.5")
 def half_an_interval():
     solve(lag()[0], intervals=10.5)

@@ -324,6 +324,12 @@ def test_plugin_options_reach_ipopt():
     assert solution.stats["iterations"] == 1
 
 
+@pytest.mark.parametrize("options", [{"ipopt": {"nosuch": 1}}, {"nosuch": 1}])
+def test_unknown_plugin_option(options):
+    with pytest.raises(co.ProblemError, match="refuses its settings"):
+        solve(lag().problem, plugin_options=options)
+
+
 @pytest.mark.needs_cc
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_compiled_functions(formulation, tmp_path, monkeypatch):
