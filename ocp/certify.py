@@ -17,7 +17,6 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import null_space, solve_triangular
 
 from covocp.extremal import Extremal
 from covocp.matrices import Array, unpack
@@ -289,6 +288,8 @@ def _terminal_equalities(reduction: Reduction, forms: Forms, u: Array) -> Array:
 
 def _directions(rows: Array, energy: Array) -> Array:
     """Basis of the null space of the rows, orthonormal in the energy metric."""
+    from scipy.linalg import null_space, solve_triangular  # here: importing scipy takes longer than all of covocp
+
     sizes = np.linalg.norm(rows, axis=1)
     kept = rows[sizes > 0] / sizes[sizes > 0][:, None]
     basis = null_space(kept) if kept.size else np.eye(energy.shape[0])

@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import cholesky, eigh_tridiagonal, solve_triangular
 
 from covocp.extremal import Extremal
 from covocp.integrators import full_interval, nominal_interval
@@ -20,6 +19,9 @@ from covocp.trajectory import Trajectory
 # A constraint whose multiplier is above this share of the largest one is active.
 ACTIVE = 1e-5
 LANCZOS_STEPS = 30
+LANCZOS_LEAST = 8
+# Residual of the smallest Ritz value, relative to the largest eigenvalue, at which its sign is known well enough.
+LANCZOS_TOLERANCE = 1e-3
 DISPLACEMENT = 0.3
 
 
@@ -54,6 +56,8 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     free = np.abs(multipliers) <= ACTIVE * max(1e-300, float(np.abs(multipliers).max(initial=0.0)))
     if not free.any():
         return None
+    from scipy.linalg import cholesky, solve_triangular  # here: importing scipy takes longer than all of covocp
+
     root = cholesky(_mass_matrix(mesh, extremal.trajectory.duration, st.nu)[np.ix_(free, free)], lower=True)
     u = extremal.trajectory.u.ravel()
     rows = np.asarray(jacobian(u).full())[:, free]
@@ -97,6 +101,8 @@ def lanczos(apply: Callable[[Array], Array], size: int) -> tuple[Array, Array]:
     An isolated extreme eigenvalue, such as the negative one of a saddle, converges first; inside a cluster the Ritz
     values lie in it, which is all that is asked here (an iteration to a tolerance would never end there).
     """
+    from scipy.linalg import eigh_tridiagonal
+
     steps = min(size, LANCZOS_STEPS)
     basis = np.zeros((steps, size))
     diagonal, beside = np.zeros(steps), np.zeros(steps)
@@ -109,11 +115,13 @@ def lanczos(apply: Callable[[Array], Array], size: int) -> tuple[Array, Array]:
         for _ in range(2):
             image -= basis[: j + 1].T @ (basis[: j + 1] @ image)
         beside[j] = np.linalg.norm(image)
-        if beside[j] <= 1e-10 * max(np.abs(diagonal[: j + 1]).max(), 1e-300):
+        values, vectors = eigh_tridiagonal(diagonal[: j + 1], beside[:j])
+        residual = beside[j] * (np.abs(vectors[-1, 0]) if j >= LANCZOS_LEAST else 1.0)
+        tolerance = LANCZOS_TOLERANCE if j >= LANCZOS_LEAST else 1e-10
+        if residual <= tolerance * max(float(np.abs(values).max()), 1e-300):
             steps = j + 1
             break
         vector = image / beside[j]
-    values, vectors = eigh_tridiagonal(diagonal[:steps], beside[: steps - 1])
     return np.asarray(values, dtype=float), np.asarray(basis[:steps].T @ vectors, dtype=float)
 
 

@@ -66,6 +66,7 @@ class Solution:
         multipliers: of the constraints.
         costates: p and the costates of the half-vectors at the nodes.
         rates: of x and e stacked, at the nodes, (K, nx + ne).
+        end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
         filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
         mesh_error: relative change of the cost by halving the integration steps (estimated with the costates).
         violations: of constraints, by name.
@@ -87,6 +88,7 @@ class Solution:
     multipliers: Multipliers
     costates: Costates
     rates: Array
+    end_rates: Array
     filter_gain: Array | None
     mesh_error: float
     violations: Mapping[str, float]
@@ -107,9 +109,8 @@ class Solution:
         cost = sum(outcome.cost_terms.values())
         after = np.hstack([costates.state, costates.matrices])[1:]
         change = float(np.sum(after * jumps)) + float(fine_cost.sum()) - outcome.cost_terms["running"]
-        values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
-        rates = np.vstack([np.asarray(values[0].full()), np.asarray(values[1].full())]).T
-        for array in (trajectory.x, trajectory.u, trajectory.e, costates.state, costates.matrices, rates):
+        rates, end_rates = _rates(extremal)
+        for array in (trajectory.x, trajectory.u, trajectory.e, costates.state, costates.matrices, rates, end_rates):
             array.setflags(write=False)
         return Solution(
             name=st.name,
@@ -123,6 +124,7 @@ class Solution:
             multipliers=extremal.multipliers,
             costates=costates,
             rates=rates,
+            end_rates=end_rates,
             filter_gain=_filter_gain(extremal),
             mesh_error=abs(change) / max(abs(cost), np.finfo(float).tiny) if change else 0.0,
             violations=dict(outcome.violations),
@@ -278,7 +280,7 @@ class Solution:
         h = (nodes[k + 1] - nodes[k])[:, None]
         c = (times[:, None] - nodes[k][:, None]) / h
         z = np.hstack([self.trajectory.x, self.trajectory.e])
-        smooth = hermite(z[k], z[k + 1], h * self.rates[k], h * self.rates[k + 1], c)
+        smooth = hermite(z[k], z[k + 1], h * self.rates[k], h * self.end_rates[k], c)
         straight = z[k] + c * (z[k + 1] - z[k])
         nx = self.trajectory.x.shape[1]
         e = smooth[:, nx:]
@@ -468,6 +470,22 @@ def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
             remedy="check the spelling, or use the symbols of the problem that was solved",
         )
     )
+
+
+def _rates(extremal: Extremal) -> tuple[Array, Array]:
+    """Rates of x and e stacked at the nodes, and at the ends of the intervals with the control of the interval."""
+    function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
+
+    def stacked(columns: tuple[Any, ...]) -> Array:
+        state, matrices, _ = function(*columns)
+        return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
+
+    x, u, *rest = extremal.columns()
+    rates = stacked((x, u, *rest))
+    if extremal.mesh.control == "linear":
+        return rates, rates[1:].copy()
+    before = np.hstack([np.asarray(u)[:, :1], np.asarray(u)[:, :-1]])
+    return rates, stacked((x, before, *rest))[1:]
 
 
 def _filter_gain(extremal: Extremal) -> Array | None:

@@ -27,6 +27,7 @@ PARTS: dict[str, Any] = {
 ARRAYS = {
     "parameters",
     "rates",
+    "end_rates",
     "mesh.nodes",
     *(f"trajectory.{name}" for name in ("x", "u", "e")),
     *(f"costates.{f.name}" for f in fields(Costates)),
@@ -165,6 +166,7 @@ def _check_shapes(solution: Solution) -> None:
         ("costates.state", solution.costates.state, (count, nx)),
         ("costates.matrices", solution.costates.matrices, (count, ne)),
         ("rates", solution.rates, (count, nx + ne)),
+        ("end_rates", solution.end_rates, (count - 1, nx + ne)),
         ("multipliers.final", m.final, (nx,)),
         ("multipliers.final_matrices", m.final_matrices, (ne,)),
         ("multipliers.start", m.start, (m.start.size,)),
