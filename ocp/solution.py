@@ -456,8 +456,8 @@ def _is_matrix_of(key: Any, half: Any) -> bool:
     symbols = ca.symvar(key)
     if len(symbols) != 1 or not ca.is_equal(symbols[0], half):
         return False
-    positions = np.asarray(ca.Function("positions", [half], [key])(np.arange(half.shape[0])).full())
-    return np.array_equal(positions, unpack_indices(size))
+    probe = np.sqrt(2.0 + np.arange(half.shape[0]))
+    return np.array_equal(np.asarray(ca.Function("probe", [half], [key])(probe).full()), probe[unpack_indices(size)])
 
 
 def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:

@@ -8,11 +8,13 @@ import sys
 import pytest
 
 import covocp as co
+import covocp.models
 from covocp.cli import main
 from covocp.progress import Progress
 
 SCRIPT = """
 import covocp as co
+import covocp.models
 
 def make(weight=1.0, kind: str = "plain"):
     '''Move a mass point. And more.'''
@@ -62,7 +64,7 @@ def test_list_shows_every_model_with_its_parameters(capsys):
     code, out, _ = run(capsys, "list")
     assert code == 0
     names = [line for line in out.splitlines() if line and not line.startswith(" ")]
-    modules = os.listdir(os.path.dirname(co.__file__) + "/../models")
+    modules = os.listdir(os.path.dirname(covocp.models.__file__))
     assert names == sorted(name[:-3] for name in modules if name.endswith(".py") and name != "__init__.py")
     assert "--set weight=10.0 final=0.0 duration=10.0" in out
     entry = out[out.index("damped_oscillator") :]
@@ -220,7 +222,7 @@ def assert_refused(outcome, words):
         (["unknown_lag", "--method", "simplex"], "There is no such method"),
         (["unknown_lag", "--option", "colour=3"], "has no option 'colour'"),
         (["unknown_lag", "--option", "control=wavy"], "The option 'control' has an unknown value"),
-        (["unknown_lag", "--option", "tolerance=small"], "check the values of --option"),
+        (["unknown_lag", "--option", "tolerance=small"], "'tolerance' is not a number"),
         (["unknown_lag", "--option", "intervals=3"], "use --intervals"),
         (["unknown_lag", "--option", "guess=magic"], "'magic'"),
         (["unknown_lag", "--plot", "figure.doc"], "suffix names no format"),
