@@ -347,3 +347,70 @@ def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> c
             )
         )
     return expression
+
+
+COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
+
+
+def column_expression(name: str, what: str, value: Any) -> ca.MX:
+    """The value as a column of expressions; comparisons, lists and symbols of another kind are refused."""
+    if not isinstance(value, (ca.MX, ca.DM, int, float)):
+        raise ProblemError(
+            describe(
+                f"The {what} '{name}' is not an expression of this problem's symbols.",
+                expected="one expression; several go into one column by casadi.vertcat",
+                received=f"{type(value).__name__}: {str(value)[:100]}",
+                remedy="use the symbols that state(), control() and symmetric() return",
+            )
+        )
+    expression = ca.MX(value)
+    if not expression.is_constant() and expression.is_binary() and expression.op() in COMPARISONS:
+        raise ProblemError(
+            describe(
+                f"The {what} '{name}' is a comparison, whose value is true or false.",
+                expected="an expression, and its bounds apart: subject_to(x, upper=1)",
+                received=str(value),
+                remedy="give what is bounded, and its bounds by lower= and upper=",
+            )
+        )
+    if expression.shape[1] != 1:
+        raise shape_error(name, what, "a scalar or a column", f"shape {expression.shape}")
+    return expression
+
+
+def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None:
+    """A constraint must contain something that can be chosen."""
+    fixed = {symbol.__hash__() for symbol in constants}
+    if all(symbol.__hash__() in fixed for symbol in ca.symvar(expression)):
+        raise ProblemError(
+            describe(
+                f"'{name}' contains no variable.",
+                expected="an expression of states, controls, matrix states or the free duration",
+                received=str(expression),
+                remedy="remove it, or use the symbols that state(), control() and symmetric() return",
+            )
+        )
+
+
+def check_limits(name: str, lower: Array, upper: Array) -> None:
+    """Bounds of a constraint must not cross, and one of them must bind."""
+    if (lower > upper).any() and (upper == 0).all():
+        raise ProblemError(
+            describe(
+                f"The bounds of '{name}' cross.",
+                expected="lower <= upper",
+                received=f"lower = {lower.max():g}, upper = 0 (which it is unless given)",
+                remedy="give the upper bound too; upper=numpy.inf where there is none",
+            )
+        )
+    check_bounds(name, lower, upper)
+    for i in np.flatnonzero(np.isneginf(lower) & np.isposinf(upper)):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"{entry} has no bound.",
+                expected="a finite lower or upper bound",
+                received="lower = -inf, upper = inf",
+                remedy="give lower= or upper=, or remove the constraint",
+            )
+        )

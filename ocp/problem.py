@@ -12,18 +12,20 @@ from covocp.checks import (
     as_number,
     caller,
     check_bounds,
+    check_constrains,
     check_density,
     check_inside,
+    check_limits,
     check_name,
     check_positive,
     check_size,
     column,
+    column_expression,
     data_column,
     density_matrix,
     find_name,
     is_symbolic,
     scale_column,
-    shape_error,
     symmetric_data,
 )
 from covocp.declarations import (
@@ -354,10 +356,8 @@ class Problem:
         Raises:
             ProblemError: name used twice, density singular, negative or of the wrong size.
         """
-        value = ca.MX(expression)
+        value = column_expression(name, "measurement", expression)
         size = self._declare(name, value.shape[0])
-        if value.shape[1] != 1:
-            raise shape_error(name, "measurement", "a column", f"shape {value.shape}")
         density = density_matrix(name, "noise density", noise, size)
         if density.is_constant():
             check_density(name, "noise density", ca.evalf(density).full(), definite=True)
@@ -417,25 +417,15 @@ class Problem:
                     remedy="choose one of the three",
                 )
             )
-        value = ca.MX(expression) if not isinstance(expression, ca.MX) else expression
-        known = {entry.name for entry in self.parameters}
-        if not any(symbol.name() not in known for symbol in ca.symvar(value)):
-            raise ProblemError(
-                describe(
-                    f"'{label}' contains no variable.",
-                    expected="an expression of states, controls, matrix states or time",
-                    received=str(expression),
-                    remedy="remove it, or use the symbols that state(), control() and symmetric() return",
-                )
-            )
-        if value.shape[1] != 1:
-            raise shape_error(label, "expression", "a scalar or a column", f"shape {value.shape}")
+        value = column_expression(label, "constraint", expression)
+        constants = [entry.symbol for entry in (*self.parameters, *self.unknowns)] + [self._time]
+        check_constrains(label, value, constants)
         size = self._declare(label, value.shape[0])
         low, high = (
             column(label, "lower bound", lower, size, inf=True),
             column(label, "upper bound", upper, size, inf=True),
         )
-        check_bounds(label, low, high)
+        check_limits(label, low, high)
         self.constraints.append(Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller()))
 
     def statement(self) -> Statement:
