@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -14,6 +15,7 @@ from covocp.integrators import full_interval, nominal_interval
 from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.shooting import common_columns, matrices_along, repeat
+from covocp.statement import Statement
 from covocp.trajectory import Trajectory
 
 # A constraint whose multiplier is above this share of the largest one is active.
@@ -51,7 +53,8 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     st, mesh = extremal.statement, extremal.mesh
     if not st.nu:
         return None
-    product, jacobian = _functions(extremal)
+    product, jacobian = _functions(st, mesh, _Active.of(extremal))
+    arguments = _arguments(extremal)
     multipliers = extremal.multipliers.controls.ravel()
     free = np.abs(multipliers) <= ACTIVE * max(1e-300, float(np.abs(multipliers).max(initial=0.0)))
     if not free.any():
@@ -60,7 +63,7 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
 
     root = cholesky(_mass_matrix(mesh, extremal.trajectory.duration, st.nu)[np.ix_(free, free)], lower=True)
     u = extremal.trajectory.u.ravel()
-    rows = np.asarray(jacobian(u).full())[:, free]
+    rows = np.asarray(jacobian(u, *arguments).full())[:, free]
     if not np.isfinite(rows).all():
         return None
     basis = _null_space(solve_triangular(root, rows.T, lower=True).T)
@@ -72,10 +75,10 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
         return full
 
     def apply(v: Array) -> Array:
-        image = np.asarray(product(u, direction(v)).full()).ravel()[free]
+        image = np.asarray(product(u, *arguments, direction(v)).full()).ravel()[free]
         return np.asarray(basis.T @ solve_triangular(root, image, lower=True))
 
-    if size == 0 or not np.isfinite(np.asarray(product(u, direction(np.ones(size))).full())).all():
+    if size == 0 or not np.isfinite(np.asarray(product(u, *arguments, direction(np.ones(size))).full())).all():
         return None
     values, vectors = lanczos(apply, size)
     return Curvature(
@@ -134,66 +137,99 @@ def _null_space(rows: Array) -> Array:
     return np.asarray(vectors[rank:].T)
 
 
-def _functions(extremal: Extremal) -> tuple[ca.Function, ca.Function]:
-    """(u, v) -> Hessian of the Lagrangian times v, and u -> Jacobian of what is held, both by single shooting."""
-    st, mesh, multipliers = extremal.statement, extremal.mesh, extremal.multipliers
-    t, p = ca.DM(extremal.trajectory.duration), ca.DM(extremal.parameters)
+@dataclass(frozen=True, kw_only=True)
+class _Active:
+    """Positions of what is held: final states and half-vectors, rows of path and end conditions, bounded states."""
+
+    final: tuple[int, ...]
+    final_matrices: tuple[int, ...]
+    path: tuple[int, ...]
+    end: tuple[int, ...]
+    states: tuple[int, ...]
+
+    @staticmethod
+    def of(extremal: Extremal) -> _Active:
+        """What is held along an extremal."""
+        _, xf, _, ef = extremal.statement.boundary_values(extremal.parameters)
+        multipliers = extremal.multipliers
+
+        def active(values: Array) -> tuple[int, ...]:
+            sizes = np.abs(values).ravel()
+            return tuple(np.flatnonzero(sizes > ACTIVE * max(1e-300, float(sizes.max(initial=0.0)))).tolist())
+
+        return _Active(
+            final=tuple(np.flatnonzero(~np.isnan(xf)).tolist()),
+            final_matrices=tuple(np.flatnonzero(~np.isnan(ef)).tolist()),
+            path=active(multipliers.path),
+            end=active(multipliers.end),
+            states=active(multipliers.states),
+        )
+
+
+def _arguments(extremal: Extremal) -> tuple[Any, ...]:
+    """The arguments of `_functions` after the control: start, T, parameters, multipliers."""
+    t, m = extremal.trajectory, extremal.multipliers
+    return (
+        *(t.x[0], t.e[0], t.duration, extremal.parameters),
+        *(m.final, m.final_matrices, m.end, m.path.T, m.states.T),
+    )
+
+
+@lru_cache(maxsize=4)
+def _functions(statement: Statement, mesh: Mesh, active: _Active) -> tuple[ca.Function, ca.Function]:
+    """(u, *arguments, v) -> Hessian of the Lagrangian times v; (u, *arguments) -> Jacobian of what is held.
+
+    Both by single shooting from the start of the extremal; `_arguments` gives the arguments.
+    """
+    st, count = statement, mesh.intervals + 1
     u = ca.MX.sym("u", st.nu * mesh.control_nodes)
-    x, e, cost = _single_shooting(extremal, ca.reshape(u, st.nu, mesh.control_nodes))
+    x0, e0, t, p = (ca.MX.sym(name, n) for name, n in (("x0", st.nx), ("e0", st.ne), ("T", 1), ("p", st.np)))
+    final, final_e, end = (
+        ca.MX.sym(name, n) for name, n in (("final", st.nx), ("final_e", st.ne), ("end", st.end.size))
+    )
+    path, states = ca.MX.sym("path", st.path.size, count), ca.MX.sym("states", st.nx, count)
+    controls = ca.reshape(u, st.nu, mesh.control_nodes)
+    x, e, cost = _single_shooting(st, mesh, controls, (x0, e0, t, p))
     last_x, last_e = x[:, -1], e[:, -1]
-    value = ca.sum2(cost) + st.terminal(last_x, last_e, t, p)
-    x0, xf, _, ef = st.boundary_values(extremal.parameters)
-    fixed_x, fixed_e = np.flatnonzero(~np.isnan(xf)), np.flatnonzero(~np.isnan(ef))
-    value += ca.dot(ca.DM(multipliers.final), last_x) + ca.dot(ca.DM(multipliers.final_matrices), last_e)
-    held = [
-        ca.vertcat(ca.MX(0, 1), *(values[int(i)] for i in at)) for values, at in ((last_x, fixed_x), (last_e, fixed_e))
-    ]
-    count = mesh.intervals + 1
-    columns = u_at_nodes(extremal, ca.reshape(u, st.nu, mesh.control_nodes))
-    time = ca.DM(extremal.time).T
-    for conditions, weights, at in (
-        (st.path, multipliers.path, list(range(count))),
-        (st.end, multipliers.end[None, :], [count - 1]),
+    value = ca.sum2(cost) + st.terminal(last_x, last_e, t, p) + ca.dot(final, last_x) + ca.dot(final_e, last_e)
+    value += ca.dot(states, x)
+    held = [_entries(last_x, active.final), _entries(last_e, active.final_matrices), _entries(x, active.states)]
+    at_nodes = controls if controls.shape[1] == count else ca.horzcat(controls, controls[:, -1])
+    time = t * ca.DM(mesh.nodes).T
+    for conditions, weights, at, rows_held in (
+        (st.path, path, list(range(count)), active.path),
+        (st.end, end, [count - 1], active.end),
     ):
         if conditions.size:
             k = len(at)
-            rows = conditions.function.map(k)(
-                x[:, at], columns[:, at], e[:, at], time[:, at], ca.repmat(t, 1, k), repeat(p, k)
-            )
-            value += ca.dot(ca.DM(weights.T), rows)
-            active = np.flatnonzero(np.abs(weights.ravel()) > ACTIVE * max(1e-300, float(np.abs(weights).max())))
-            held.append(ca.vec(rows)[active.tolist()])
-    states = multipliers.states.T
-    if np.abs(states).max(initial=0.0) > 0:
-        value += ca.dot(ca.DM(states), x)
-        active = np.flatnonzero(np.abs(states.ravel(order="F")) > ACTIVE * np.abs(states).max())
-        held.append(ca.vec(x)[active.tolist()])
+            columns = (v[:, at] for v in (x, at_nodes, e, time))
+            rows = conditions.function.map(k)(*columns, ca.repmat(t, 1, k), repeat(p, k))
+            value += ca.dot(weights, rows)
+            held.append(_entries(rows, rows_held))
+    arguments = [u, x0, e0, t, p, final, final_e, end, path, states]
     direction = ca.MX.sym("v", u.shape[0])
-    gradient = ca.gradient(value, u)
-    product = ca.Function("product", [u, direction], [ca.densify(ca.jtimes(gradient, u, direction))])
-    kept = ca.vertcat(ca.MX(0, 1), *held)
-    return product, ca.Function("held", [u], [ca.densify(ca.jacobian(kept, u))])
+    product = ca.densify(ca.jtimes(ca.gradient(value, u), u, direction))
+    kept = ca.densify(ca.jacobian(ca.vertcat(ca.MX(0, 1), *held), u))
+    return ca.Function("product", [*arguments, direction], [product]), ca.Function("held", arguments, [kept])
 
 
-def u_at_nodes(extremal: Extremal, u: Any) -> Any:
-    """Controls at all nodes, a column each."""
-    return u if u.shape[1] == extremal.mesh.intervals + 1 else ca.horzcat(u, u[:, -1])
+def _entries(values: Any, positions: tuple[int, ...]) -> Any:
+    """Some entries of a matrix, in the order of its transpose flattened (time first), as a column."""
+    return ca.vec(values)[list(positions)] if positions else ca.MX(0, 1)
 
 
-def _single_shooting(extremal: Extremal, u: Any) -> tuple[Any, Any, Any]:
-    """States, half-vectors at the nodes and running costs as functions of the controls alone."""
-    st, mesh, trajectory = extremal.statement, extremal.mesh, extremal.trajectory
-    p = ca.DM(extremal.parameters)
-    common = common_columns(mesh, u, ca.DM(trajectory.duration), p)
-    x0, e0 = ca.DM(trajectory.x[0]), ca.DM(trajectory.e[0])
-    if st.coupled:
-        interval = full_interval(st, mesh.substeps, mesh.step)
+def _single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """States, half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
+    x0, e0, duration, p = start
+    common = common_columns(mesh, u, duration, p)
+    if statement.coupled:
+        interval = full_interval(statement, mesh.substeps, mesh.step)
         ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
         nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
-        return nodes[: st.nx, :], nodes[st.nx :, :], cost
-    ends, fine, cost = nominal_interval(st, mesh.substeps).mapaccum("run", mesh.intervals)(x0, *common)
+        return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
+    ends, fine, cost = nominal_interval(statement, mesh.substeps).mapaccum("run", mesh.intervals)(x0, *common)
     x = ca.horzcat(x0, ends)
-    if not st.matrices:
+    if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, e0)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
     return x, e, cost + matrix_cost

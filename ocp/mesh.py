@@ -62,7 +62,7 @@ class Options:
         return nodes
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
     """A resolved mesh.
 
