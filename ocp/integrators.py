@@ -32,6 +32,8 @@ Step = Literal["gauss", "strang", "rk4"]
 # Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
+# With equilibration LAPACK's interface prints every matrix that has a zero row.
+SOLVER_OPTIONS: dict[str, dict[str, Any]] = {"lapacklu": {"equilibration": False}}
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
 
@@ -50,6 +52,11 @@ def interval_symbols(statement: Statement, symbolic: Any) -> tuple[Any, ...]:
         symbolic.sym("T"),
         symbolic.sym("p", statement.np),
     )
+
+
+def linear_solve(matrix: Any, right: Any, solver: str) -> Any:
+    """matrix^-1 right; where the matrix is singular the evaluation fails, without a word on the terminal."""
+    return ca.solve(matrix, right, solver, SOLVER_OPTIONS.get(solver, {}))
 
 
 def _slopes(statement: Statement, count: int) -> dict[str, Any]:
@@ -173,7 +180,7 @@ def _gauss_matrix(points: Any, size: int, solver: str) -> Any:
     a = 0.5 - 2.0 * g
     unit = ca.DM.eye(2 * size)
     left, right = unit - g * second, unit - g * first
-    stage = ca.solve(left @ right - a / 2 * (first + second), ca.densify(left), solver)
+    stage = linear_solve(left @ right - a / 2 * (first + second), ca.densify(left), solver)
     return unit + (right @ stage - unit) / a
 
 
@@ -211,7 +218,7 @@ def _strang_matrix(parts: Any, size: int, solver: str) -> Any:
     unit, zero = ca.DM.eye(size), ca.DM(size, size)
     update_a, update_b = (ca.blockcat([[unit, w], [zero, unit]]) for w in (information_a, information_b))
     diffuse_a, diffuse_b = (ca.blockcat([[unit, zero], [q, unit]]) for q in (noise_a, noise_b))
-    move = ca.blockcat([[ca.solve(transition.T, unit, solver), zero], [zero, transition]])
+    move = ca.blockcat([[linear_solve(transition.T, unit, solver), zero], [zero, transition]])
     return update_b @ diffuse_b @ move @ diffuse_a @ update_a
 
 
@@ -244,7 +251,7 @@ def apply_step(matrix: Any, half: Any, size: int, solver: str = LINEAR_SOLVER) -
     covariance = unpack_symbolic(half, size)
     below = matrix[size:, :size] + matrix[size:, size:] @ covariance
     above = matrix[:size, :size] + matrix[:size, size:] @ covariance
-    return pack_symbolic(ca.solve(above.T, below.T, solver))
+    return pack_symbolic(linear_solve(above.T, below.T, solver))
 
 
 @lru_cache(maxsize=KEPT)
