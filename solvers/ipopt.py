@@ -22,6 +22,8 @@ from covocp.progress import Progress
 from covocp.shooting import transcribe
 from covocp.statement import Statement
 
+TOLERANCE = 1e-7
+MAX_ITERATIONS = 1000
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
@@ -49,8 +51,8 @@ def prepare(
     statement: Statement,
     options: Options,
     *,
-    tolerance: float = 1e-7,
-    max_iterations: int = 1000,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
     hessian: str = "auto",
     plugin: str = "ipopt",
     plugin_options: Mapping[str, Any] | None = None,
@@ -61,10 +63,12 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh and formulation.
-        tolerance: on the scaled optimality conditions.
-        max_iterations: of the NLP solver.
-        hessian: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or "limited-memory".
-        plugin: name of a CasADi NLP plugin, such as "ipopt", "sqpmethod" or "fatrop".
+        tolerance: of Ipopt, on the scaled optimality conditions; None: 1e-7.
+        max_iterations: of Ipopt; None: 1000.
+        hessian: of Ipopt: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or
+            "limited-memory".
+        plugin: name of a CasADi NLP plugin, such as "ipopt", "sqpmethod" or "fatrop"; another one than Ipopt takes its
+            own settings by plugin_options.
         plugin_options: passed to CasADi's nlpsol as they are.
         compile: whether the functions of the NLP are compiled by the C compiler of the machine.
 
@@ -74,25 +78,42 @@ def prepare(
     Raises:
         ProblemError: an option is wrong, or the model is not finite where the solver starts.
     """
+    _check_options(tolerance, max_iterations, hessian, plugin)
+    step = choose_step(statement, options)
+    stiff = stiffness(statement, options.nodes(), options.control, statement.values, matrices=step == "rk4")
+    mesh = choose_mesh(statement, options, stiff)
+    limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
+    limited = limited and plugin == "ipopt"
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+    settings["calc_lam_p"] = False
+    if plugin == "ipopt":
+        settings["ipopt"] = {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": TOLERANCE if tolerance is None else tolerance,
+            "max_iter": MAX_ITERATIONS if max_iterations is None else max_iterations,
+            # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
+            "fixed_variable_treatment": "make_parameter_nodual",
+        }
+        if limited:
+            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
+    if compile:
+        settings |= JIT
+        mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
+    for key, value in (plugin_options or {}).items():
+        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
+    return ShootingSolver(statement, mesh, plugin, settings, limited)
+
+
+def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: Any) -> None:
+    """Refuse options that mean nothing, or nothing to the plugin."""
+    if tolerance is not None:
+        check_positive("tolerance", tolerance)
+    whole = isinstance(max_iterations, (int, np.integer)) and not isinstance(max_iterations, bool)
+    if max_iterations is not None and not (whole and max_iterations >= 0):
+        raise _option_error("max_iterations", "a number of iterations: 0, 1, 2, ...", max_iterations)
     if hessian not in ("auto", "exact", "limited-memory"):
-        raise ProblemError(
-            describe(
-                "The option 'hessian' has an unknown value.",
-                expected="'auto', 'exact' or 'limited-memory'",
-                received=repr(hessian),
-                remedy="correct hessian=",
-            )
-        )
-    check_positive("tolerance", tolerance)
-    if isinstance(max_iterations, bool) or not isinstance(max_iterations, (int, np.integer)) or max_iterations < 0:
-        raise ProblemError(
-            describe(
-                "The option 'max_iterations' is not a number of iterations.",
-                expected="0, 1, 2, ...",
-                received=repr(max_iterations),
-                remedy="correct max_iterations=",
-            )
-        )
+        raise _option_error("hessian", "'auto', 'exact' or 'limited-memory'", hessian)
     if not ca.has_nlpsol(plugin):
         raise ProblemError(
             describe(
@@ -102,25 +123,25 @@ def prepare(
                 remedy="correct plugin=, or install a CasADi that has it",
             )
         )
-    step = choose_step(statement, options)
-    stiff = stiffness(statement, options.nodes(), options.control, statement.values, matrices=step == "rk4")
-    mesh = choose_mesh(statement, options, stiff)
-    limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
-    limited = limited and plugin == "ipopt"
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
-    settings["calc_lam_p"] = False
-    if plugin == "ipopt":
-        settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
-        # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
-        settings["ipopt"]["fixed_variable_treatment"] = "make_parameter_nodual"
-        if limited:
-            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
-    if compile:
-        settings |= JIT
-        mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
-    for key, value in (plugin_options or {}).items():
-        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
-    return ShootingSolver(statement, mesh, plugin, settings, limited)
+    given = {
+        "tolerance": tolerance,
+        "max_iterations": max_iterations,
+        "hessian": None if hessian == "auto" else hessian,
+    }
+    for name, value in given.items():
+        if plugin != "ipopt" and value is not None:
+            raise _option_error(name, f"nothing: it is Ipopt's, and '{plugin}' takes plugin_options", value)
+
+
+def _option_error(name: str, expected: str, received: Any) -> ProblemError:
+    return ProblemError(
+        describe(
+            f"The option '{name}' has a value that does not apply.",
+            expected=expected,
+            received=repr(received),
+            remedy=f"correct {name}=",
+        )
+    )
 
 
 class ShootingSolver:
@@ -154,8 +175,14 @@ class ShootingSolver:
         built = time.perf_counter()
         if self._monitor is not None:
             self._monitor.attach(progress, scale, bounds)
-        result = solver(**arguments)
-        stats = solver.stats()
+        try:
+            result = solver(**arguments)
+        except RuntimeError as error:  # a plugin that gives up by raising; its last iterate is lost, the start is not
+            result = {"x": ca.DM(w0), "lam_x": ca.DM.zeros(w0.size), "lam_g": ca.DM.zeros(bounds["lbg"].size)}
+            reason = str(error).strip().splitlines()[-1]
+            stats: dict[str, Any] = {"success": False, "return_status": f"{self._plugin} gave up: {reason}"}
+        else:
+            stats = solver.stats()
         w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
         counts = {
             "iterations": int(stats.get("iter_count", -1)),
@@ -183,7 +210,7 @@ class ShootingSolver:
             extremal=extremal,
             cost_terms={"terminal": values["terminal"], "running": values["running"]},
             converged=success,
-            message=MESSAGES.get(status, status.replace("_", " ").lower() or ("solved" if success else "failed")),
+            message=MESSAGES.get(status, status.replace("_", " ") or ("solved" if success else "failed")),
             violations=nlp.violations(values["g"], parameters),
             stats=stats,
         )
@@ -243,7 +270,7 @@ class ShootingSolver:
 
         Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
         """
-        if not solver.has_function("nlp_grad_f"):  # another plugin
+        if self._plugin != "ipopt":  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         gradient = solver.get_function("nlp_grad_f")
         p = np.append(parameters, 1.0)
