@@ -418,7 +418,7 @@ class Problem:
                 )
             )
         value = column_expression(label, "constraint", expression)
-        constants = [entry.symbol for entry in (*self.parameters, *self.unknowns)] + [self._time]
+        constants = [q.symbol for q in self.parameters] + [q.symbol for q in self.unknowns] + [self._time]
         check_constrains(label, value, constants)
         size = self._declare(label, value.shape[0])
         low, high = (

@@ -210,10 +210,16 @@ class ShootingSolver:
             extremal=extremal,
             cost_terms={"terminal": values["terminal"], "running": values["running"]},
             converged=success,
-            message=MESSAGES.get(status, status.replace("_", " ") or ("solved" if success else "failed")),
+            message=self._message(success, status),
             violations=nlp.violations(values["g"], parameters),
             stats=stats,
         )
+
+    def _message(self, success: bool, status: str) -> str:
+        """How the run ended, a sentence."""
+        if self._plugin == "ipopt" and status in MESSAGES:
+            return MESSAGES[status]
+        return "solved" if success else f"{self._plugin} ended with the status '{status}'"
 
     def _build(self, parameters: Array, guess: Guess) -> tuple[NLP, ca.Function]:
         """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts."""
