@@ -55,7 +55,7 @@ def peer(case: dict[str, Any]) -> dict[str, Any]:
     import peers_systems
 
     module = importlib.import_module(f"peers_{case['code']}")
-    options = {"max_iter": case["max_iter"]} if "max_iter" in case else {}
+    options = {name: case[name] for name in ("max_iter", "wrapped") if name in case}
     start = time.perf_counter()
     system = peers_systems.oscillator() if case["system"] == "oscillator" else peers_systems.chain(case["masses"])
     stated = time.perf_counter()

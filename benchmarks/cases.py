@@ -88,6 +88,9 @@ def chain_cases(sizes: Sequence[int]) -> list[Case]:
         options = {"system": "chain", "masses": SIZES[n], "intervals": CHAIN_INTERVALS}
         codes = ["covocp", "eliminated", *(["packed", "rockit"] if n <= LARGEST_STATED else [])]
         cases += [Case(part="b", code=code, size=n, options={"code": code, **options}) for code in codes]
+        if n == LARGEST_STATED:
+            one_function = {"code": "rockit", **options, "wrapped": True}
+            cases.append(Case(part="b", code="rockit, one function", size=n, options=one_function))
         if n == ONE_ITERATION:
             one = {"code": "packed", **options, "max_iter": 1}
             cases.append(Case(part="b", code="packed, one iteration", size=n, options=one))

@@ -26,10 +26,18 @@ LABELS = {
     "packed, one iteration": "the same, one iteration",
     "naive": "casadi.Opti, full covariance, steps in a loop",
     "rockit": "rockit, full covariance",
+    "rockit, one function": "rockit, rates and Jacobian in one expanded function first",
     "statement": "covocp, model to frozen statement",
 }
 COLUMNS = {"build": ".3f", "solve": ".3f", "iterations": ".0f", "cost": ".8g", "memory": ".0f"}
-MARKERS = {"covocp": "o", "eliminated": "s", "packed": "^", "packed, one iteration": "v", "rockit": "D"}
+MARKERS = {
+    "covocp": "o",
+    "eliminated": "s",
+    "packed": "^",
+    "packed, one iteration": "v",
+    "rockit": "D",
+    "rockit, one function": "d",
+}
 
 
 def case_row(case: Case) -> str:

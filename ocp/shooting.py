@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.integrators import (
+    KEPT,
     full_interval,
     interval_symbols,
     joint_interval,
@@ -93,7 +97,7 @@ def common_columns(mesh: Mesh, u: Any, duration: Any, parameters: Any) -> tuple[
     return start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n)
 
 
-def _shoot(statement: Statement, mesh: Mesh, variables: _Variables) -> dict[str, Any]:
+def _shoot(statement: Statement, mesh: Mesh, variables: _Variables | SimpleNamespace) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
     common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
@@ -113,6 +117,25 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables) -> dict[str,
         return result | {"e": nodes[nx:, :]}
     e, matrix_cost = matrices_along(statement, mesh, result["x"], fine, common, variables.parameters)
     return result | {"e": e, "cost": cost + matrix_cost}
+
+
+@lru_cache(maxsize=KEPT)
+def refined_run(statement: Statement, mesh: Mesh) -> ca.Function:
+    """Run the segments again with half the integration steps.
+
+    Returns:
+        (states at the starts of the segments and at the end (nx, S + 1), half-vectors there (ne, S + 1), controls, T,
+        parameters) -> jumps at the ends of the segments (nx, or nx + ne where the matrices are variables; S), running
+        cost, half-vectors at the end.
+    """
+    count = len(mesh.starts)
+    x, e = ca.MX.sym("x", statement.nx, count), ca.MX.sym("e", statement.ne, count)
+    u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
+    duration, parameters = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
+    start = SimpleNamespace(x=x, e=e, u=u, duration=duration, parameters=parameters)
+    nodes = _shoot(statement, replace(mesh, substeps=2 * mesh.substeps), start)
+    jumps = ca.vertcat(nodes["gap_x"], nodes["gap_e"])
+    return ca.Function("refined", [x, e, u, duration, parameters], [jumps, ca.sum2(nodes["cost"]), nodes["e"][:, -1]])
 
 
 def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:

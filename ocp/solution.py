@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from covocp.accuracy import mesh_error
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
-from covocp.hamiltonian import Costates, discrete_costates, fine_trajectory
+from covocp.hamiltonian import Costates, discrete_costates
 from covocp.integrators import hermite
 from covocp.matrices import (
     Array,
@@ -64,11 +65,10 @@ class Solution:
         trajectory: x, u, e at the nodes, terminal time [s].
         parameters: stacked values of known parameters and means of unknowns.
         multipliers: of the constraints.
-        costates: p and the costates of the half-vectors at the nodes.
         rates: of x and e stacked, at the nodes, (K, nx + ne).
         end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
         filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
-        mesh_error: relative change of the cost by halving the integration steps (estimated with the costates).
+        mesh_error: relative change of the cost by halving the integration steps (estimated to first order).
         violations: of constraints, by name.
         stats: iterations, times, what the method counts.
         blocks: where each symbol lies.
@@ -86,7 +86,6 @@ class Solution:
     trajectory: Trajectory
     parameters: Array
     multipliers: Multipliers
-    costates: Costates
     rates: Array
     end_rates: Array
     filter_gain: Array | None
@@ -97,20 +96,16 @@ class Solution:
     augmented: tuple[str, ...]
     constraints: Mapping[str, tuple[str, ...]]
     statement: Statement | None = field(default=None, repr=False)
+    stored_costates: Costates | None = field(default=None, repr=False)
     stored_optimality: Optimality | None = field(default=None, repr=False)
 
     @staticmethod
     def of(outcome: Outcome, method: str) -> Solution:
-        """The solution of an outcome, with its costates and the estimate of its mesh error."""
+        """The solution of an outcome, with the estimate of its mesh error."""
         extremal = outcome.extremal
         st, trajectory = extremal.statement, extremal.trajectory
-        costates, _, _ = discrete_costates(extremal)
-        _, jumps, fine_cost = fine_trajectory(extremal, 2 * extremal.mesh.substeps)
-        cost = sum(outcome.cost_terms.values())
-        after = np.hstack([costates.state, costates.matrices])[1:]
-        change = float(np.sum(after * jumps)) + float(fine_cost.sum()) - outcome.cost_terms["running"]
         rates, end_rates = _rates(extremal)
-        for array in (trajectory.x, trajectory.u, trajectory.e, costates.state, costates.matrices, rates, end_rates):
+        for array in (trajectory.x, trajectory.u, trajectory.e, rates, end_rates):
             array.setflags(write=False)
         return Solution(
             name=st.name,
@@ -122,11 +117,10 @@ class Solution:
             trajectory=trajectory,
             parameters=extremal.parameters,
             multipliers=extremal.multipliers,
-            costates=costates,
             rates=rates,
             end_rates=end_rates,
             filter_gain=_filter_gain(extremal),
-            mesh_error=abs(change) / max(abs(cost), np.finfo(float).tiny) if change else 0.0,
+            mesh_error=mesh_error(extremal, outcome.cost_terms["running"]),
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),
             blocks=st.blocks,
@@ -183,6 +177,16 @@ class Solution:
             parameters=self.parameters,
             multipliers=self.multipliers,
         )
+
+    @cached_property
+    def costates(self) -> Costates:
+        """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
+        if self.stored_costates is not None:
+            return self.stored_costates
+        costates, _, _ = discrete_costates(self.extremal)
+        for array in (costates.state, costates.matrices):
+            array.setflags(write=False)
+        return costates
 
     @cached_property
     def optimality(self) -> Optimality:

@@ -21,7 +21,7 @@ PARTS: dict[str, Any] = {
     "mesh": Mesh,
     "trajectory": Trajectory,
     "multipliers": Multipliers,
-    "costates": Costates,
+    "stored_costates": Costates,
     "stored_optimality": Optimality,
 }
 ARRAYS = {
@@ -30,7 +30,7 @@ ARRAYS = {
     "end_rates",
     "mesh.nodes",
     *(f"trajectory.{name}" for name in ("x", "u", "e")),
-    *(f"costates.{f.name}" for f in fields(Costates)),
+    *(f"stored_costates.{f.name}" for f in fields(Costates)),
     *(f"multipliers.{f.name}" for f in fields(Multipliers)),
 }
 WORDS = {"name", "method", "message", "mesh.control", "mesh.step"}
@@ -44,6 +44,7 @@ def to_tree(solution: Solution) -> dict[str, Any]:
     """All entries of a solution but the statement, its parts as dictionaries."""
     tree = {f.name: getattr(solution, f.name) for f in fields(Solution) if f.name != "statement"}
     tree["stored_optimality"] = _known_optimality(solution)
+    tree["stored_costates"] = solution.costates
     for name in PARTS:
         if tree[name] is not None:
             tree[name] = {f.name: getattr(tree[name], f.name) for f in fields(tree[name])}

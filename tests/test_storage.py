@@ -54,8 +54,10 @@ def assert_same(one, two, place="solution"):
         assert one.tobytes() == two.tobytes(), place
     elif is_dataclass(one):
         for f in fields(one):
-            if f.name not in ("statement", "stored_optimality"):
+            if f.name not in ("statement", "stored_optimality", "stored_costates"):
                 assert_same(getattr(one, f.name), getattr(two, f.name), f"{place}.{f.name}")
+        if isinstance(one, co.Solution):
+            assert_same(one.costates, two.costates, f"{place}.costates")
     elif isinstance(one, dict):
         assert list(one) == list(two), place
         for key in one:
@@ -142,6 +144,7 @@ def test_any_solution_comes_back(lag, tmp_path_factory, data, suffix):
         violations=draw(st.dictionaries(st.text(max_size=5), st.floats(), max_size=3)),
         stats=draw(st.dictionaries(st.text(max_size=5), values, max_size=3)),
         mesh_error=draw(st.floats()),
+        stored_costates=lag.costates,
         statement=None,
     )
     path = changed.save(tmp_path_factory.mktemp("any") / f"solution{suffix}")
@@ -216,7 +219,7 @@ def changed(path, change):
         (lambda tree: tree.pop("version"), "version is None"),
         (lambda tree: tree.pop("rates"), "lacks the entries rates"),
         (lambda tree: tree["mesh"].pop("nodes"), "lacks the entries mesh.nodes"),
-        (lambda tree: tree.update(costates=None), "lacks the entries costates"),
+        (lambda tree: tree.update(stored_costates=None), "lacks the entries stored_costates"),
         (lambda tree: tree.update(name=3), "wrong type: name"),
         (lambda tree: tree.update(blocks=[]), "wrong type: blocks"),
         (lambda tree: tree["mesh"].update(substeps=1.5), "wrong type: mesh.substeps"),
