@@ -1,4 +1,4 @@
-"""The chain of masses in rockit: full covariance as a matrix state, multiple shooting, one Runge-Kutta step an interval.
+"""The chain of masses in rockit: full covariance as a state, multiple shooting, one Runge-Kutta step an interval.
 
 The model is written as rockit's documentation writes models, as expressions of its own symbols, with a control that is
 constant over each interval (fewer unknowns than a piecewise-linear one). `wrapped` puts the rates and the Jacobian into
