@@ -10,8 +10,6 @@ if __name__ != "covocp":
         "This folder is the source of the package 'covocp'. Install it (pip install -e .) and import covocp instead."
     )
 
-from covocp.certify import Certificate as Certificate
-from covocp.certify import certify as certify
 from covocp.declarations import Free as Free
 from covocp.errors import CovocpError as CovocpError
 from covocp.errors import CovocpWarning as CovocpWarning
@@ -23,15 +21,28 @@ from covocp.methods import methods as methods
 from covocp.methods import solve as solve
 from covocp.problem import Problem as Problem
 from covocp.solution import Solution as Solution
-from covocp.storage import load as load
 
 if TYPE_CHECKING:
+    from covocp.certificate import Certificate as Certificate
+    from covocp.certificate import certify as certify
     from covocp.solvers.compare import Comparison as Comparison
     from covocp.solvers.compare import compare as compare
+    from covocp.storage import load as load
 else:
+    # What is done with a solution is imported when it is first asked for: so the import stays as light as CasADi's,
+    # and nothing here imports a method.
+    _LATER = {
+        "Certificate": "covocp.certificate",
+        "certify": "covocp.certificate",
+        "Comparison": "covocp.solvers.compare",
+        "compare": "covocp.solvers.compare",
+        "load": "covocp.storage",
+    }
 
     def __getattr__(name):
-        """What compares methods, looked up when it is first asked for: nothing here imports a method."""
-        if name in ("compare", "Comparison"):
-            return getattr(importlib.import_module("covocp.solvers.compare"), name)
+        if name in _LATER:
+            return getattr(importlib.import_module(_LATER[name]), name)
         raise AttributeError(f"module 'covocp' has no attribute '{name}'")
+
+    def __dir__():
+        return sorted([*globals(), *_LATER])

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import warnings
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, cast
 
 import numpy as np
@@ -231,8 +231,6 @@ class Solver:
 
 
 def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
-    from dataclasses import replace
-
     return replace(outcome, stats={**outcome.stats, **stats})
 
 

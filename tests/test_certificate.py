@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh, null_space
 
 import covocp as co
-from covocp.certify import Bound, halve
+from covocp.certificate import Bound, halve
 from covocp.matrices import unpack
 from covocp.mesh import Mesh
 from covocp.models import damped_oscillator, mass_chain, unknown_lag
