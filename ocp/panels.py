@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ProblemError
+from covocp.lookup import name_of
 from covocp.matrices import Array, half_indices
-from covocp.solution import Sample, Solution, name_of
+from covocp.solution import Sample, Solution
 from covocp.statement import Block, Statement, entry_names
 
 # Curves are sampled at the nodes, on coarser meshes at least this often.

@@ -17,14 +17,13 @@ from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
 from covocp.hamiltonian import Costates, discrete_costates
 from covocp.integrators import hermite
+from covocp.lookup import name_of, unknown_name
 from covocp.matrices import (
     Array,
-    half_length,
     is_semidefinite,
     smallest_eigenvalue,
     unpack,
     unpack_costate,
-    unpack_indices,
 )
 from covocp.mesh import Mesh
 from covocp.optimality import Optimality, assess, path_violations
@@ -428,52 +427,6 @@ class Solution:
 def _later(module: str) -> Any:
     """A module that is built on solutions; imported when it is used."""
     return importlib.import_module(f"covocp.{module}")
-
-
-def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
-    """Name of a symbol or name; "" where it is not one and that is allowed.
-
-    Raises:
-        ProblemError: where it is unknown.
-    """
-    if isinstance(key, str) and key in names:
-        return key
-    if isinstance(key, ca.MX):
-        for name, symbol in symbols.items():
-            if key.is_symbolic() and ca.is_equal(key, symbol) and name in names and key.shape == symbol.shape:
-                return name
-            if name in names and _is_matrix_of(key, symbol):
-                return name
-    label = getattr(key, "labels", None)
-    if label is not None and "E" in names:
-        return "E"
-    if missing_ok:
-        return ""
-    raise unknown_name(key, names)
-
-
-def _is_matrix_of(key: Any, half: Any) -> bool:
-    """Whether an expression is the full matrix of a half-vector's symbol."""
-    size = int(key.shape[0])
-    if size != key.shape[1] or half.shape[0] != half_length(size) or key.is_symbolic():
-        return False
-    symbols = ca.symvar(key)
-    if len(symbols) != 1 or not ca.is_equal(symbols[0], half):
-        return False
-    probe = np.sqrt(2.0 + np.arange(half.shape[0]))
-    return np.array_equal(np.asarray(ca.Function("probe", [half], [key])(probe).full()), probe[unpack_indices(size)])
-
-
-def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
-    """The error for something that is not in the solution."""
-    return ProblemError(
-        describe(
-            f"'{key}' is not in this solution.",
-            expected="a symbol or name of " + ", ".join(names),
-            received=str(key),
-            remedy="check the spelling, or use the symbols of the problem that was solved",
-        )
-    )
 
 
 def _rates(extremal: Extremal) -> tuple[Array, Array]:

@@ -1,0 +1,58 @@
+"""Which of its names a symbol, a name or a matrix stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import ProblemError, describe
+from covocp.matrices import half_length, unpack_indices
+
+
+def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
+    """Name of a symbol or name; "" where it is not one and that is allowed.
+
+    Raises:
+        ProblemError: where it is unknown.
+    """
+    if isinstance(key, str) and key in names:
+        return key
+    if isinstance(key, ca.MX):
+        for name, symbol in symbols.items():
+            if key.is_symbolic() and ca.is_equal(key, symbol) and name in names and key.shape == symbol.shape:
+                return name
+            if name in names and _is_matrix_of(key, symbol):
+                return name
+    label = getattr(key, "labels", None)
+    if label is not None and "E" in names:
+        return "E"
+    if missing_ok:
+        return ""
+    raise unknown_name(key, names)
+
+
+def _is_matrix_of(key: Any, half: Any) -> bool:
+    """Whether an expression is the full matrix of a half-vector's symbol."""
+    size = int(key.shape[0])
+    if size != key.shape[1] or half.shape[0] != half_length(size) or key.is_symbolic():
+        return False
+    symbols = ca.symvar(key)
+    if len(symbols) != 1 or not ca.is_equal(symbols[0], half):
+        return False
+    probe = np.sqrt(2.0 + np.arange(half.shape[0]))
+    return np.array_equal(np.asarray(ca.Function("probe", [half], [key])(probe).full()), probe[unpack_indices(size)])
+
+
+def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
+    """The error for something that is not in the solution."""
+    return ProblemError(
+        describe(
+            f"'{key}' is not in this solution.",
+            expected="a symbol or name of " + ", ".join(names),
+            received=str(key),
+            remedy="check the spelling, or use the symbols of the problem that was solved",
+        )
+    )
