@@ -95,6 +95,7 @@ def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
     expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix" if size > 1 else "a number"
     if is_symbolic(value):
         if value.shape == (size, size):
+            check_symmetric(name, what, value)
             return value
         if value.shape == (1, 1):
             return value * ca.MX.eye(size)
@@ -127,6 +128,25 @@ def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite:
     if matrix.shape != (size, size):
         raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
     return pack_symbolic(matrix)
+
+
+def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
+    """A matrix expression must be symmetric: seen at random values of its symbols."""
+    symbols = ca.symvar(expression)
+    generator = np.random.default_rng(0)
+    values = [generator.uniform(0.5, 1.5, symbol.shape) for symbol in symbols]
+    numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
+    difference = np.abs(numbers - numbers.T)
+    if np.isfinite(numbers).all() and (difference > 1e-9 * np.abs(numbers).max(initial=0.0)).any():
+        i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is not symmetric.",
+                expected="a symmetric matrix",
+                received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
+                remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
+            )
+        )
 
 
 def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -172,6 +173,19 @@ def _check_symbols(problem: Problem) -> None:
                         else f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
                     )
                 )
+    passing: list[Any] = [*problem.controls, SimpleNamespace(name="time", symbol=problem.time)]
+    terminal_cost = problem.cost[1] if problem.cost is not None else ca.MX(0)
+    terminal = {symbol.__hash__() for symbol in ca.symvar(terminal_cost)}
+    for entry in passing:
+        if entry.symbol.__hash__() in terminal:
+            raise ProblemError(
+                describe(
+                    f"The terminal cost contains '{entry.name}'.",
+                    expected="states, matrix states, parameters and the duration",
+                    received=str(terminal_cost)[:200],
+                    remedy="use Problem.duration for the terminal time; controls belong into the running cost",
+                )
+            )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
     if all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):

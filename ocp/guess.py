@@ -11,7 +11,7 @@ import numpy as np
 from covocp.checks import as_number, check_density
 from covocp.errors import ProblemError, describe
 from covocp.integrators import full_interval, nominal_interval
-from covocp.matrices import Array, half_indices, unpack
+from covocp.matrices import Array, half_indices, pack, unpack
 from covocp.mesh import Mesh
 from covocp.nlp import Scales
 from covocp.shooting import common_columns, matrices_along
@@ -140,12 +140,33 @@ def _starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array,
     e0 = np.where(np.isnan(e0), np.nan_to_num(ef), e0)
     for block in statement.matrices:
         if statement.guesses[block.name] is not None:
-            rows, columns = half_indices(block.size)
-            e0[block.span] = np.broadcast_to(statement.guesses[block.name], (block.size,) * 2)[rows, columns]
+            e0[block.span] = matrix_guess(block, statement.guesses[block.name])
     known = statement.boundary_values(parameters)[2]
     e0 = np.where(np.isnan(known), e0, known)
     _check_covariances(statement, e0)
     return np.where(np.isnan(x0), default, x0), e0
+
+
+def matrix_guess(block: Block, guess: Any) -> Array:
+    """Half-vector of the guess of a matrix; a number means that multiple of the identity.
+
+    Raises:
+        ProblemError: where it is not a finite symmetric matrix of the right size.
+    """
+    numbers = as_number(block.name, "guess", guess)
+    if numbers.size == 1:
+        numbers = float(numbers.reshape(())) * np.eye(block.size)
+    wrong = numbers.shape != (block.size, block.size)
+    if wrong or not np.isfinite(numbers).all() or not np.allclose(numbers, numbers.T):
+        raise ProblemError(
+            describe(
+                f"The guess of '{block.name}' does not fit.",
+                expected=f"a symmetric {block.size} x {block.size} matrix, or a number (times identity)",
+                received=f"shape {numbers.shape}" if wrong else str(numbers),
+                remedy=f"correct the guess of '{block.name}'",
+            )
+        )
+    return pack(numbers)
 
 
 def _check_covariances(statement: Statement, e0: Array) -> None:

@@ -166,6 +166,8 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         obstacle = "the rate of a state depends on a matrix"
     elif np.isnan(initial).any():
         obstacle = "an initial value of a matrix is free"
+    elif bounded := _bounded_matrices(statement):
+        obstacle = f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
     if options.covariances == "eliminated" and obstacle:
         raise ProblemError(
             describe(
@@ -178,6 +180,21 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     if options.covariances != "auto":
         return options.covariances == "eliminated"
     return obstacle is None and not statement.path.uses_matrices
+
+
+def _bounded_matrices(statement: Statement) -> list[str]:
+    """Matrices with lower bounds on the diagonal that only a variable can keep.
+
+    An estimation covariance stays positive semidefinite by itself, and so does a state of Riccati or Lyapunov form
+    that is only asked not to be negative.
+    """
+    names = []
+    for block, form in zip(statement.matrices, statement.riccati, strict=True):
+        lower = statement.matrix_lower[block.span]
+        lower = lower[np.isfinite(lower)]
+        if lower.size and not block.estimation and (form is None or lower.max() > 0):
+            names.append(block.name)
+    return names
 
 
 def _whole(name: str, value: Any) -> None:

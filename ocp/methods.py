@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from covocp.checks import column
+from covocp.densities import impossible_density
 from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
 from covocp.extremal import Guess, Outcome, Prepared
 from covocp.matrices import Array
@@ -63,6 +64,15 @@ class Solver:
                     expected="one of " + ", ".join(repr(name) for name in METHODS),
                     received=repr(method),
                     remedy="correct method=",
+                )
+            )
+        if not isinstance(problem, Problem):
+            raise ProblemError(
+                describe(
+                    "This is not a problem.",
+                    expected="a Problem",
+                    received=type(problem).__name__,
+                    remedy="pass the Problem itself (solutions go into guess=)",
                 )
             )
         prepare = importlib.import_module(METHODS[method]).prepare
@@ -125,6 +135,15 @@ class Solver:
         """The stacked parameters with some of them replaced."""
         values = self.statement.values.copy()
         blocks = {b.name: b for b in (*self.statement.of_kind("parameter"), *self.statement.of_kind("unknown"))}
+        if not isinstance(parameters, Mapping):
+            raise ProblemError(
+                describe(
+                    "The parameters are not given by name.",
+                    expected="a dict of name to value",
+                    received=repr(parameters)[:100],
+                    remedy="write parameters={'name': value}",
+                )
+            )
         for name, value in parameters.items():
             if name not in blocks:
                 raise ProblemError(
@@ -149,6 +168,16 @@ class Solver:
                     remedy="correct guess=",
                 )
             )
+        for name, number, least in (("starts", starts, 0), ("seed", seed, 0)):
+            if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
+                raise ProblemError(
+                    describe(
+                        f"The option '{name}' is not a whole number.",
+                        expected="0, 1, 2, ...",
+                        received=repr(number),
+                        remedy=f"correct {name}=",
+                    )
+                )
         best: Outcome | None = None
         costs = []
         for start in random_guesses(self.statement, self._prepared.mesh, values, starts, seed):
@@ -195,6 +224,9 @@ class Solver:
 
     def _finish(self, outcome: Outcome, allow_failure: bool, interrupted: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
+        impossible = impossible_density(outcome.extremal) if outcome.converged else ""
+        if impossible:
+            outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
         solution = Solution.of(outcome, self.method)
         if not outcome.converged:
             if interrupted:
@@ -212,7 +244,7 @@ class Solver:
                 violations=outcome.violations,
             )
         error = solution.mesh_error
-        if error > COARSE_MESH:
+        if not error <= COARSE_MESH:
             warnings.warn(
                 f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative). "
                 "Use more intervals or substeps.",
@@ -265,5 +297,14 @@ def solve(
         SolveError: the method did not converge (carries the last iterate).
     """
     extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
+    if extra and not isinstance(guess, str):
+        raise ProblemError(
+            describe(
+                f"{' and '.join(extra)} belong to multistart.",
+                expected="guess='multistart'",
+                received=f"guess={type(guess).__name__}",
+                remedy="add guess='multistart', or remove them",
+            )
+        )
     solver = Solver(problem, method, intervals=intervals, **options)
     return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

@@ -232,7 +232,12 @@ def _transversality(extremal: Extremal, by_duration: float, values: Array) -> fl
         arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
         value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
     slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
-    return float(abs(slope + values[-1, 0]) / max(float(values[:, 1].max()), abs(slope), np.finfo(float).tiny))
+    residual = slope + float(values[-1, 0])
+    at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
+    at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
+    if (at_lower and residual > 0) or (at_upper and residual < 0):
+        residual = 0.0  # the bound holds what would go on
+    return abs(residual) / max(float(values[:, 1].max()), abs(slope), float(np.finfo(float).tiny))
 
 
 def _curvature(extremal: Extremal) -> float | None:

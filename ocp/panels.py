@@ -88,11 +88,10 @@ class Drawn:
         return np.sqrt(np.maximum(covariance[:, rows, rows], 0.0))
 
     def target(self, block: Block) -> Array:
-        """What a state should be at the end, NaN where it is free or not known."""
-        statement = self.solution.statement
-        if statement is None or block.kind != "state":
+        """What a state should be at the end, NaN where it is free."""
+        if block.kind != "state":
             return np.full(block.size, np.nan)
-        return statement.boundary_values(self.solution.parameters)[1][block.span]
+        return self.solution.targets[block.span]
 
 
 def choose_panels(

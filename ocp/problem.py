@@ -19,6 +19,7 @@ from covocp.checks import (
     check_name,
     check_positive,
     check_size,
+    check_symmetric,
     column,
     column_expression,
     data_column,
@@ -265,7 +266,11 @@ class Problem:
                 initial matrix that is not positive semidefinite.
         """
         size = self._declare(name, size)
+        lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
         covariance = lower is not None and lower >= 0
+        if lower is not None and initial is not None and not is_symbolic(initial):
+            diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
+            check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
         labels = tuple(str(i) for i in range(size))
         declaration = self._add_matrix(name, size, initial, final, lower, guess, covariance, False, labels, unit)
         return declaration.matrix
@@ -332,7 +337,9 @@ class Problem:
                         remedy="unknowns are constant, and the estimation covariance has its rate already",
                     )
                 )
-            value, density = pack_symbolic(as_expression(name, "rate", rate, (matrix.size, matrix.size))), None
+            full = as_expression(name, "rate", rate, (matrix.size, matrix.size))
+            check_symmetric(name, "rate", full)
+            value, density = pack_symbolic(full), None
         if name in self.rates:
             raise ProblemError(
                 describe(

@@ -117,11 +117,8 @@ def _states(solution: Solution) -> str:
     blocks = tuple(b for b in solution.blocks if b.kind == "state")
     if not blocks:
         return ""
-    st = solution.statement
-    target = np.full(solution.trajectory.x.shape[1], np.nan)
-    if st is not None:
-        target = st.boundary_values(solution.parameters)[1]
-    bound = ~np.isnan(target) if st is not None else solution.multipliers.final != 0
+    target = solution.targets
+    bound = ~np.isnan(target)
     columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
     rows = [
         [name, number(x), number(goal), number(multiplier if fixed else None)]

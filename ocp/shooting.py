@@ -113,9 +113,10 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables | SimpleNames
     result = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
     if not statement.matrices:
         return result | {"e": ca.MX(0, mesh.intervals + 1)}
-    if not mesh.eliminated:
+    if not mesh.eliminated or statement.coupled:
         return result | {"e": nodes[nx:, :]}
-    e, matrix_cost = matrices_along(statement, mesh, result["x"], fine, common, variables.parameters)
+    e0 = None if variables.e is None else variables.e[:, 0]
+    e, matrix_cost = matrices_along(statement, mesh, result["x"], fine, common, variables.parameters, e0)
     return result | {"e": e, "cost": cost + matrix_cost}
 
 

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.accuracy import mesh_error
+from covocp.checks import as_number
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
 from covocp.hamiltonian import Costates, discrete_costates
@@ -72,6 +73,7 @@ class Solution:
         stats: iterations, times, what the method counts.
         blocks: where each symbol lies.
         augmented: names of the rows of the estimation covariance.
+        targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
         statement: the problem solved; None for a solution read from a file.
     """
@@ -93,6 +95,7 @@ class Solution:
     stats: Mapping[str, Any]
     blocks: tuple[Block, ...]
     augmented: tuple[str, ...]
+    targets: Array
     constraints: Mapping[str, tuple[str, ...]]
     statement: Statement | None = field(default=None, repr=False)
     stored_costates: Costates | None = field(default=None, repr=False)
@@ -124,6 +127,7 @@ class Solution:
             stats=dict(outcome.stats),
             blocks=st.blocks,
             augmented=st.augmented,
+            targets=st.boundary_values(extremal.parameters)[1],
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             statement=st,
         )
@@ -273,11 +277,19 @@ class Solution:
             What `[symbol or name]` gives the values of.
 
         Raises:
-            ValueError: where a time lies outside.
+            ProblemError: where a time lies outside, or is not a number.
         """
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        if times.size and (times.min() < -1e-9 * self.duration or times.max() > (1 + 1e-9) * self.duration):
-            raise ValueError(f"times must lie in [0, {self.duration:g}] s; received [{times.min():g}, {times.max():g}]")
+        times = np.atleast_1d(as_number("at", "times", t))
+        margin = 1e-9 * self.duration
+        if times.ndim != 1 or not ((times >= -margin) & (times <= self.duration + margin)).all():
+            raise ProblemError(
+                describe(
+                    "A solution has no values there.",
+                    expected=f"a time or a row of times within [0, {self.duration:g}] s",
+                    received=str(t)[:100],
+                    remedy="stay within the duration of the solution",
+                )
+            )
         nodes = self.t
         k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
         h = (nodes[k + 1] - nodes[k])[:, None]
@@ -400,6 +412,15 @@ class Solution:
         Returns:
             Violation by name, in the unit of the constraint; only those that are violated.
         """
+        if isinstance(points, bool) or not isinstance(points, (int, np.integer)) or points < 1:
+            raise ProblemError(
+                describe(
+                    "check_path needs a number of parts of each interval.",
+                    expected="1, 2, 3, ...",
+                    received=repr(points),
+                    remedy="correct points",
+                )
+            )
         return path_violations(self.extremal, points)
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
@@ -458,4 +479,7 @@ def _filter_gain(extremal: Extremal) -> Array | None:
     M = np.asarray(jacobian.full()).reshape(m, count, size).transpose(1, 0, 2)
     U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
     E = unpack(extremal.trajectory.e[:, block.span], size)
-    return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
+    try:
+        return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
+    except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
+        return None

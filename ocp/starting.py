@@ -11,6 +11,7 @@ import numpy as np
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Guess
 from covocp.guess import first_guess, quadrature_weights
+from covocp.lookup import name_of
 from covocp.matrices import Array, pack
 from covocp.mesh import Mesh
 from covocp.solution import Solution
@@ -33,8 +34,8 @@ def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) 
     if isinstance(guess, Mapping):
         guesses = dict(statement.guesses)
         for key, value in guess.items():
-            names = [n for n, s in statement.symbols.items() if key is s or (isinstance(key, str) and key == n)]
-            if not names or names[0] not in guesses:
+            name = name_of(key, statement.symbols, tuple(guesses), missing_ok=True)
+            if not name:
                 raise ProblemError(
                     describe(
                         f"The guess names '{key}', which cannot be guessed.",
@@ -43,7 +44,7 @@ def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) 
                         remedy="correct the name",
                     )
                 )
-            guesses[names[0]] = value
+            guesses[name] = value
         return Guess(trajectory=first_guess(replace(statement, guesses=guesses), mesh, parameters))
     raise ProblemError(
         describe(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from covocp.problem import Problem
 
 DEFAULT = ("ipopt", "gradient")
-SOLVE_OPTIONS = ("starts", "seed", "guess")
+SOLVE_OPTIONS = ("starts", "seed", "guess", "parameters")
 INTERRUPTED = "interrupted by the user"
 
 

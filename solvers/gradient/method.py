@@ -92,6 +92,9 @@ def prepare(
     Raises:
         ProblemError: an option is wrong.
     """
+    for name in ("segments", "covariances"):
+        if getattr(options, name) != "auto":
+            raise _option_error(name, "nothing: it belongs to shooting", getattr(options, name))
     _check_options(statement, variant, weight, weight_factor, fraction)
     step = choose_step(statement, options)
     nodes = options.nodes()

@@ -771,6 +771,73 @@ def measurement_of_a_symbol_of_another_kind():
     empty().measurement("m", ca.SX.sym("q"), noise=1.0)
 
 
+@wrong("noise density of 'm'", "not symmetric", "entries [0, 1] and [1, 0]")
+def unsymmetric_noise_density():
+    ocp = empty()
+    x = ocp.state("x", 2, initial=0)
+    ocp.measurement("m", x, noise=ca.blockcat([[1, 0.2 * ocp.time], [0, 1]]))
+
+
+@wrong("rate of 'P'", "not symmetric", "A @ P + P @ A.T")
+def unsymmetric_rate_of_a_matrix():
+    ocp = empty()
+    P = ocp.symmetric("P", 2, initial=np.eye(2))
+    ocp.dynamics(P, 2 * np.array([[0.0, 1.0], [2.0, 0.0]]) @ P)
+
+
+@wrong("terminal cost contains 'time'", "Problem.duration")
+def time_in_the_terminal_cost():
+    ocp = co.Problem(co.Free(2.0))
+    x = ocp.state("x", initial=0, final=1)
+    u = ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2, terminal=ocp.time)
+    co.solve(ocp)
+
+
+@wrong("terminal cost contains 'u'")
+def control_in_the_terminal_cost():
+    ocp, _, u = simple()
+    ocp.cost = None
+    ocp.minimize(terminal=u)
+    co.solve(ocp)
+
+
+@wrong("initial value of 'P'", "[3, inf]")
+def matrix_below_its_bound():
+    empty().symmetric("P", 1, initial=1.0, lower=3.0)
+
+
+@wrong("guess of 'E'", "symmetric 2 x 2 matrix", "shape (3, 3)")
+def shape_of_the_guess_of_a_matrix():
+    co.solve(lag()[0], guess={"E": np.eye(3)})
+
+
+@wrong("not a problem", "received: int")
+def a_number_for_a_problem():
+    co.solve(3)
+
+
+@wrong("parameters are not given by name")
+def parameters_in_a_list():
+    co.solve(lag()[0], parameters=[1.0])
+
+
+@wrong("belong to multistart", "guess='multistart'")
+def seed_without_multistart():
+    co.solve(lag()[0], seed=1)
+
+
+@wrong("'starts' is not a whole number")
+def starts_below_zero():
+    co.solve(lag()[0], guess="multistart", starts=-1)
+
+
+@wrong("'segments'", "belongs to shooting")
+def segments_of_the_gradient_method():
+    co.solve(lag()[0], "gradient", segments=3)
+
+
 @pytest.fixture
 def no_solver(monkeypatch):
     """A solver that is called is a failure of the test."""
