@@ -300,9 +300,9 @@ def solve(
     if extra and not isinstance(guess, str):
         raise ProblemError(
             describe(
-                f"{' and '.join(extra)} belong to multistart.",
+                "The options of multistart are given, but not multistart.",
                 expected="guess='multistart'",
-                received=f"guess={type(guess).__name__}",
+                received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
                 remedy="add guess='multistart', or remove them",
             )
         )

@@ -93,8 +93,9 @@ def test_a_loaded_solution_prints_what_it_knows(lag, tmp_path):
     assert str(co.load(path, unknown_lag.problem(final=1.0))) == str(lag)
     known = str(co.load(path))
     assert numbers_after(known, "total") == numbers_after(str(lag), "total")
+    assert known == str(lag)
     x = numbers_after(known, "x  ")
-    assert x == pytest.approx([lag["x"][-1], lag.multipliers.final[0], lag.deviation("x")[-1]], rel=1e-7)
+    assert x == pytest.approx([lag["x"][-1], 1.0, lag.multipliers.final[0], lag.deviation("x")[-1]], rel=1e-7)
     without = replace(co.load(path), stored_optimality=None)
     assert "necessary conditions: not evaluated" in str(without)
 

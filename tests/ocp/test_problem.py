@@ -823,7 +823,7 @@ def parameters_in_a_list():
     co.solve(lag()[0], parameters=[1.0])
 
 
-@wrong("belong to multistart", "guess='multistart'")
+@wrong("The options of multistart", "guess='multistart'", "seed")
 def seed_without_multistart():
     co.solve(lag()[0], seed=1)
 
