@@ -85,6 +85,7 @@ def freeze(problem: Problem) -> Statement:
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
+        noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
         expression=_expression_builder(problem, stacked),
@@ -317,6 +318,14 @@ def _inverse(density: Any) -> Any:
     if density.sparsity().is_diag():
         return ca.diag(1.0 / ca.diag(density))
     return ca.inv(density)
+
+
+def _noise_varies(problem: Problem) -> bool:
+    """Whether a noise density depends on more than parameters."""
+    densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    densities += [entry.noise for entry in problem.measurements]
+    constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
+    return any(symbol.__hash__() not in constants for density in densities for symbol in ca.symvar(density))
 
 
 def _blocks(problem: Problem) -> tuple[Block, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -10,7 +11,7 @@ import numpy as np
 
 from covocp.checks import as_number, check_density
 from covocp.errors import ProblemError, describe
-from covocp.integrators import full_interval, nominal_interval
+from covocp.integrators import KEPT, full_interval, nominal_interval
 from covocp.matrices import Array, half_indices, pack, unpack
 from covocp.mesh import Mesh
 from covocp.nlp import Scales
@@ -217,16 +218,22 @@ def _short(values: Array) -> str:
     return np.array2string(np.asarray(values), precision=4, threshold=8)
 
 
-def simulate_states(
-    statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
-) -> Array:
-    """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
+@lru_cache(maxsize=KEPT)
+def _simulation(statement: Statement, mesh: Mesh) -> ca.Function:
+    """All intervals in sequence, from the start."""
     if statement.coupled:
         interval = full_interval(statement, mesh.substeps, mesh.step)
     else:
         interval = nominal_interval(statement, mesh.substeps)
+    return interval.mapaccum("simulate", mesh.intervals)
+
+
+def simulate_states(
+    statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
+) -> Array:
+    """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
     first = np.concatenate([start, e0]) if statement.coupled else start
-    run = interval.mapaccum("simulate", mesh.intervals)
+    run = _simulation(statement, mesh)
     ends = np.asarray(run(first, *common_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0].full())
     values = np.vstack([start, ends[: statement.nx].T])
     if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:

@@ -123,6 +123,7 @@ class Statement:
     coupled: bool
     symbolic: type
     autonomous: bool
+    noise_varies: bool
     running_uses_matrices: bool
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
