@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -349,18 +348,25 @@ def _radius(matrix: Array) -> float:
 
 
 def _state_jacobian(statement: Statement) -> ca.Function:
-    return _jacobian(statement, lambda symbols, outputs: ca.jacobian(outputs[0], symbols[0]))
+    """f_x as a function of the six arguments."""
+    symbols = _six_symbols(statement)
+    if statement.nominal is None:
+        rate = statement.rates(*symbols)[0]
+    else:
+        rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
+    return ca.Function("jacobian", symbols, [ca.jacobian(rate, symbols[0])])
 
 
 def _matrix_jacobian(statement: Statement) -> ca.Function:
-    return _jacobian(statement, lambda symbols, outputs: ca.jacobian(outputs[1], symbols[2]))
+    """V_e as a function of the six arguments."""
+    symbols = _six_symbols(statement)
+    return ca.Function("jacobian", symbols, [ca.jacobian(statement.rates(*symbols)[1], symbols[2])])
 
 
-def _jacobian(statement: Statement, select: Callable[[list[Any], list[Any]], Any]) -> ca.Function:
+def _six_symbols(statement: Statement) -> list[Any]:
     symbolic: Any = statement.symbolic
     sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
-    symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
-    return ca.Function("jacobian", symbols, [select(symbols, list(statement.rates(*symbols)))])
+    return [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
 
 
 def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
