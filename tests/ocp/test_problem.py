@@ -866,7 +866,12 @@ def test_wrong_statement(case):
 def test_zero_variance_and_zero_noise_are_allowed():
     ocp = empty()
     x = ocp.state("x", 2, initial=0, variance=[1.0, 0.0])
-    ocp.dynamics(x, x, noise=[0.0, 1.0])
+    ocp.dynamics(x, x + ocp.control("u"), noise=[0.0, 1.0])
+    E = ocp.estimation_covariance()
+    ocp.minimize(terminal=ca.trace(E.matrix))
+    statement = ocp.statement()
+    assert statement.boundary_values(statement.values)[2].tolist() == [1.0, 0.0, 0.0]
+    np.testing.assert_array_equal(statement.riccati[0](0, 0, 0, 1, [])[1].full(), np.diag([0.0, 1.0]))
 
 
 def test_errors_are_value_errors():
