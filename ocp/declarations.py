@@ -44,7 +44,10 @@ class Free:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """A vector state of the nominal; data are columns of numbers or of expressions in the parameters."""
+    """A vector state of the nominal; data are columns of numbers or of expressions in the parameters.
+
+    estimated: whether it is part of the augmented state; constants to be chosen are not, and come last.
+    """
 
     name: str
     symbol: ca.MX
@@ -58,6 +61,7 @@ class State:
     guess: Guess
     scale: Array | None
     variance: ca.MX
+    estimated: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,6 +121,19 @@ class Matrix:
     covariance: bool
     estimation: bool
     labels: tuple[str, ...]
+    backward: Backward | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Backward:
+    """What makes a matrix run backward in time: its value at the end, and the Riccati form of its rate.
+
+    end: the matrix at T, an expression of states, parameters, unknowns and the duration.
+    form: F, Q, W of V = F E + E F' + Q - E W E, the rate in forward time; expressions of nominal, time, parameters.
+    """
+
+    end: ca.MX
+    form: tuple[ca.MX, ca.MX, ca.MX]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,3 +165,58 @@ class Constraint:
     upper: Array
     at: Place
     where: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """A feedback gain with constraints, optimised instead of the unconstrained optimal one.
+
+    Args:
+        structure: which entries may differ from zero, shape (controls, augmented states), truth values; None: all.
+        constant: whether each entry is one number for the whole time.
+        lower: lower bounds of the entries, a number or an array of that shape.
+        upper: upper bounds.
+        guess: where the entries start; None: zero.
+    """
+
+    structure: Any = None
+    constant: bool = False
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    guess: Any = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expected:
+    """An expected cost: L and k of the actual system, and the weights of what their second derivatives leave out.
+
+    terminal_weight: added to k_xx, matrix over the augmented state or None; control_weight: B where it is given, a
+    matrix over the controls, None where L_uu is taken.
+    """
+
+    running: ca.MX
+    terminal: ca.MX
+    terminal_weight: Any
+    control_weight: Any
+    gain: Gain | None
+    where: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expansion:
+    """What the feedback sees of the actual system along the nominal; expressions of the user's symbols.
+
+    F, G: slopes of the rates by the augmented state and by the control; A, B, N: second derivatives of the running
+    cost with the weights; Q: process noise; end: S(T); running, terminal: L and k; gain: the feedback gain C.
+    """
+
+    F: ca.MX
+    G: ca.MX
+    A: ca.MX
+    B: ca.MX
+    N: ca.MX
+    Q: ca.MX
+    end: ca.MX
+    running: ca.MX
+    terminal: ca.MX
+    gain: ca.MX

@@ -16,8 +16,8 @@ from covocp.declarations import Constraint, Matrix, Place
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
 from covocp.matrices import pack_symbolic, unpack_symbolic
-from covocp.riccati import recognise, riccati_rate
-from covocp.statement import INPUTS, Block, Conditions, Duration, Statement
+from covocp.riccati import inverse, recognise, riccati_rate
+from covocp.statement import INPUTS, Block, Conditions, Duration, Loop, Statement
 
 if TYPE_CHECKING:
     from covocp.problem import Problem
@@ -28,6 +28,7 @@ class Stacked:
     """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them."""
 
     inputs: tuple[Any, ...]
+    estimated: int
     unknowns: int
     substitute: Callable[..., list[Any]]
     symbolic: type
@@ -70,6 +71,8 @@ def freeze(problem: Problem) -> Statement:
         rates=stacked.function("rates", [rates, matrix_rates, running]),
         terminal=stacked.function("terminal", [terminal], without=("control", "time")),
         boundary=_boundary(problem, stacked),
+        matrix_end=_matrix_end(problem, stacked),
+        loop=_loop(problem, stacked),
         riccati=riccati,
         measurement=measurement,
         measurement_names=tuple(m.name for m in problem.measurements),
@@ -81,7 +84,7 @@ def freeze(problem: Problem) -> Statement:
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
         guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
         scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
-        augmented=augmented_names(_all(problem.states, problem.unknowns)),
+        augmented=augmented_names(_estimated(problem)),
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
@@ -92,6 +95,11 @@ def freeze(problem: Problem) -> Statement:
     )
 
 
+def _estimated(problem: Problem) -> list[Any]:
+    """The declarations of the augmented state: states, then unknowns."""
+    return [*(state for state in problem.states if state.estimated), *problem.unknowns]
+
+
 def _all(*groups: Iterable[Any]) -> list[Any]:
     """Declarations of several kinds in one list."""
     return [entry for group in groups for entry in group]
@@ -99,7 +107,7 @@ def _all(*groups: Iterable[Any]) -> list[Any]:
 
 def _check_complete(problem: Problem) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
-    for entry in _all(problem.states, (m for m in problem.matrices if not m.estimation)):
+    for entry in _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None)):
         if entry.name not in problem.rates:
             raise ProblemError(
                 describe(
@@ -119,7 +127,7 @@ def _check_complete(problem: Problem) -> None:
         raise ProblemError(
             describe(
                 "The problem has no cost.",
-                expected="minimize(running=..., terminal=...)",
+                expected="minimize(running=..., terminal=...), or minimize_expected",
                 received="none",
                 remedy="say what is to be minimised",
             )
@@ -135,7 +143,7 @@ def _check_complete(problem: Problem) -> None:
                     remedy="declare a control by control()",
                 )
             )
-    entry_augmented = sum(s.size for s in _all(problem.states, problem.unknowns))
+    entry_augmented = sum(entry.size for entry in _estimated(problem))
     covariance = next((m for m in problem.matrices if m.estimation), None)
     if covariance is not None and covariance.size != entry_augmented:
         raise ProblemError(
@@ -241,6 +249,7 @@ def _stack(problem: Problem) -> Stacked:
 
     return Stacked(
         inputs=(x, u, e, t, duration, p),
+        estimated=sum(entry.size for entry in problem.states if entry.estimated),
         unknowns=sum(entry.size for entry in problem.unknowns),
         substitute=substitute,
         symbolic=symbolic,
@@ -265,6 +274,9 @@ def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, 
         if entry.estimation:
             form: Any = _kalman_form(problem, stacked, rates, measurement)
             values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
+        elif entry.backward is not None:
+            form = tuple(stacked.substitute(*entry.backward.form))
+            values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
         else:
             values += stacked.substitute(problem.rates[entry.name].rate)
             form = recognise(values[-1], half, entry.size) if stacked.symbolic is ca.SX else None
@@ -279,7 +291,8 @@ def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, 
 def _augmented_jacobian(stacked: Stacked, expression: Any) -> Any:
     """Jacobian with respect to the augmented state (states, then unknowns)."""
     x, p = stacked.inputs[0], stacked.inputs[5]
-    return ca.horzcat(ca.jacobian(expression, x), ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
+    by_state = ca.jacobian(expression, x)[:, : stacked.estimated]
+    return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
 
 
 def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | None:
@@ -294,11 +307,11 @@ def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | N
 
 def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: Any) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
-    size = sum(entry.size for entry in _all(problem.states, problem.unknowns))
-    constants = ca.DM.zeros(size - rates.shape[0], 1)
-    drift = _augmented_jacobian(stacked, ca.vertcat(rates, constants))
+    size = stacked.estimated + stacked.unknowns
+    constants = ca.DM.zeros(stacked.unknowns, 1)
+    drift = _augmented_jacobian(stacked, ca.vertcat(rates[: stacked.estimated], constants))
     noises = []
-    for state in problem.states:
+    for state in (entry for entry in problem.states if entry.estimated):
         density = problem.rates[state.name].noise
         noises.append(ca.DM(state.size, state.size) if density is None else stacked.substitute(density)[0])
     count = sum(entry.size for entry in problem.unknowns)
@@ -306,18 +319,7 @@ def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: An
     if measurement is None:
         return drift, noise, stacked.symbolic(size, size)
     _, jacobian, density = measurement
-    return drift, noise, jacobian.T @ _inverse(density) @ jacobian
-
-
-def _inverse(density: Any) -> Any:
-    """Inverse of the noise density of the measurements, with as much structure as it has."""
-    if density.is_constant():
-        numbers = ca.evalf(density).full()
-        check_density("measurement", "noise density", numbers, definite=True)
-        return ca.sparsify(ca.DM(np.linalg.inv(numbers)))
-    if density.sparsity().is_diag():
-        return ca.diag(1.0 / ca.diag(density))
-    return ca.inv(density)
+    return drift, noise, jacobian.T @ inverse(density) @ jacobian
 
 
 def _noise_varies(problem: Problem) -> bool:
@@ -350,6 +352,7 @@ def _blocks(problem: Problem) -> tuple[Block, ...]:
                     labels=entry.labels if isinstance(entry, Matrix) else (),
                     covariance=isinstance(entry, Matrix) and entry.covariance,
                     estimation=isinstance(entry, Matrix) and entry.estimation,
+                    backward=isinstance(entry, Matrix) and entry.backward is not None,
                     unit=entry.unit,
                 )
             )
@@ -400,6 +403,34 @@ def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
     values = ca.Function("boundary", own, outputs).call(arguments, True, False)
     names = ["initial_state", "final_state", "initial_matrices", "final_matrices"]
     return ca.Function("boundary", [p], values, ["parameters"], names)
+
+
+def _matrix_end(problem: Problem, stacked: Stacked) -> ca.Function | None:
+    """Half-vectors of the matrices that run backward, at the end."""
+    ends = [entry.backward.end for entry in problem.matrices if entry.backward is not None]
+    if not ends:
+        return None
+    values = ca.vertcat(*(pack_symbolic(end) for end in stacked.substitute(*ends)))
+    return stacked.function("matrix_end", [values], without=("control", "matrices", "time"))
+
+
+def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
+    """What the feedback of an expected cost sees, as functions."""
+    v = problem.expansion
+    if v is None:
+        return None
+    slopes = [ca.densify(entry) for entry in stacked.substitute(v.F, v.G, v.A, v.B, v.N, v.Q)]
+    (gain, running, terminal, end) = stacked.substitute(v.gain, v.running, v.terminal, v.end)
+    u = stacked.inputs[1][: slopes[3].shape[0]]
+    return Loop(
+        expansion=stacked.function("expansion", slopes, without=("matrices",)),
+        gain=stacked.function("gain", [ca.densify(gain)]),
+        running=stacked.function("running", [running], without=("matrices",)),
+        terminal=stacked.function("terminal", [terminal, ca.densify(end)], without=("control", "matrices", "time")),
+        extra_control=stacked.function(
+            "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
+        ),
+    )
 
 
 def _conditions(problem: Problem, stacked: Stacked, at: Place) -> Conditions:

@@ -255,23 +255,21 @@ def apply_step(matrix: Any, half: Any, size: int, solver: str = LINEAR_SOLVER) -
 
 
 @lru_cache(maxsize=KEPT)
-def propagate_interval(statement: Statement, substeps: int, solver: str = LINEAR_SOLVER) -> ca.Function:
-    """All half-vectors over one control interval, given the step matrices of its substeps.
+def propagate_step(statement: Statement, positions: tuple[int, ...], solver: str = LINEAR_SOLVER) -> ca.Function:
+    """Half-vectors of some matrices over one substep, given their step matrices.
 
     Returns:
-        (e, D of matrix 1 (2n, 2n substeps), D of matrix 2, ...) -> half-vectors at the end of the interval (ne, 1),
-        at the ends of the substeps (ne, substeps).
+        (their half-vectors stacked, D of the first (2n, 2n), D of the second, ...) -> half-vectors after the substep.
     """
-    e = ca.MX.sym("e", statement.ne)
-    steps = [ca.MX.sym(f"d_{b.name}", 2 * b.size, 2 * b.size * substeps) for b in statement.matrices]
-    columns = []
-    halves = [e[block.span] for block in statement.matrices]
-    for j in range(substeps):
-        for i, block in enumerate(statement.matrices):
-            width = 2 * block.size
-            halves[i] = apply_step(steps[i][:, j * width : (j + 1) * width], halves[i], block.size, solver)
-        columns.append(ca.vertcat(*halves))
-    return ca.Function("propagate_interval", [e, *steps], [columns[-1], ca.horzcat(*columns)])
+    blocks = [statement.matrices[i] for i in positions]
+    e = ca.MX.sym("e", sum(block.length for block in blocks))
+    steps = [ca.MX.sym(f"d_{block.name}", 2 * block.size, 2 * block.size) for block in blocks]
+    offsets = np.cumsum([0, *(block.length for block in blocks)]).tolist()
+    halves = [
+        apply_step(step, e[i:j], block.size, solver)
+        for step, block, i, j in zip(steps, blocks, offsets, offsets[1:], strict=False)
+    ]
+    return ca.Function("propagate_step", [e, *steps], [ca.vertcat(*halves)])
 
 
 @lru_cache(maxsize=KEPT)
@@ -318,14 +316,15 @@ def full_interval(statement: Statement, substeps: int, step: Step, solver: str =
     _, states, cost = nominal_interval(statement, substeps)(x, *common)
     starts = ca.horzcat(x, states[:, : substeps - 1])
     matrices = [step_matrix(statement, i, step, solver) for i in range(len(statement.matrices))]
-    columns: list[list[Any]] = [[] for _ in matrices]
+    propagate = propagate_step(statement, tuple(range(len(matrices))), solver)
+    columns = []
+    half = e
     for j in range(substeps):
         c, d = j / substeps, (j + 1) / substeps
         ends = (ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, ds / substeps, duration, p)
-        for i, matrix in enumerate(matrices):
-            columns[i].append(matrix(starts[:, j], states[:, j], *ends))
-    stacked = [ca.horzcat(*entry) for entry in columns]
-    _, halves = propagate_interval(statement, substeps, solver)(e, *stacked)
+        half = propagate(half, *(matrix(starts[:, j], states[:, j], *ends) for matrix in matrices))
+        columns.append(half)
+    halves = ca.horzcat(*columns)
     if statement.running_uses_matrices:
         cost = simpson_interval(statement, substeps)(x, e, states, halves, *common)
     fine = ca.vertcat(states, halves)

@@ -124,7 +124,7 @@ def choose_mesh(statement: Statement, options: Options, stiffness: float) -> Mes
         substeps = int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
     else:
         substeps = options.substeps
-    if statement.running_uses_matrices and step != "rk4" and substeps % 2:
+    if statement.running_uses_matrices and (step != "rk4" or statement.behind) and substeps % 2:
         substeps += 1  # Simpson's rule for the running cost takes them in pairs
     short, longer = divmod(intervals, count)
     lengths = (short + 1,) * longer + (short,) * (count - longer)
@@ -160,7 +160,7 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     """
     if not statement.matrices:
         return True
-    initial = statement.boundary_values(statement.values)[2]
+    initial = statement.boundary_values(statement.values)[2][statement.entries(statement.ahead)]
     obstacle = None
     if statement.coupled:
         obstacle = "the rate of a state depends on a matrix"

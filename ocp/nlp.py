@@ -19,7 +19,10 @@ VIOLATION = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Typical magnitudes of the entries of x, u, e and T; the NLP works in units of them."""
+    """Typical magnitudes of the entries of x, u, e and T; the NLP works in units of them.
+
+    Those of the controls are the same at all nodes, shape (nu,), or one for each control value, (nodes, nu).
+    """
 
     x: Array
     u: Array
@@ -95,8 +98,8 @@ class NLP:
             lows.append(el / self.scales.e)
             highs.append(eu / self.scales.e)
         nodes = self.mesh.control_nodes
-        lows.append(np.tile(st.control_bounds[0] / self.scales.u, (nodes, 1)))
-        highs.append(np.tile(st.control_bounds[1] / self.scales.u, (nodes, 1)))
+        lows.append(np.tile(st.control_bounds[0], (nodes, 1)) / self.scales.u)
+        highs.append(np.tile(st.control_bounds[1], (nodes, 1)) / self.scales.u)
         if st.duration.free:
             lows.append(np.array([st.duration.lower / self.scales.duration]))
             highs.append(np.array([st.duration.upper / self.scales.duration]))
@@ -190,6 +193,7 @@ class NLP:
             "start": multipliers.start,
             "end": multipliers.end,
             "final_matrices": multipliers.final_matrices[known],
+            "backward_ends": multipliers.final_matrices[st.entries(st.behind)],
         }
         lam_g = [values[rows.kind].ravel() * rows.scale for rows in self.rows]
         lam_x = [multipliers.states[starts] * self.scales.x]

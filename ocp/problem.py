@@ -33,7 +33,10 @@ from covocp.declarations import (
     Constraint,
     Control,
     Dynamics,
+    Expansion,
+    Expected,
     Free,
+    Gain,
     Guess,
     Matrix,
     Measurement,
@@ -44,6 +47,7 @@ from covocp.declarations import (
 )
 from covocp.errors import ProblemError, describe
 from covocp.estimation import EstimationCovariance, augmented_names
+from covocp.expected import derive, expected_cost
 from covocp.freeze import freeze
 from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
 from covocp.statement import Statement
@@ -77,6 +81,8 @@ class Problem:
         self.measurements: list[Measurement] = []
         self.constraints: list[Constraint] = []
         self.cost: tuple[ca.MX, ca.MX] | None = None
+        self.expected: Expected | None = None
+        self.expansion: Expansion | None = None
         self._frozen: Statement | None = None
 
     @property
@@ -380,20 +386,52 @@ class Problem:
         Raises:
             ProblemError: not scalar, or given twice.
         """
-        if self.cost is not None:
-            raise ProblemError(
-                describe(
-                    "The cost is given twice.",
-                    expected="one call of minimize()",
-                    received="a second one",
-                    remedy="add the terms up in one call",
-                )
-            )
+        self._check_first_cost()
         self.cost = (
             as_expression("minimize", "running cost", running, (1, 1)),
             as_expression("minimize", "terminal cost", terminal, (1, 1)),
         )
         self._frozen = None
+
+    def minimize_expected(
+        self,
+        running: Any = 0.0,
+        terminal: Any = 0.0,
+        *,
+        terminal_weight: Any = None,
+        control_weight: Any = None,
+        gain: Gain | None = None,
+    ) -> None:
+        """State the expected cost <terminal + integral of running> of the actual system under linear feedback.
+
+        The actual control is u - C dx', dx' the Kalman filter's estimate of the deviation from the nominal. The cost is
+        expanded to second order about the nominal [Schmidt 6.3]; nominal, filter and gain are chosen together.
+
+        Args:
+            running: L(x, u, t), scalar, cost per second.
+            terminal: k(x(T), T), scalar.
+            terminal_weight: added to k_xx, by symbol or name: {x: 2.0}; what missing a prescribed final value costs.
+            control_weight: weight B of the deviations of the controls, by symbol or name, in place of L_uu; needed
+                where L_uu is not positive definite.
+            gain: constraints on the gain C (structure, constancy, bounds); None: the best one.
+
+        Raises:
+            ProblemError: not scalar, cost given twice, weights that do not fit or are negative.
+        """
+        self._check_first_cost()
+        self.expected = expected_cost(self, running, terminal, terminal_weight, control_weight, gain)
+        self._frozen = None
+
+    def _check_first_cost(self) -> None:
+        if self.cost is not None or self.expected is not None:
+            raise ProblemError(
+                describe(
+                    "The cost is given twice.",
+                    expected="one call of minimize() or minimize_expected()",
+                    received="a second one",
+                    remedy="add the terms up in one call",
+                )
+            )
 
     def subject_to(
         self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None
@@ -442,7 +480,7 @@ class Problem:
             ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
         """
         if self._frozen is None:
-            self._frozen = freeze(self)
+            self._frozen = freeze(self if self.expected is None else derive(self))
         return self._frozen
 
     def _declare(self, name: str, size: Any) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.checks import check_density
 from covocp.matrices import half_indices, pack_symbolic, unpack_symbolic
 
 # Agreement asked between a rate and its recognised form at random points.
@@ -23,6 +24,21 @@ def riccati_rate(covariance: Any, drift: Any, noise: Any, information: Any) -> A
     """Rate F E + E F' + Q - E W E of a covariance, W = M' U^-1 M [Schmidt 2.5-3]; all n x n."""
     product = drift @ covariance
     return product + product.T + noise - covariance @ information @ covariance
+
+
+def inverse(density: Any) -> Any:
+    """Inverse of a density or weight matrix, with as much structure as it has.
+
+    Raises:
+        ProblemError: where it is constant and not positive definite.
+    """
+    if density.is_constant():
+        numbers = ca.evalf(density).full()
+        check_density("measurement", "noise density", numbers, definite=True)
+        return ca.sparsify(ca.DM(np.linalg.inv(numbers)))
+    if density.sparsity().is_diag():
+        return ca.diag(1.0 / ca.diag(density))
+    return ca.inv(density)
 
 
 def recognise(rate: Any, half: Any, size: int) -> tuple[Any, Any, Any] | None:

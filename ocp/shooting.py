@@ -18,7 +18,7 @@ from covocp.integrators import (
     interval_symbols,
     joint_interval,
     nominal_interval,
-    propagate_interval,
+    propagate_step,
     simpson_interval,
     step_matrix,
 )
@@ -73,7 +73,7 @@ class _Variables:
         x, e, u, duration = (self.w[i:j] for i, j in pairwise(ends))
         self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
         self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
-        self.u = ca.reshape(u, nu, nodes) * ca.repmat(ca.DM(scales.u), 1, nodes)
+        self.u = ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T)
         self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
         self.p = ca.MX.sym("p", statement.np + 1)
         self.parameters, self.cost_scale = ca.vertsplit(self.p, [0, statement.np, statement.np + 1])
@@ -175,8 +175,9 @@ def matrices_along(
     common: tuple[Any, ...],
     parameters: Any,
     e0: Any = None,
+    kicks: Any = None,
 ) -> tuple[Any, Any]:
-    """Propagate the matrices along a nominal.
+    """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
 
     Args:
         statement: an uncoupled problem with matrices.
@@ -186,6 +187,8 @@ def matrices_along(
         common: common arguments of the interval functions, a column for each interval.
         parameters: of the statement.
         e0: half-vectors at the start; None: the statement's.
+        kicks: added to the half-vectors as they pass the nodes, (ne, N + 1): slopes by them are costates. None:
+            nothing; only where some matrix runs backward.
 
     Returns:
         Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
@@ -193,23 +196,93 @@ def matrices_along(
     n, m = mesh.intervals, mesh.substeps
     e0 = statement.boundary(parameters)[2] if e0 is None else e0
     starts = x[:, :n]
-    if mesh.step == "rk4":
+    if mesh.step == "rk4" and not statement.behind:
         ends, cost = _runge_kutta_along(statement, mesh, e0, starts, common)
         return ca.horzcat(e0, ends), cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     before = starts
     if m > 1:
         before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
         before = ca.reshape(before, statement.nx, n * m)
-    ends_of = substep_columns(common, m, n)
-    matrices = [
-        step_matrix(statement, i, mesh.step, mesh.linear_solver).map(n * m)(before, fine, *ends_of)
-        for i in range(len(statement.matrices))
-    ]
-    ends, halves = propagate_interval(statement, m, mesh.linear_solver).mapaccum("propagate", n)(e0, *matrices)
-    e = ca.horzcat(e0, ends)
+    columns = (before, fine, *substep_columns(common, m, n))
+    first = e0[statement.entries(statement.ahead)]
+    passages = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
+    if statement.matrix_end is not None:
+        last = statement.matrix_end(x[:, -1], common[4][:, -1], parameters)
+        other = _backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind))
+        entries = np.argsort(statement.entries(statement.ahead) + statement.entries(statement.behind)).tolist()
+        passages = tuple(ca.vertcat(a, b)[entries, :] for a, b in zip(passages, other, strict=True))
+    e, begins, halves = passages
     if not statement.running_uses_matrices:
         return e, ca.DM.zeros(1, n)
-    return e, simpson_interval(statement, m).map(n)(starts, e[:, :n], fine, halves, *common)
+    return e, simpson_interval(statement, m).map(n)(starts, begins, fine, halves, *common)
+
+
+def _of(kicks: Any, statement: Statement, positions: tuple[int, ...]) -> Any:
+    """The rows of the kicks that belong to some of the matrices."""
+    return None if kicks is None else kicks[statement.entries(positions), :]
+
+
+def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+    """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
+    n, m = mesh.intervals, mesh.substeps
+    first = first if kicks is None else first + kicks[:, 0]
+    arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, None if kicks is None else kicks[:, 1:])
+    nodes = ca.horzcat(first, passed[:, m - 1 :: m])
+    return nodes, nodes[:, :n], arrived
+
+
+def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+    """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
+    n, m = mesh.intervals, mesh.substeps
+    before, after, start, end, s, ds, duration, parameters = columns
+    turned = tuple(
+        column[:, list(range(n * m - 1, -1, -1))]
+        for column in (after, before, end, start, s + ds, -ds, duration, parameters)
+    )
+    last = last if kicks is None else last + kicks[:, n]
+    kicks = None if kicks is None else kicks[:, list(range(n - 1, -1, -1))]
+    arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
+    order = list(range(n * m - 1, -1, -1))
+    points = ca.horzcat(passed[:, order], last)
+    return points[:, ::m], arrived[:, order][:, ::m], points[:, 1:]
+
+
+def _sequence(
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Any, columns: tuple[Any, ...], kicks: Any
+) -> tuple[Any, Any]:
+    """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
+    count = mesh.intervals * mesh.substeps
+    if mesh.step == "rk4":
+        step = _runge_kutta_step(statement, positions)
+        matrices = [column for k, column in enumerate(columns) if k != 1]
+    else:
+        step = propagate_step(statement, positions, mesh.linear_solver)
+        matrices = [
+            step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions
+        ]
+    if kicks is None:
+        values = step.mapaccum("propagate", count)(first, *matrices)
+        return values, values
+    inputs = step.mx_in()
+    kick = ca.MX.sym("kick", first.shape[0])
+    arrived = step(*inputs)
+    kicked = ca.Function("kicked", [*inputs, kick], [arrived + kick, arrived])
+    at_nodes = ca.MX(first.shape[0], count)
+    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
+    passed, before = kicked.mapaccum("propagate", count)(first, *matrices, at_nodes)
+    return before, passed
+
+
+def _runge_kutta_step(statement: Statement, positions: tuple[int, ...]) -> ca.Function:
+    """(half-vectors of some matrices, state, *common of the substep) -> half-vectors after a classical step."""
+    entries = statement.entries(positions)
+    symbolic: Any = statement.symbolic
+    own, x = symbolic.sym("e", len(entries)), symbolic.sym("x", statement.nx)
+    rest = interval_symbols(statement, symbolic)
+    e = symbolic.zeros(statement.ne)
+    e[entries] = own
+    end = joint_interval(statement, 1)(ca.vertcat(x, e), *rest)[0]
+    return ca.Function("matrix_step", [own, x, *rest], [end[statement.nx :][entries]])
 
 
 def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
@@ -252,6 +325,8 @@ def _constraints(
     rows = [_gap_rows("gap_x", nodes["gap_x"], scales.x, statement.state_names)]
     if not mesh.eliminated and statement.matrices:
         rows.append(_gap_rows("gap_e", nodes["gap_e"], scales.e, statement.matrix_names))
+        if statement.matrix_end is not None:
+            rows.append(_backward_ends(statement, scales, variables, nodes))
     rows += _interior_bounds(statement, mesh, scales, nodes["x"])
     u = variables.u
     at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1]) if statement.nu else u
@@ -287,6 +362,22 @@ def _constraints(
     if mesh.eliminated and statement.matrices:
         rows += _final_matrices(statement, scales, nodes["e"][:, -1])
     return tuple(sorted(rows, key=lambda entry: entry.dense))
+
+
+def _backward_ends(statement: Statement, scales: Scales, variables: _Variables, nodes: dict[str, Any]) -> Rows:
+    """The matrices that run backward, where they are variables, at the end."""
+    assert statement.matrix_end is not None
+    entries = statement.entries(statement.behind)
+    value = statement.matrix_end(nodes["x"][:, -1], variables.duration, variables.parameters)
+    scale = scales.e[entries]
+    return Rows(
+        kind="backward_ends",
+        expression=(nodes["e"][entries, -1] - value) / ca.DM(scale),
+        lower=np.zeros(len(entries)),
+        upper=np.zeros(len(entries)),
+        names=tuple(f"final value of {statement.matrix_names[i]}" for i in entries),
+        scale=scale,
+    )
 
 
 def _gap_rows(kind: str, gaps: Any, scale: Array, names: tuple[str, ...]) -> Rows:

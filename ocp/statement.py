@@ -37,6 +37,7 @@ class Block:
     labels: tuple[str, ...] = ()
     covariance: bool = False
     estimation: bool = False
+    backward: bool = False
     unit: str = ""
 
     @property
@@ -70,6 +71,27 @@ class Conditions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Loop:
+    """What the feedback of an expected cost sees of the actual system along the nominal [Schmidt 6.2, 6.3].
+
+    n: rows of the augmented state (states, then unknowns), m: those of the control that is fed back.
+
+    expansion: (state, control, time, duration, parameters) -> F (n, n), G (n, m), A (n, n), B (m, m), N (n, m),
+        Q (n, n): slopes of the rates, second derivatives of the running cost with the weights, process noise.
+    gain: (all six) -> C (m, n) of du = -C dx'.
+    running: (state, control, time, duration, parameters) -> L of the actual system.
+    terminal: (state, duration, parameters) -> k of the actual system, S(T) (n, n).
+    extra_control: (state, control, time, duration, parameters) -> B - L_uu (m, m): what the weights add to L.
+    """
+
+    expansion: ca.Function
+    gain: ca.Function
+    running: ca.Function
+    terminal: ca.Function
+    extra_control: ca.Function
+
+
+@dataclass(frozen=True, kw_only=True)
 class Duration:
     """The terminal time: its guess and bounds [s]; fixed where the bounds are equal."""
 
@@ -93,6 +115,8 @@ class Statement:
         rates: (all six) -> rate of the state, rate of the stacked half-vectors, running cost.
         terminal: (state, matrices, duration, parameters) -> terminal cost.
         boundary: (parameters) -> initial state, final state, initial matrices, final matrices (NaN: free).
+        matrix_end: (state, duration, parameters) -> half-vectors at T of the matrices that run backward, stacked; None
+            where there are none. They have no initial value, and their rates do not depend on the other matrices.
         riccati: for each matrix, (state, control, time, duration, parameters) -> F, Q, W with
             V = F E + E F' + Q - E W E, or None where the rate has not this form.
         measurement: (state, control, time, duration, parameters) -> measured values, H = their Jacobian by the
@@ -108,6 +132,8 @@ class Statement:
     rates: ca.Function
     terminal: ca.Function
     boundary: ca.Function
+    matrix_end: ca.Function | None
+    loop: Loop | None
     riccati: tuple[ca.Function | None, ...]
     measurement: ca.Function | None
     measurement_names: tuple[str, ...]
@@ -161,6 +187,20 @@ class Statement:
     def ne(self) -> int:
         """Entries of all half-vectors together."""
         return sum(block.length for block in self.matrices)
+
+    @cached_property
+    def ahead(self) -> tuple[int, ...]:
+        """Positions among `matrices` of those that run forward in time."""
+        return tuple(i for i, block in enumerate(self.matrices) if not block.backward)
+
+    @cached_property
+    def behind(self) -> tuple[int, ...]:
+        """Positions among `matrices` of those that run backward in time."""
+        return tuple(i for i, block in enumerate(self.matrices) if block.backward)
+
+    def entries(self, positions: tuple[int, ...]) -> list[int]:
+        """Entries of the stacked half-vectors that belong to some of the matrices."""
+        return [k for i in positions for k in range(self.matrices[i].span.start, self.matrices[i].span.stop)]
 
     @property
     def np(self) -> int:

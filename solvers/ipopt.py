@@ -13,7 +13,7 @@ import numpy as np
 from covocp.checks import check_positive
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import choose_scales, stiffness
+from covocp.guess import choose_scales, quadrature_weights, stiffness
 from covocp.integrators import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
@@ -226,7 +226,10 @@ class ShootingSolver:
         if self._nlp is None or self._cold is None:
             scales = choose_scales(self._statement, self._mesh, guess.trajectory, parameters)
             if self._limited:
-                scales = replace(scales, x=STRETCH * scales.x)
+                # in these units equal changes of two control values cost the same, however long their intervals are
+                weights = quadrature_weights(self._mesh)
+                units = np.sqrt(weights.mean() / weights)[:, None]
+                scales = replace(scales, x=STRETCH * scales.x, u=scales.u * units)
             self._nlp = transcribe(self._statement, self._mesh, scales)
             if self._plugin == "ipopt":
                 self._monitor = _Monitor(self._nlp)

@@ -1,0 +1,450 @@
+"""Expected cost -> deterministic vector-matrix problem: the closed loop of G. T. Schmidt, Sc.D. thesis, 1971, chapter 6.
+
+The actual system dx = f dt + n, measured as h + v, is controlled by u - C x', x' the estimate of its deviation by the
+Kalman filter along the nominal. To second order the expected cost is (6.3-14)
+
+    J = k + int L dt + 1/2 tr S(T) X(T) + 1/2 int tr(A X + B C X' C' - 2 N C X') dt,      X = E + X',
+
+E the covariance of the estimate's error, X' that of the estimate itself (called Xhat). With the best gain,
+
+    C = B^-1 (G' S + N'),    -dS/dt = F' S + S F + A - C' B C,    S(T) = k_xx + weights,          (6.3-19 .. 6.3-24)
+
+tr(S X) may be integrated by parts (E-20), and once more with E in place of X, which leaves
+
+    J = k + int L dt + 1/2 tr S(T) E(T) + 1/2 int tr(A E + S E W E) dt,      W = M' U^-1 M.
+
+So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had afterwards. The costate of S is
+-Xhat/2. Where the gain is constrained (`Gain`), C is a control and the matrices are E and Xhat instead.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.checks import as_expression, as_number, caller, check_density, density_matrix, find_name
+from covocp.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, Matrix, State
+from covocp.errors import ProblemError, describe
+from covocp.estimation import augmented_names
+from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
+from covocp.riccati import inverse
+
+if TYPE_CHECKING:
+    from covocp.problem import Problem
+
+# Names of what the derived problem adds to the user's symbols.
+FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
+
+
+def expected_cost(
+    problem: Problem, running: Any, terminal: Any, terminal_weight: Any, control_weight: Any, gain: Gain | None
+) -> Expected:
+    """Check and keep what `Problem.minimize_expected` was given."""
+    if gain is not None and not isinstance(gain, Gain):
+        raise ProblemError(
+            describe(
+                "The gain of minimize_expected() is not a description of a gain.",
+                expected="Gain(structure=..., constant=..., lower=..., upper=...), or None for the best gain",
+                received=repr(gain)[:100],
+                remedy="correct gain=, or leave it out",
+            )
+        )
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    return Expected(
+        running=as_expression("minimize_expected", "running cost", running, (1, 1)),
+        terminal=as_expression("minimize_expected", "terminal cost", terminal, (1, 1)),
+        terminal_weight=_by_name("terminal_weight", terminal_weight, entries),
+        control_weight=_by_name("control_weight", control_weight, problem.controls),
+        gain=gain,
+        where=caller(),
+    )
+
+
+def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
+    """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
+    if not isinstance(weights, Mapping):
+        return weights
+    result = {}
+    for key, value in weights.items():
+        name = find_name(key, what, entries, tuple(entries))
+        size = next(entry.size for entry in entries if entry.name == name)
+        result[name] = density_matrix(name, what.replace("_", " "), value, size)
+    return result
+
+
+def derive(problem: Problem) -> Problem:
+    """The deterministic vector-matrix problem of a problem with an expected cost.
+
+    Args:
+        problem: with `minimize_expected`.
+
+    Returns:
+        A problem on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
+
+    Raises:
+        ProblemError: the system is deterministic, a control has no weight, a terminal condition has none.
+    """
+    expected = problem.expected
+    assert expected is not None
+    _check_random(problem)
+    derived = _copied(problem)
+    if not any(matrix.estimation for matrix in derived.matrices):
+        derived.estimation_covariance()
+    _check_free_names(derived)
+    expansion = _expand(derived, expected)
+    E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
+    size = E.shape[0]
+    jacobian, density = _measured(derived, size)
+    innovation = E @ jacobian.T  # K U
+    information = innovation @ inverse(density) @ innovation.T if jacobian.shape[0] else ca.MX(size, size)
+    if expected.gain is None:
+        S, expansion = _add_feedback(derived, expansion)
+        running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
+        terminal = expansion.terminal + _trace(expansion.end, E) / 2
+    else:
+        X, expansion = _add_free_gain(derived, expansion, expected.gain, information)
+        C = expansion.gain
+        fed = _trace(expansion.B @ C, C @ X) - 2 * _trace(expansion.N, X @ C.T)
+        running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
+        terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
+    derived.cost = (running, terminal)
+    derived.expansion = expansion
+    return derived
+
+
+def deterministic(problem: Problem) -> Problem:
+    """The problem without its noise: what quadratic synthesis takes the nominal from [Schmidt 6.3].
+
+    Raises:
+        ProblemError: where the deterministic part of the expected cost depends on nothing that can be chosen.
+    """
+    expected = problem.expected
+    if expected is None:
+        raise ProblemError(
+            describe(
+                "nominal='deterministic' needs an expected cost.",
+                expected="a problem with minimize_expected()",
+                received=f"'{problem.name}' with minimize()",
+                remedy="leave nominal= out: the cost is deterministic already",
+            )
+        )
+    plain = _copied(problem)
+    plain.cost = (expected.running, expected.terminal)
+    used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
+    plain.matrices = [m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation]
+    chosen = {entry.symbol.__hash__() for entry in (*problem.states, *problem.controls, *plain.matrices)}
+    if problem.free_duration is not None:
+        chosen.add(problem.duration.__hash__())
+    if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*plain.cost))):
+        raise ProblemError(
+            describe(
+                "The deterministic part of the expected cost depends on nothing that can be chosen.",
+                expected="a running or terminal cost of states, controls or the free duration",
+                received=f"running = {expected.running}, terminal = {expected.terminal}",
+                remedy="evaluate(problem, nominal=...) takes any nominal; or add a small deterministic cost",
+            )
+        )
+    return plain
+
+
+def _copied(problem: Problem) -> Problem:
+    """The same declarations and symbols, in lists of its own."""
+    derived = copy.copy(problem)
+    for name in ("states", "unknowns", "parameters", "controls", "matrices", "measurements", "constraints"):
+        setattr(derived, name, list(getattr(problem, name)))
+    derived.rates = dict(problem.rates)
+    derived.expected, derived._frozen = None, None
+    return derived
+
+
+def _check_random(problem: Problem) -> None:
+    """Something must be uncertain, or the expected cost is the deterministic one."""
+    variances = [entry.variance for entry in (*problem.states, *problem.unknowns)]
+    densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    started = [m.initial for m in problem.matrices if m.estimation]
+    uncertain = [*(started or variances), *densities]
+    if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
+        raise ProblemError(
+            describe(
+                "The expected cost is deterministic: nothing in the system is uncertain.",
+                expected="variance= of a state or an unknown, or noise= in dynamics()",
+                received="no initial variance and no process noise",
+                remedy="use minimize() for a deterministic problem, or say what is uncertain",
+            )
+        )
+
+
+def _check_free_names(problem: Problem) -> None:
+    """The names of the derived matrices must not be taken."""
+    for entry in problem._declared:
+        if entry.name in (FEEDBACK, ESTIMATE, GAIN):
+            raise ProblemError(
+                describe(
+                    f"The name '{entry.name}' is taken by minimize_expected().",
+                    expected=f"any name but {FEEDBACK}, {ESTIMATE}, {GAIN}: they are the matrices of the feedback",
+                    received=f"'{entry.name}', declared at {entry.where}",
+                    remedy="choose another name",
+                )
+            )
+
+
+def _expand(problem: Problem, expected: Expected) -> Expansion:
+    """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    _check_rates(problem)
+    augmented = [entry.symbol for entry in entries]
+    controls = [entry.symbol for entry in problem.controls]
+    count = sum(entry.size for entry in problem.unknowns)
+    rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
+    noises = [problem.rates[s.name].noise for s in problem.states]
+    noise = ca.diagcat(
+        *(ca.MX(s.size, s.size) if q is None else q for s, q in zip(problem.states, noises, strict=True)),
+        ca.MX(count, count),
+    )
+    by_state = ca.vertcat(*(ca.gradient(expected.running, symbol) for symbol in augmented))
+    by_control = ca.vertcat(*(ca.gradient(expected.running, symbol) for symbol in controls))
+    at_end = ca.vertcat(*(ca.gradient(expected.terminal, symbol) for symbol in augmented))
+    weight = _weight_matrix(expected.terminal_weight, entries, "terminal weight")
+    end = _slope(at_end, augmented) + (0 if weight is None else weight)
+    _check_terminal_weights(problem, end)
+    return Expansion(
+        F=_slope(rates, augmented),
+        G=_slope(rates, controls),
+        A=_slope(by_state, augmented),
+        B=_control_weights(problem, expected, _slope(by_control, controls)),
+        N=_slope(by_state, controls),
+        Q=noise,
+        end=end,
+        running=expected.running,
+        terminal=expected.terminal,
+        gain=ca.MX(),
+    )
+
+
+def _check_rates(problem: Problem) -> None:
+    for state in problem.states:
+        if state.name not in problem.rates:
+            raise ProblemError(
+                describe(
+                    f"'{state.name}' has no dynamics (declared at {state.where}).",
+                    expected=f"dynamics({state.name}, rate)",
+                    received="none",
+                    remedy="give its rate; 0 for a constant",
+                )
+            )
+
+
+def _slope(expression: Any, symbols: list[Any]) -> Any:
+    """Jacobian by several symbols, side by side."""
+    return ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+
+
+def _trace(a: Any, b: Any) -> Any:
+    """tr(a b) of symmetric a or b of the same shape as b'."""
+    return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
+
+
+def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
+    """One matrix over some entries from weights by name, a number or a matrix; None without weights."""
+    if weights is None:
+        return None
+    if isinstance(weights, Mapping):
+        return ca.diagcat(*(weights.get(e.name, ca.MX(e.size, e.size)) for e in entries))
+    return density_matrix("minimize_expected", what, weights, sum(e.size for e in entries))
+
+
+def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> Any:
+    """B: the given weights, L_uu where none is given [Schmidt 6.6]; every control needs one."""
+    given = expected.control_weight
+    if given is None:
+        weights = curvature
+    elif not isinstance(given, Mapping):
+        weights = _weight_matrix(given, problem.controls, "control weight")
+    else:
+        rows = []
+        for a in problem.controls:
+            blocks = []
+            for b in problem.controls:
+                block = ca.jacobian(ca.gradient(expected.running, a.symbol), b.symbol)
+                replaced = a.name in given or b.name in given
+                blocks.append((given[a.name] if a is b else ca.MX(a.size, b.size)) if replaced else block)
+            rows.append(ca.horzcat(*blocks))
+        weights = ca.vertcat(*rows)
+    names = [e.name if e.size == 1 else f"{e.name}[{i}]" for e in problem.controls for i in range(e.size)]
+    constant = weights.is_constant()
+    numbers = ca.evalf(weights).full() if constant else None
+    for i, name in enumerate(names):
+        if not weights.sparsity().has_nz(i, i) or (numbers is not None and numbers[i, i] == 0):
+            raise ProblemError(
+                describe(
+                    f"The control '{name}' has no weight: the second derivative of the running cost by it is zero.",
+                    expected="a positive weight of its deviations, or the feedback gain would be infinite",
+                    received=f"running = {expected.running}",
+                    remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
+                )
+            )
+    if numbers is not None:
+        check_density(", ".join(names), "control weight", numbers, definite=True)
+    return ca.sparsify(ca.evalf(weights)) if constant else weights
+
+
+def _check_terminal_weights(problem: Problem, end: Any) -> None:
+    """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
+    offset = 0
+    for state in problem.states:
+        free = [True] * state.size
+        if state.final.is_constant():
+            free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()
+        for i in range(state.size):
+            if not free[i] and not end.sparsity().has_nz(offset + i, offset + i):
+                raise ProblemError(
+                    describe(
+                        f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
+                        expected="a weight of its deviation at the end: only the nominal meets a terminal condition "
+                        "exactly, the actual system scatters around it",
+                        received=f"final value of {state.name}, no terminal cost or weight of it",
+                        remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
+                        "to scatter",
+                    )
+                )
+        offset += state.size
+
+
+def _measured(problem: Problem, size: int) -> tuple[Any, Any]:
+    """M and U of all measurements."""
+    augmented = [entry.symbol for entry in (*problem.states, *problem.unknowns)]
+    if not problem.measurements:
+        return ca.MX(0, size), ca.MX(0, 0)
+    value = ca.vertcat(*(m.expression for m in problem.measurements))
+    return _slope(value, augmented), ca.diagcat(*(m.noise for m in problem.measurements))
+
+
+def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansion]:
+    """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
+    labels = augmented_names([*problem.states, *problem.unknowns])
+    size = len(labels)
+    half = ca.MX.sym(FEEDBACK, half_length(size))
+    S = unpack_symbolic(half, size)
+    F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
+    weight = inverse(expansion.B)
+    form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
+    problem.matrices.append(
+        Matrix(
+            name=FEEDBACK,
+            symbol=half,
+            matrix=S,
+            size=size,
+            where="minimize_expected()",
+            unit="",
+            initial=None,
+            final=None,
+            lower=None,
+            guess=None,
+            covariance=False,
+            estimation=False,
+            labels=labels,
+            backward=Backward(end=expansion.end, form=form),
+        )
+    )
+    return S, replace(expansion, gain=weight @ (G.T @ S + N.T))
+
+
+def _add_free_gain(
+    problem: Problem, expansion: Expansion, gain: Gain, information: Any
+) -> tuple[Any, Expansion]:
+    """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
+    labels = augmented_names([*problem.states, *problem.unknowns])
+    size, rows = len(labels), sum(control.size for control in problem.controls)
+    half = ca.MX.sym(ESTIMATE, half_length(size))
+    X = unpack_symbolic(half, size)
+    pattern, low, high, guess = _gain_entries(gain, (rows, size))
+    where = np.flatnonzero(pattern.ravel(order="F"))
+    symbol = ca.MX.sym(GAIN, where.size)
+    C = ca.MX(rows, size)
+    position = ca.DM.zeros(rows * size, where.size)
+    for k, index in enumerate(where.tolist()):
+        position[index, k] = 1.0
+    C = ca.reshape(ca.sparsify(position) @ symbol, rows, size)
+    common: dict[str, Any] = {
+        "name": GAIN,
+        "symbol": symbol,
+        "size": int(where.size),
+        "where": "minimize_expected()",
+        "unit": "",
+        "lower": low.ravel(order="F")[where],
+        "upper": high.ravel(order="F")[where],
+        "guess": guess.ravel(order="F")[where],
+        "scale": None,
+    }
+    if gain.constant:
+        free = ca.MX(ca.DM.nan(where.size, 1))
+        nothing = ca.MX(where.size, where.size)
+        problem.states.append(State(**common, initial=free, final=free, variance=nothing, estimated=False))
+        problem.rates[GAIN] = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
+    else:
+        problem.controls.append(Control(**common))
+    closed = expansion.F - expansion.G @ C
+    problem.matrices.append(
+        Matrix(
+            name=ESTIMATE,
+            symbol=half,
+            matrix=X,
+            size=size,
+            where="minimize_expected()",
+            unit="",
+            initial=ca.MX(ca.DM.zeros(half_length(size), 1)),
+            final=None,
+            lower=0.0,
+            guess=None,
+            covariance=True,
+            estimation=False,
+            labels=labels,
+        )
+    )
+    rate = closed @ X + X @ closed.T + information
+    problem.rates[ESTIMATE] = Dynamics(rate=pack_symbolic(rate), noise=None, where="minimize_expected()")
+    return X, replace(expansion, gain=C)
+
+
+def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:
+    """Pattern, bounds and guess of a gain, all of its shape.
+
+    Raises:
+        ProblemError: where one does not fit.
+    """
+    values = []
+    for what, value in (
+        ("structure", np.ones(shape) if gain.structure is None else gain.structure),
+        ("lower", gain.lower),
+        ("upper", gain.upper),
+        ("guess", 0.0 if gain.guess is None else gain.guess),
+    ):
+        numbers = as_number(GAIN, what, value)
+        if numbers.size == 1:
+            numbers = np.full(shape, float(numbers.reshape(())))
+        if numbers.shape != shape or np.isnan(numbers).any():
+            raise ProblemError(
+                describe(
+                    f"The {what} of the gain does not fit.",
+                    expected=f"a number, or an array of shape {shape}: controls by augmented states, without NaN",
+                    received=f"shape {numbers.shape}",
+                    remedy=f"correct Gain({what}=...)",
+                )
+            )
+        values.append(numbers)
+    pattern, low, high, guess = values
+    if not pattern.any() or (low > high).any():
+        raise ProblemError(
+            describe(
+                "The gain leaves nothing to choose.",
+                expected="a structure with at least one entry, and lower <= upper",
+                received=str(gain),
+                remedy="correct Gain(...)",
+            )
+        )
+    return pattern != 0, low, high, np.clip(guess, low, high)
