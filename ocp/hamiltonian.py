@@ -19,10 +19,11 @@ import casadi as ca
 import numpy as np
 
 from covocp.extremal import Extremal
-from covocp.integrators import KEPT, Step, full_interval, interval_symbols
+from covocp.integrators import KEPT, Step, full_interval, hermite, interval_symbols, nominal_interval
 from covocp.matrices import Array
+from covocp.mesh import Mesh
 from covocp.nlp import terminal_slopes
-from covocp.shooting import common_columns
+from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Statement
 
 
@@ -125,21 +126,21 @@ def _stack(extremal: Extremal) -> Any:
 
 
 @lru_cache(maxsize=KEPT)
-def adjoint_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
-    """Adjoint of one discrete control interval.
+def adjoint_interval(statement: Statement, substeps: int, step: Step | None) -> ca.Function:
+    """Adjoint of one discrete control interval; of the nominal alone, without cost, where no covariance step is given.
 
     Returns:
         (costates at the end, which of them to keep (1 or 0), values in place of the others, impulse at the start,
         x and e stacked, *common) -> costates at the start, slopes of the Lagrangian by the control at the start, by
         that at the end, by T.
     """
-    interval = full_interval(statement, substeps, step)
+    interval = full_interval(statement, substeps, step) if step else nominal_interval(statement, substeps)
     symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
-    size = statement.nx + statement.ne
+    size = interval.size1_in(0)
     after, keep, known, impulse, z = (symbolic.sym(name, size) for name in ("after", "keep", "known", "impulse", "z"))
     common = interval_symbols(statement, symbolic)
     end, _, cost = interval(z, *common)
-    value = ca.dot(keep * after + known, end) + cost
+    value = ca.dot(keep * after + known, end) + (cost if step else 0)
     by = (z, common[0], common[1], *([common[4]] if statement.duration.free else []))
     slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
     return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
@@ -155,19 +156,78 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
         Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
         multipliers of control bounds; its slope by T through the intervals.
     """
-    st, mesh = extremal.statement, extremal.mesh
-    n = mesh.intervals
+    st = extremal.statement
+    if st.behind:
+        return _costates_both_ways(extremal)
     last = np.concatenate(terminal_costates(extremal))
-    sweep = adjoint_interval(st, mesh.substeps, mesh.step).mapaccum("sweep", n)
+    interval = adjoint_interval(st, extremal.mesh.substeps, extremal.mesh.step)
+    costates, slopes, by_duration = _swept(extremal, interval, last, impulses(extremal), _stack(extremal))
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
+
+
+def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Any) -> tuple[Array, Array, float]:
+    """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
+    st, mesh = extremal.statement, extremal.mesh
+    n, size = mesh.intervals, last.size
+    sweep = interval.mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
-    stacked = (*_restarts(extremal), impulses(extremal)[:-1].T, _stack(extremal)[:, :n], *_columns(extremal))
+    keep, known = (values[:size] for values in _restarts(extremal))
+    stacked = (keep, known, jumps[:-1].T, z[:, :n], *_columns(extremal))
     outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
     values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
-    costates = np.vstack([values.T, last])
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start.T
     slopes[int(mesh.control == "linear") :][:n] += by_end.T
-    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, float(by_duration.sum())
+    return np.vstack([values.T, last]), slopes, float(by_duration.sum())
+
+
+def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """The same where some matrix runs backward: its costate runs forward, from zero.
+
+    The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
+    both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    nx = st.nx
+    jumps = impulses(extremal)
+    last_x, last_e = terminal_costates(extremal)
+    behind = st.entries(st.behind)
+    direct = last_e[behind] - extremal.multipliers.final_matrices[behind]
+    weights = jumps[:, nx:].copy()
+    weights[-1] = last_e
+    weights[-1, behind] = direct
+    outputs = passage_slopes(st, mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    by_x, by_u, by_duration, kicks = (np.asarray(v.full()).T for v in outputs)
+    kicks[-1, behind] -= direct
+    kicks[:, behind] *= -1.0
+    by_x[-1] = 0.0  # the slope by x(T) through the matrices that start there is part of the multipliers `final`
+    interval = adjoint_interval(st, mesh.substeps, None)
+    costates, slopes, total = _swept(extremal, interval, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T))
+    return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
+
+
+@lru_cache(maxsize=KEPT)
+def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
+    """Slopes of cost and weighted half-vectors along given nodes of the nominal.
+
+    Returns:
+        (states at the nodes, controls, T, parameters, half-vectors at the start, weights of the half-vectors at the
+        nodes) -> slopes of int L dt + weights . half-vectors by the states at the nodes, the controls, T, and by kicks
+        at the nodes.
+    """
+    n = mesh.intervals
+    x, u = ca.MX.sym("x", statement.nx, n + 1), ca.MX.sym("u", statement.nu, mesh.control_nodes)
+    duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
+    e0, kicks = ca.MX.sym("e0", statement.ne), ca.MX.sym("kicks", statement.ne, n + 1)
+    weights = ca.MX.sym("weights", statement.ne, n + 1)
+    common = common_columns(mesh, u, duration, p)
+    _, states, cost = nominal_interval(statement, mesh.substeps).map(n)(x[:, :-1], *common)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
+    value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
+    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
+    inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
+    values = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
+    return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], values)
 
 
 def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:
@@ -191,33 +251,86 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Ar
 def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
     """Classical Runge-Kutta step of the adjoint equations p' = -H_x, P' = -H_E backward over a pair of substeps.
 
+    The costates of matrices that run backward are not integrated here, they run forward: they are given.
+
     Args:
         statement: the problem.
         cost: False for an influence function, R' = -f_x' R: the adjoint of the rates alone.
         matrices: False where the costates of the half-vectors are zero.
 
     Returns:
-        (costates at the end, stacked x and e at start, middle and end, *common of the pair) -> costates at the start.
+        (costates at the end, stacked x and e at start, middle and end, given costates there, *common of the pair) ->
+        costates at the start.
     """
     symbolic: Any = statement.symbolic
-    nx, size = statement.nx, statement.nx + statement.ne
+    nx, size, behind = statement.nx, statement.nx + statement.ne, _behind(statement)
     after = symbolic.sym("after", size)
     points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
+    given = [symbolic.sym(name, len(behind)) for name in ("k0", "km", "k1")]
     common = interval_symbols(statement, symbolic)
     ua, ub, s, ds, duration, p = common
     slope = state_slope(statement, cost=cost, matrices=matrices)
 
     def rate(costate: Any, c: float) -> Any:
-        z = points[round(2 * c)]
+        z, full = points[round(2 * c)], _with(costate, behind, given[round(2 * c)])
         u, t = ua + c * (ub - ua), duration * (s + c * ds)
-        return slope(z[:nx], u, z[nx:], t, duration, p, costate[:nx], costate[nx:])
+        return slope(z[:nx], u, z[nx:], t, duration, p, full[:nx], full[nx:])
 
     h = duration * ds
     k1 = rate(after, 1.0)
     k2 = rate(after + h / 2 * k1, 0.5)
     k3 = rate(after + h / 2 * k2, 0.5)
     k4 = rate(after + h * k3, 0.0)
-    return ca.Function("backward", [after, *points, *common], [after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    before = _with(after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), behind, given[0])
+    return ca.Function("backward", [after, *points, *given, *common], [before])
+
+
+def _behind(statement: Statement) -> list[int]:
+    """Entries of z = (x, e) that run backward."""
+    return [statement.nx + k for k in statement.entries(statement.behind)]
+
+
+def _with(column: Any, entries: list[int], values: Any) -> Any:
+    """A column with some entries replaced."""
+    if not entries:
+        return column
+    result = type(column)(column)
+    result[entries] = values
+    return result
+
+
+@lru_cache(maxsize=KEPT)
+def forward_costates(statement: Statement, pairs: int) -> ca.Function:
+    """Costates of the matrices that run backward, forward over the pairs of substeps of one control interval.
+
+    P' = -H_S does not depend on the other costates. Between the ends of a pair they are cubic.
+
+    Returns:
+        (their costates at the start, x and e stacked at the starts, middles and ends of the pairs (size, 2 pairs + 1),
+        *common) -> at the end, at the starts, middles and ends of the pairs.
+    """
+    nx, behind = statement.nx, _behind(statement)
+    start, z = ca.MX.sym("start", len(behind)), ca.MX.sym("z", nx + statement.ne, 2 * pairs + 1)
+    common = interval_symbols(statement, ca.MX)
+    slope = state_slope(statement)
+    value, points = start, [start]
+
+    def rate(costate: Any, point: int) -> Any:
+        full = _with(ca.MX.zeros(nx + statement.ne), behind, costate)
+        u, _, s, _, duration, p = part_of(common, point / (2 * pairs), point / (2 * pairs))
+        return -slope(z[:nx, point], u, z[nx:, point], duration * s, duration, p, full[:nx], full[nx:])[behind]
+
+    h = common[4] * common[3] / pairs
+    for j in range(pairs):
+        first, middle, last = 2 * j, 2 * j + 1, 2 * j + 2
+        k1 = rate(value, first)
+        k2 = rate(value + h / 2 * k1, middle)
+        k3 = rate(value + h / 2 * k2, middle)
+        k4 = rate(value + h * k3, last)
+        after = value + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        points += [hermite(value, after, h * k1, h * rate(after, last), 0.5), after]
+        value = after
+    return ca.Function("forward_costates", [start, z, *common], [value, ca.horzcat(*points)])
 
 
 def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
@@ -243,21 +356,27 @@ def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, 
 
     Returns:
         (columns at the end (size, 1 + influences), impulse at the start, x and e stacked at the starts, middles and
-        ends of the pairs (size, 2 pairs + 1), *common) -> columns at the start with the impulse on the first, columns
-        at the starts of the pairs without it (size, pairs (1 + influences)).
+        ends of the pairs (size, 2 pairs + 1), the costates there of the matrices that run backward, *common) -> columns
+        at the start with the impulse on the first, columns at the starts of the pairs without it
+        (size, pairs (1 + influences)).
     """
-    size = statement.nx + statement.ne
+    size, count = statement.nx + statement.ne, len(_behind(statement))
     after, impulse = ca.MX.sym("after", size, 1 + influences), ca.MX.sym("impulse", size)
-    z = ca.MX.sym("z", size, 2 * pairs + 1)
+    z, given = ca.MX.sym("z", size, 2 * pairs + 1), ca.MX.sym("given", count, 2 * pairs + 1)
+    zero = ca.DM.zeros(count, 2 * pairs + 1)
     common = interval_symbols(statement, ca.MX)
     steps = [backward_pair(statement), backward_pair(statement, cost=False, matrices=matrices)]
     columns, passed = ca.horzsplit(after), []
     for j in range(pairs - 1, -1, -1):
-        points = (z[:, 2 * j], z[:, 2 * j + 1], z[:, 2 * j + 2], *part_of(common, j / pairs, (j + 1) / pairs))
-        columns = [steps[min(k, 1)](column, *points) for k, column in enumerate(columns)]
+        part = part_of(common, j / pairs, (j + 1) / pairs)
+        at = [2 * j, 2 * j + 1, 2 * j + 2]
+        columns = [
+            steps[min(k, 1)](column, *(v[:, i] for v in (z, zero if k else given) for i in at), *part)
+            for k, column in enumerate(columns)
+        ]
         passed.append(ca.horzcat(*columns))
     start = ca.horzcat(columns[0] + impulse, *columns[1:])
-    return ca.Function("backward_interval", [after, impulse, z, *common], [start, ca.horzcat(*passed[::-1])])
+    return ca.Function("backward_interval", [after, impulse, z, given, *common], [start, ca.horzcat(*passed[::-1])])
 
 
 def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
@@ -279,12 +398,37 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     start, _ = interval(keep * after + known, *rest)
     sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
+    given, last_given = given_costates(st, values, _columns(extremal), pairs)
     points = values[backward].transpose(2, 0, 1).reshape(size, -1)
     stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
-    result = sweep(last, *stacked, points, *(column[:, backward] for column in _columns(extremal)))
+    last[_behind(st)] = last_given
+    reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], -1)
+    result = sweep(last, *stacked, points, reversed_given, *(column[:, backward] for column in _columns(extremal)))
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
+
+
+def given_costates(statement: Statement, values: Array, common: tuple[Any, ...], pairs: int) -> tuple[Array, Array]:
+    """Costates of the matrices that run backward along a trajectory; none where none does.
+
+    Args:
+        statement: the problem.
+        values: x and e at the starts, middles and ends of the pairs of all intervals, (N, 2 pairs + 1, size).
+        common: common arguments of the interval functions, a column for each interval.
+        pairs: Runge-Kutta steps an interval.
+
+    Returns:
+        At the same points (N, 2 pairs + 1, rows), and at the end (rows,).
+    """
+    n, points, size = values.shape
+    rows = len(_behind(statement))
+    if not rows:
+        return np.zeros((n, points, 0)), np.zeros(0)
+    sweep = forward_costates(statement, pairs).mapaccum("forward", n)
+    ends, inside = sweep(np.zeros(rows), values.transpose(2, 0, 1).reshape(size, -1), *common)
+    at_points = np.asarray(inside.full()).reshape(rows, n, points).transpose(1, 2, 0)
+    return at_points, np.asarray(ends.full())[:, -1]
 
 
 def _restarts(extremal: Extremal) -> tuple[Array, Array]:
