@@ -403,7 +403,7 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
-    reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], -1)
+    reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
     result = sweep(last, *stacked, points, reversed_given, *(column[:, backward] for column in _columns(extremal)))
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
