@@ -11,10 +11,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.extremal import Extremal
-from covocp.integrators import full_interval, nominal_interval
 from covocp.matrices import Array
 from covocp.mesh import Mesh
-from covocp.shooting import common_columns, matrices_along, repeat
+from covocp.shooting import repeat, single_shooting
 from covocp.statement import Statement
 from covocp.trajectory import Trajectory
 
@@ -189,7 +188,7 @@ def _functions(statement: Statement, mesh: Mesh, active: _Active) -> tuple[ca.Fu
     )
     path, states = ca.MX.sym("path", st.path.size, count), ca.MX.sym("states", st.nx, count)
     controls = ca.reshape(u, st.nu, mesh.control_nodes)
-    x, e, cost = _single_shooting(st, mesh, controls, (x0, e0, t, p))
+    x, e, cost = single_shooting(st, mesh, controls, (x0, e0, t, p))
     last_x, last_e = x[:, -1], e[:, -1]
     value = ca.sum2(cost) + st.terminal(last_x, last_e, t, p) + ca.dot(final, last_x) + ca.dot(final_e, last_e)
     value += ca.dot(states, x)
@@ -216,20 +215,3 @@ def _functions(statement: Statement, mesh: Mesh, active: _Active) -> tuple[ca.Fu
 def _entries(values: Any, positions: tuple[int, ...]) -> Any:
     """Some entries of a matrix, in the order of its transpose flattened (time first), as a column."""
     return ca.vec(values)[list(positions)] if positions else ca.MX(0, 1)
-
-
-def _single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-    """States, half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
-    x0, e0, duration, p = start
-    common = common_columns(mesh, u, duration, p)
-    if statement.coupled:
-        interval = full_interval(statement, mesh.substeps, mesh.step)
-        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
-        nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
-        return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
-    ends, fine, cost = nominal_interval(statement, mesh.substeps).mapaccum("run", mesh.intervals)(x0, *common)
-    x = ca.horzcat(x0, ends)
-    if not statement.matrices:
-        return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
-    return x, e, cost + matrix_cost

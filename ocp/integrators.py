@@ -140,7 +140,7 @@ def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINE
     inner = _gauss_points(statement, index) if step == "gauss" else _strang_parts(statement, index)
     xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
     common = interval_symbols(statement, ca.MX)
-    compose = _gauss_matrix if step == "gauss" else _strang_matrix
+    compose = gauss_matrix if step == "gauss" else _strang_matrix
     value = compose(inner(xa, xb, *common), size, solver)
     return ca.Function("step_matrix", [xa, xb, *common], [value], _slopes(statement, 2))
 
@@ -164,7 +164,7 @@ def _gauss_points(statement: Statement, index: int) -> ca.Function:
     return ca.Function("gauss_points", [xa, xb, *common], points, _slopes(statement, 2))
 
 
-def _gauss_matrix(points: Any, size: int, solver: str) -> Any:
+def gauss_matrix(points: Any, size: int, solver: str) -> Any:
     """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
 
     With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a

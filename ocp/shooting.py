@@ -285,6 +285,23 @@ def _runge_kutta_step(statement: Statement, positions: tuple[int, ...]) -> ca.Fu
     return ca.Function("matrix_step", [own, x, *rest], [end[statement.nx :][entries]])
 
 
+def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """States and half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
+    x0, e0, duration, p = start
+    common = common_columns(mesh, u, duration, p)
+    if statement.coupled:
+        interval = full_interval(statement, mesh.substeps, mesh.step)
+        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
+        nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
+        return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
+    ends, fine, cost = nominal_interval(statement, mesh.substeps).mapaccum("run", mesh.intervals)(x0, *common)
+    x = ca.horzcat(x0, ends)
+    if not statement.matrices:
+        return x, ca.MX(0, mesh.intervals + 1), cost
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
+    return x, e, cost + matrix_cost
+
+
 def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
     """The common arguments for each substep, a column each."""
     if m == 1:

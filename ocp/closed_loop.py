@@ -1,0 +1,264 @@
+"""The closed loop along a nominal: covariances for any gains and statistics, gains, and both forms of the expected cost.
+
+With e the error of the estimate and y the estimate of the deviation (Schmidt's x'), both driven by the gains of the
+design, K = E M' U^-1 and C, and by the true statistics E0(0), Q0, U0 (appendix A, 6.11):
+
+    de = (F - K M) e dt + K dv - dn,      dy = (F - G C) y dt - K M e dt + K dv.
+
+Their joint covariance [E Z; Z' Xhat] obeys a Lyapunov equation, stepped by the two-stage Gauss method: it is positive
+semidefinite at any step size. Where the statistics are the design's, Z = 0 and E is the design's. The cost is had from
+it by (E-1), extended by Z (6.11), and from E and S of the design by (E-20).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.extremal import Extremal
+from covocp.hamiltonian import fine_trajectory
+from covocp.integrators import GAUSS_NODES, KEPT, LINEAR_SOLVER, gauss_matrix, hermite, interval_symbols
+from covocp.matrices import Array, unpack, unpack_symbolic
+from covocp.riccati import inverse
+from covocp.shooting import common_columns, substep_columns
+from covocp.statement import Loop, Statement
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """What is truly uncertain: covariance of the initial deviation, densities of process and measurement noise.
+
+    initial: (n, n); density: (state, control, time, duration, parameters) -> Q (n, n), U (m, m); parameters: its own.
+    """
+
+    initial: Array
+    density: ca.Function
+    parameters: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedLoop:
+    """The closed loop at the nodes of a nominal.
+
+    E: covariance of the error of the estimate, (K, n, n); Xhat: of the estimate; Z: between both, <e y'>; gain: C,
+        (K, m, n).
+    cost: expected cost by (E-1) with Z, by term: "terminal" k, "running" int L dt, "deviations at the end"
+        1/2 tr S(T) X(T), "deviations on the way" the integral of A, B, N.
+    other_cost: the same expected cost by (E-20), from S(0) E(0); None where the gain is not the best one or the
+        statistics are not the design's.
+    """
+
+    E: Array
+    Xhat: Array
+    Z: Array
+    gain: Array
+    cost: Mapping[str, float]
+    other_cost: float | None
+
+    @property
+    def X(self) -> Array:
+        """Covariance of the deviations of the actual system, E + Xhat - Z - Z'."""
+        return np.asarray(self.E + self.Xhat - self.Z - self.Z.transpose(0, 2, 1))
+
+    @property
+    def expected_cost(self) -> float:
+        """Sum of the terms."""
+        return float(sum(self.cost.values()))
+
+
+def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoop:
+    """Propagate the covariances of the loop along a solution.
+
+    Args:
+        extremal: of a statement with a loop.
+        truth: the true statistics; None: the design's.
+
+    Returns:
+        Covariances, gains and costs at the nodes.
+    """
+    st, mesh = extremal.statement, extremal.mesh
+    size = len(st.augmented)
+    statistics = truth if truth is not None else design_statistics(extremal)
+    n, m = mesh.intervals, 2 * max(1, mesh.substeps // 2)
+    fine, _, _ = fine_trajectory(extremal, m)
+    common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
+    before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
+    q = np.tile(statistics.parameters[:, None], (1, n * m))
+    step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
+    joint = np.zeros((2 * size, 2 * size))
+    joint[:size, :size] = statistics.initial
+    values = np.zeros((n * m + 1, 2 * size, 2 * size))
+    values[0] = joint
+    matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
+    for k, D in enumerate(matrices):
+        half = 2 * size
+        moved = D[half:, :half] + D[half:, half:] @ joint
+        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
+        joint = 0.5 * (joint + joint.T)
+        values[k + 1] = joint
+    cost, other = _costs(extremal, fine, values.reshape(n * m + 1, 2 * size, 2 * size), truth is None)
+    at = values[::m]
+    columns = extremal.columns()
+    loop = _loop(st)
+    gain = np.asarray(loop.gain.map(n + 1)(*columns).full())
+    return ClosedLoop(
+        E=at[:, :size, :size],
+        Xhat=at[:, size:, size:],
+        Z=at[:, :size, size:],
+        gain=gain.reshape(-1, n + 1, size).transpose(1, 0, 2),
+        cost=cost,
+        other_cost=other,
+    )
+
+
+def design_statistics(extremal: Extremal) -> Statistics:
+    """The statistics that the design assumes."""
+    st = extremal.statement
+    block = next(b for b in st.matrices if b.estimation)
+    return Statistics(
+        initial=unpack(st.boundary_values(extremal.parameters)[2][block.span], block.size),
+        density=densities(st),
+        parameters=extremal.parameters,
+    )
+
+
+@lru_cache(maxsize=KEPT)
+def densities(statement: Statement) -> ca.Function:
+    """(state, control, time, duration, parameters) -> densities Q of the process and U of the measurement noise."""
+    symbolic: Any = statement.symbolic
+    arguments = [symbolic.sym(f"a{i}", k) for i, k in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
+    noise = _loop(statement).expansion(*arguments)[5]
+    measured = statement.measurement
+    density = symbolic(0, 0) if measured is None else measured(*arguments)[2]
+    return ca.Function("densities", arguments, [noise, ca.densify(density)])
+
+
+def _loop(statement: Statement) -> Loop:
+    if statement.loop is None:
+        raise ValueError("a problem without an expected cost has no loop")
+    return statement.loop
+
+
+def _fine_columns(extremal: Extremal, substeps: int) -> tuple[Any, ...]:
+    """Common arguments of the interval functions, a column for each substep."""
+    t = extremal.trajectory
+    common = common_columns(extremal.mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
+    return substep_columns(common, substeps, extremal.mesh.intervals)
+
+
+@lru_cache(maxsize=KEPT)
+def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
+    """(z at both ends of a substep, *common, parameters of the truth) -> step matrix of [E Z; Z' Xhat], 4n x 4n.
+
+    x, E, S of the design between the ends by cubic Hermite polynomials.
+    """
+    symbolic: Any = statement.symbolic
+    nx, size = statement.nx, len(statement.augmented)
+    za, zb = (symbolic.sym(name, nx + statement.ne) for name in ("za", "zb"))
+    common = interval_symbols(statement, symbolic)
+    q = symbolic.sym("q", density.size1_in(4))
+    ua, ub, s, ds, duration, p = common
+    h = duration * ds
+
+    def slope(z: Any, u: Any, at: Any) -> Any:
+        return ca.vertcat(*statement.rates(z[:nx], u, z[nx:], duration * at, duration, p)[:2])
+
+    fa, fb = slope(za, ua, s), slope(zb, ub, s + ds)
+    block = next(b for b in statement.matrices if b.estimation)
+    loop = _loop(statement)
+    points = []
+    for c in GAUSS_NODES:
+        z, u, t = hermite(za, zb, h * fa, h * fb, c), ua + c * (ub - ua), duration * (s + c * ds)
+        F, G = loop.expansion(z[:nx], u, t, duration, p)[:2]
+        C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
+        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][block.span], size), (t, duration, p))
+        noise, measured = density(z[:nx], u, t, duration, q)
+        drift = ca.blockcat([[F - K @ M, symbolic.zeros(size, size)], [-K @ M, F - G @ C]])
+        spread = K @ measured @ K.T
+        driven = ca.blockcat([[spread + noise, spread], [spread, spread]])
+        points.append(h * ca.blockcat([[-drift.T, symbolic.zeros(2 * size, 2 * size)], [driven, drift]]))
+    inner = ca.Function("points", [za, zb, *common, q], points)
+    outer = inner.mx_in()
+    value = gauss_matrix(inner(*outer), 2 * size, LINEAR_SOLVER)
+    return ca.Function("joint_step", outer, [value])
+
+
+def _filter(statement: Statement, x: Any, u: Any, E: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
+    if statement.measurement is None:
+        return E[:, :0], E[:0, :]
+    _, M, U = statement.measurement(x, u, *rest)
+    return E @ M.T @ inverse(U), ca.densify(M)
+
+
+def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple[dict[str, float], float | None]:
+    """Terms of the cost by (E-1) with Z [6.11], and by (E-20) where it holds; integrals by Simpson's rule."""
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
+    best = bool(st.behind) and design
+    function = _running(st)
+    u = extremal.controls
+    after = u[:-1] if mesh.control == "constant" else u[1:]
+    h = np.diff(extremal.time)
+    running = deviations = other = 0.0
+    for j in range(m + 1):
+        c = j / m
+        weight = (1 if j in (0, m) else 4 if j % 2 else 2) / (3 * m) * h
+        z = fine[:, j]
+        covariance = joint[j :: m][:n]
+        arguments = (
+            z[:, : st.nx].T,
+            (u[:-1] + c * (after - u[:-1])).T,
+            z[:, st.nx :].T,
+            (extremal.time[:-1] + c * h)[None, :],
+            np.full((1, n), t.duration),
+            np.tile(extremal.parameters[:, None], (1, n)),
+        )
+        values = function.map(n)(*arguments, covariance.transpose(1, 0, 2).reshape(2 * size, -1))
+        L, fed, alternative = (np.asarray(v.full()).ravel() for v in values)
+        running += float(weight @ L)
+        deviations += float(weight @ fed)
+        other += float(weight @ alternative)
+    loop = _loop(st)
+    k, S = (np.asarray(v.full()) for v in loop.terminal(t.x[-1], t.duration, extremal.parameters))
+    error, cross, estimate = joint[-1][:size, :size], joint[-1][:size, size:], joint[-1][size:, size:]
+    spread = error + estimate - cross - cross.T
+    terms = {
+        "terminal": float(k.item()),
+        "running": running,
+        "deviations at the end": 0.5 * float(np.sum(S * spread)),
+        "deviations on the way": deviations,
+    }
+    if not best:
+        return terms, None
+    block = next(b for b in st.matrices if b.backward)
+    at_start = unpack(t.e[0, block.span], size)
+    return terms, float(k.item()) + running + 0.5 * float(np.sum(at_start * joint[0][:size, :size])) + other
+
+
+@lru_cache(maxsize=KEPT)
+def _running(statement: Statement) -> ca.Function:
+    """(all six, joint covariance) -> L, its second-order part by (E-1) with Z, 1/2 tr(S Q + C'B C E) of (E-20)."""
+    symbolic: Any = statement.symbolic
+    size = len(statement.augmented)
+    sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
+    six = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    joint = symbolic.sym("joint", 2 * size, 2 * size)
+    loop = _loop(statement)
+    plain = (*six[:2], *six[3:])
+    _, _, A, B, N, Q = loop.expansion(*plain)
+    C = loop.gain(*six)
+    E, Z, Xhat = joint[:size, :size], joint[:size, size:], joint[size:, size:]
+    X = E + Xhat - Z - Z.T
+    fed = ca.trace(A @ X) + ca.trace(B @ C @ Xhat @ C.T) - 2 * ca.trace(N @ C @ (Xhat - Z.T))
+    other = symbolic(0)
+    if statement.behind:
+        block = next(b for b in statement.matrices if b.backward)
+        S = unpack_symbolic(six[2][block.span], size)
+        other = ca.trace(S @ Q) + ca.trace(C.T @ B @ C @ E)
+    return ca.Function("running", [*six, joint], [loop.running(*plain), fed / 2, other / 2])
