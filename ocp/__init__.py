@@ -11,11 +11,13 @@ if __name__ != "covocp":
     )
 
 from covocp.declarations import Free as Free
+from covocp.declarations import Gain as Gain
 from covocp.errors import CovocpError as CovocpError
 from covocp.errors import CovocpWarning as CovocpWarning
 from covocp.errors import ExportError as ExportError
 from covocp.errors import ProblemError as ProblemError
 from covocp.errors import SolveError as SolveError
+from covocp.evaluate import evaluate as evaluate
 from covocp.methods import Solver as Solver
 from covocp.methods import methods as methods
 from covocp.methods import solve as solve

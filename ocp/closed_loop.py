@@ -1,4 +1,4 @@
-"""The closed loop along a nominal: covariances for any gains and statistics, gains, and both forms of the expected cost.
+"""The closed loop along a nominal: covariances for any gains and statistics, gains, both forms of the expected cost.
 
 With e the error of the estimate and y the estimate of the deviation (Schmidt's x'), both driven by the gains of the
 design, K = E M' U^-1 and C, and by the true statistics E0(0), Q0, U0 (appendix A, 6.11):
@@ -28,6 +28,9 @@ from covocp.riccati import inverse
 from covocp.shooting import common_columns, substep_columns
 from covocp.statement import Loop, Statement
 
+# Share of the largest slope below which a direction of the state counts as moved by nothing.
+UNMOVED = 1e-10
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics:
@@ -49,6 +52,9 @@ class ClosedLoop:
         (K, m, n).
     cost: expected cost by (E-1) with Z, by term: "terminal" k, "running" int L dt, "deviations at the end"
         1/2 tr S(T) X(T), "deviations on the way" the integral of A, B, N.
+    conservation: largest relative error of w'(E + Xhat)w, which grows by int w'Qw dt only, over the directions w that
+        neither the control nor the state moves (w'F = 0, w'G = 0: constants, or the logarithm of a density plus a
+        multiple of the altitude); None where there are none.
     other_cost: the same expected cost by (E-20), from S(0) E(0); None where the gain is not the best one or the
         statistics are not the design's.
     """
@@ -59,6 +65,7 @@ class ClosedLoop:
     gain: Array
     cost: Mapping[str, float]
     other_cost: float | None
+    conservation: float | None
 
     @property
     def X(self) -> Array:
@@ -113,6 +120,7 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
         gain=gain.reshape(-1, n + 1, size).transpose(1, 0, 2),
         cost=cost,
         other_cost=other,
+        conservation=_conservation(extremal, fine, values, statistics),
     )
 
 
@@ -196,6 +204,39 @@ def _filter(statement: Statement, x: Any, u: Any, E: Any, rest: tuple[Any, ...])
     return E @ M.T @ inverse(U), ca.densify(M)
 
 
+def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Statistics) -> float | None:
+    """Largest relative error of the variances that only noise changes [2.1 of chapter 6, 3 and 4]."""
+    st, mesh = extremal.statement, extremal.mesh
+    n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
+    X = joint[:, :size, :size] + joint[:, size:, size:] - joint[:, :size, size:] - joint[:, size:, :size]
+    units = np.sqrt(np.diagonal(X, axis1=1, axis2=2).max(axis=0).clip(np.finfo(float).tiny))
+    z = np.concatenate([fine[:, :-1].reshape(n * m, -1), fine[-1:, -1]])
+    u, h = extremal.controls, np.diff(extremal.time)
+    at = np.interp(np.arange(n * m + 1) / m, np.arange(n + 1), extremal.time)
+    controls = (
+        np.column_stack([np.interp(at, extremal.time, column) for column in u.T]) if st.nu else np.zeros((at.size, 0))
+    )
+    rest = (at[None, :], np.full((1, at.size), extremal.trajectory.duration))
+    own, true = (np.tile(p[:, None], (1, at.size)) for p in (extremal.parameters, statistics.parameters))
+    arguments = (z[:, : st.nx].T, controls.T, *rest)
+    F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(at.size)(*arguments, own)[:2])
+    F = F.reshape(size, at.size, size) * units / units[:, None, None]
+    slopes = np.hstack([F.reshape(size, -1), G / units[:, None]])
+    vectors, values, _ = np.linalg.svd(slopes, full_matrices=True)
+    values = np.append(values, np.zeros(size - values.size))
+    kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
+    if not kept.shape[1]:
+        return None
+    noise = np.asarray(statistics.density.map(at.size)(*arguments, true)[0].full()).reshape(size, at.size, size)
+    growth = np.einsum("iw,ikj,jw->kw", kept, noise, kept)
+    weights = np.array([1.0 if j in (0, m) else 4.0 if j % 2 else 2.0 for j in range(m + 1)]) / (3 * m)
+    index = m * np.arange(n)[:, None] + np.arange(m + 1)
+    grown = np.cumsum(np.einsum("k,j,kjw->kw", h, weights, growth[index]), axis=0)
+    variance = np.einsum("iw,kij,jw->kw", kept, X[::m], kept)
+    error = np.abs(variance[1:] - variance[0] - grown)
+    return float((error / np.maximum(variance[1:], np.finfo(float).tiny)).max())
+
+
 def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple[dict[str, float], float | None]:
     """Terms of the cost by (E-1) with Z [6.11], and by (E-20) where it holds; integrals by Simpson's rule."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
@@ -210,7 +251,7 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
         c = j / m
         weight = (1 if j in (0, m) else 4 if j % 2 else 2) / (3 * m) * h
         z = fine[:, j]
-        covariance = joint[j :: m][:n]
+        covariance = joint[j::m][:n]
         arguments = (
             z[:, : st.nx].T,
             (u[:-1] + c * (after - u[:-1])).T,

@@ -1,4 +1,4 @@
-"""Expected cost -> deterministic vector-matrix problem: the closed loop of G. T. Schmidt, Sc.D. thesis, 1971, chapter 6.
+"""Expected cost -> deterministic vector-matrix problem: the closed loop of G. T. Schmidt, Sc.D. thesis, chapter 6.
 
 The actual system dx = f dt + n, measured as h + v, is controlled by u - C x', x' the estimate of its deviation by the
 Kalman filter along the nominal. To second order the expected cost is (6.3-14)
@@ -109,7 +109,7 @@ def derive(problem: Problem) -> Problem:
     else:
         X, expansion = _add_free_gain(derived, expansion, expected.gain, information)
         C = expansion.gain
-        fed = _trace(expansion.B @ C, C @ X) - 2 * _trace(expansion.N, X @ C.T)
+        fed = _trace(expansion.B @ C, X @ C.T) - 2 * _trace(expansion.N, C @ X)
         running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
         terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
     derived.cost = (running, terminal)
@@ -137,7 +137,8 @@ def deterministic(problem: Problem) -> Problem:
     plain.cost = (expected.running, expected.terminal)
     used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
     plain.matrices = [m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation]
-    chosen = {entry.symbol.__hash__() for entry in (*problem.states, *problem.controls, *plain.matrices)}
+    entries: list[Any] = [*problem.states, *problem.controls, *plain.matrices]
+    chosen = {entry.symbol.__hash__() for entry in entries}
     if problem.free_duration is not None:
         chosen.add(problem.duration.__hash__())
     if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*plain.cost))):
@@ -164,7 +165,8 @@ def _copied(problem: Problem) -> Problem:
 
 def _check_random(problem: Problem) -> None:
     """Something must be uncertain, or the expected cost is the deterministic one."""
-    variances = [entry.variance for entry in (*problem.states, *problem.unknowns)]
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    variances = [entry.variance for entry in entries]
     densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     started = [m.initial for m in problem.matrices if m.estimation]
     uncertain = [*(started or variances), *densities]
@@ -245,7 +247,7 @@ def _slope(expression: Any, symbols: list[Any]) -> Any:
 
 
 def _trace(a: Any, b: Any) -> Any:
-    """tr(a b) of symmetric a or b of the same shape as b'."""
+    """tr(a b)."""
     return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
 
 
@@ -317,7 +319,8 @@ def _check_terminal_weights(problem: Problem, end: Any) -> None:
 
 def _measured(problem: Problem, size: int) -> tuple[Any, Any]:
     """M and U of all measurements."""
-    augmented = [entry.symbol for entry in (*problem.states, *problem.unknowns)]
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    augmented = [entry.symbol for entry in entries]
     if not problem.measurements:
         return ca.MX(0, size), ca.MX(0, 0)
     value = ca.vertcat(*(m.expression for m in problem.measurements))
@@ -354,9 +357,7 @@ def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansio
     return S, replace(expansion, gain=weight @ (G.T @ S + N.T))
 
 
-def _add_free_gain(
-    problem: Problem, expansion: Expansion, gain: Gain, information: Any
-) -> tuple[Any, Expansion]:
+def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, information: Any) -> tuple[Any, Expansion]:
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
     labels = augmented_names([*problem.states, *problem.unknowns])
     size, rows = len(labels), sum(control.size for control in problem.controls)
@@ -365,7 +366,6 @@ def _add_free_gain(
     pattern, low, high, guess = _gain_entries(gain, (rows, size))
     where = np.flatnonzero(pattern.ravel(order="F"))
     symbol = ca.MX.sym(GAIN, where.size)
-    C = ca.MX(rows, size)
     position = ca.DM.zeros(rows * size, where.size)
     for k, index in enumerate(where.tolist()):
         position[index, k] = 1.0

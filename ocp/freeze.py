@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_density
 from covocp.declarations import Constraint, Matrix, Place
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names

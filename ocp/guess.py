@@ -114,7 +114,7 @@ def first_guess(
     """
     u = controls_guess(statement, mesh.nodes, mesh.control, random)
     duration = statement.duration.guess
-    start, e0 = _starts(statement, mesh, parameters)
+    start, e0 = starts(statement, mesh, parameters)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
         u = steer(statement, mesh, start, u, duration, parameters)
@@ -128,7 +128,7 @@ def first_guess(
     return Trajectory(x=x, u=u, e=simulate_matrices(statement, mesh, x, u, e0, duration, parameters), duration=duration)
 
 
-def _starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
+def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
     """Initial state and matrices, the free entries guessed."""
     x0, _, e0, ef = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
@@ -329,7 +329,7 @@ def stiffness(statement: Statement, nodes: Array, control: str, parameters: Arra
     """Largest h times spectral radius of what Runge-Kutta steps, at the start: f_x, with `matrices` 2 (F - E W)."""
     u = controls_guess(statement, nodes, control, None)[:1].ravel() if statement.nu else np.zeros(0)
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
-    x, e = _starts(statement, mesh, parameters)
+    x, e = starts(statement, mesh, parameters)
     duration = statement.duration.guess
     largest = _radius(_state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
     if matrices and statement.ne:
@@ -377,7 +377,10 @@ def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameter
     for block in statement.matrices:
         if block.estimation:
             diagonal = np.diagonal(unpack(np.nan_to_num(e0[block.span]), block.size))
-            candidates.append(np.sqrt(np.maximum(diagonal[: statement.nx], 0.0)))
+            known = min(statement.nx, block.size)  # constants to be chosen are states that nothing estimates
+            deviations = np.zeros(statement.nx)
+            deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
+            candidates.append(deviations)
     span = upper - lower
     x = np.max(candidates, axis=0)
     bounded = np.isfinite(span) & (span > 0)

@@ -224,10 +224,10 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     _, states, cost = nominal_interval(statement, mesh.substeps).map(n)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
-    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
+    slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
-    values = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
-    return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], values)
+    values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
+    return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
 
 
 def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:

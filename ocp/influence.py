@@ -14,6 +14,14 @@ t/T: a change of T stretches them, and the slope of J by T is
     k_T + int_0^1 d/dT [T H(t = s T)] ds,
 
 which is k_t + H(T) where H_u = 0 (appendix D); elsewhere it has the change of u at a fixed time that a stretch brings.
+
+In the closed loop (appendix E, corrected) z = (x, E, S), and S runs backward from s(x(T), T), after the nominal. Its
+costate Y runs forward from zero (it is -Xhat/2 [A-32]) and needs no other; p and P come last. With nu = k_S - Y(T)
+
+    p(T) = k_x + s_x' nu,   slope by T: k_T + s_T' nu + ...,
+
+which is (1/2 tr S(T) X(T))_x where the terminal cost is not quadratic, a term that the source drops. No condition
+depends on S elsewhere, so the influence functions have no part in S.
 """
 
 from __future__ import annotations
@@ -25,11 +33,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.hamiltonian import backward_interval, hamiltonian, part_of
-from covocp.integrators import full_interval, interval_symbols
+from covocp.hamiltonian import backward_interval, forward_costates, hamiltonian, part_of
+from covocp.integrators import (
+    COMMON,
+    full_interval,
+    interval_symbols,
+    joint_interval,
+    nominal_interval,
+    propagate_step,
+    step_matrix,
+)
 from covocp.matrices import Array
 from covocp.mesh import Mesh
-from covocp.shooting import common_columns
+from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Statement
 
 
@@ -42,8 +58,9 @@ class Terminal:
         rows: equalities among the final conditions that do not depend on the control.
         names: of all of them, in this order.
         matrices: whether the matrices have an influence on them.
-        function: (z, T, p) -> terminal cost k, the values of the conditions, and the slopes of both by z (size,
-            1 + q) and by T (1, 1 + q).
+        function: (z, T, p, Y) -> terminal cost k, the values of the conditions, the slopes of both by z (size,
+            1 + q) and by T (1, 1 + q), S(T) = s(x(T), T) inserted and the slopes of k with -Y' s; the part of the
+            slope of k by x(T) that comes through S(T), and Y - k_S.
     """
 
     fixed: tuple[int, ...]
@@ -61,7 +78,12 @@ class Terminal:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweeps:
-    """The compiled sweeps of a statement on a mesh; `pairs` Runge-Kutta steps backward in each interval."""
+    """The compiled sweeps of a statement on a mesh; `pairs` Runge-Kutta steps backward in each interval.
+
+    forward: (z(0), *common) -> z at the nodes (size, N + 1), running cost of each interval.
+    refine: z at the starts and at the ends of the intervals, *common -> z at the starts, middles and ends of the pairs.
+    given: costates of the matrices that run backward there; None without such matrices.
+    """
 
     statement: Statement
     mesh: Mesh
@@ -69,6 +91,7 @@ class Sweeps:
     terminal: Terminal
     forward: ca.Function
     refine: ca.Function
+    given: ca.Function | None
     backward: ca.Function
     quadrature: ca.Function
     curvature: ca.Function
@@ -103,6 +126,7 @@ class Slopes:
     control: slopes by the control values, (1 + q, K, nu); cost: the part of the running cost alone, (K, nu).
     duration: by T, (1 + q,). start: by z(0), (1 + q, size), the columns p, P, R at t = 0.
     columns: costates and influence functions at the nodes, (N + 1, size, 1 + q).
+    through: the part of p(T) that comes through S(T), and Y(T) - k_S at the entries of S, (size,).
     middles: values of z in the intervals, and columns at the ends of the pairs: what `reweigh` needs.
     """
 
@@ -111,7 +135,8 @@ class Slopes:
     duration: Array
     start: Array
     columns: Array
-    middles: tuple[Array, Array, Array, Array]
+    through: Array
+    middles: tuple[Array, ...]
 
 
 def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
@@ -126,17 +151,75 @@ def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
     n, count = mesh.intervals, len(terminal.names)
     make = hamiltonian(statement)
     curvature = make("curvature", lambda h, x, u, e, t: [ca.hessian(h, u)[0] if statement.nu else ca.DM(0, 0)])
+    given = forward_costates(statement, pairs).mapaccum("given", n) if statement.behind else None
     return Sweeps(
         statement=statement,
         mesh=mesh,
         pairs=pairs,
         terminal=terminal,
-        forward=full_interval(statement, mesh.substeps, mesh.step).mapaccum("forward", n),
-        refine=full_interval(statement, 2 * pairs, mesh.step).map(n),
+        forward=_passage(statement, mesh),
+        refine=_fine_interval(statement, mesh, 2 * pairs).map(n),
+        given=given,
         backward=backward_interval(statement, pairs, count, matrices=terminal.matrices).mapaccum("backward", n),
         quadrature=quadrature_interval(statement, pairs, count, matrices=terminal.matrices).map(n),
         curvature=curvature.map(n + 1),
     )
+
+
+def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
+    """(z(0), *common) -> z at the nodes (size, N + 1), running cost of each interval (steps 2 and 3 of appendix E)."""
+    n, nx, solver = mesh.intervals, statement.nx, mesh.linear_solver
+    start = ca.MX.sym("start", nx + statement.ne)
+    symbols = zip(COMMON, interval_symbols(statement, ca.MX), strict=True)
+    common = tuple(ca.MX.sym(name, symbol.shape[0], n) for name, symbol in symbols)
+    if not statement.behind:
+        interval = full_interval(statement, mesh.substeps, mesh.step, solver).mapaccum("passage", n)
+        ends, _, cost = interval(start, *common)
+        return ca.Function("forward", [start, *common], [ca.horzcat(start, ends), cost])
+    ends, fine, cost = nominal_interval(statement, mesh.substeps).mapaccum("passage", n)(start[:nx], *common)
+    x = ca.horzcat(start[:nx], ends)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common[-1][:, 0], start[nx:])
+    return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
+
+
+def _fine_interval(statement: Statement, mesh: Mesh, count: int) -> ca.Function:
+    """Trajectory inside an interval: x and E stepped from its start, S from its end, as they were to get there.
+
+    Returns:
+        (z at the start, z at the end, *common) -> z at the ends of `count` substeps and before, (size, count + 1).
+    """
+    nx, size, solver = statement.nx, statement.nx + statement.ne, mesh.linear_solver
+    before, after = ca.MX.sym("before", size), ca.MX.sym("after", size)
+    common = interval_symbols(statement, ca.MX)
+    if not statement.behind:
+        _, fine, _ = full_interval(statement, count, mesh.step, solver)(before, *common)
+        return ca.Function("fine", [before, after, *common], [ca.horzcat(before, fine)])
+    x = ca.horzcat(before[:nx], nominal_interval(statement, count)(before[:nx], *common)[1])
+    ahead, behind = statement.entries(statement.ahead), statement.entries(statement.behind)
+    first, last = [before[nx:][ahead]], [after[nx:][behind]]
+    for j in range(count):
+        part = part_of(common, j / count, (j + 1) / count)
+        first.append(_matrix_step(statement, mesh, statement.ahead, first[-1], (x[:, j], x[:, j + 1], *part)))
+    for j in range(count, 0, -1):
+        ua, ub, s, ds, *rest = part_of(common, (j - 1) / count, j / count)
+        turned = (x[:, j], x[:, j - 1], ub, ua, s + ds, -ds, *rest)
+        last.append(_matrix_step(statement, mesh, statement.behind, last[-1], turned))
+    e = ca.vertcat(ca.horzcat(*first), ca.horzcat(*last[::-1]))[np.argsort(ahead + behind).tolist(), :]
+    return ca.Function("fine", [before, after, *common], [ca.vertcat(x, e)])
+
+
+def _matrix_step(
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], halves: Any, arguments: tuple[Any, ...]
+) -> Any:
+    """Half-vectors of some matrices after one step along (x there, x after it, *common of the step)."""
+    if mesh.step == "rk4":
+        entries = statement.entries(positions)
+        e = ca.MX.zeros(statement.ne)
+        e[entries] = halves
+        end = joint_interval(statement, 1)(ca.vertcat(arguments[0], e), *arguments[2:])[0]
+        return end[statement.nx :][entries]
+    steps = [step_matrix(statement, i, mesh.step, mesh.linear_solver)(*arguments) for i in positions]
+    return propagate_step(statement, positions, mesh.linear_solver)(halves, *steps)
 
 
 def terminal_conditions(statement: Statement) -> Terminal:
@@ -148,13 +231,23 @@ def terminal_conditions(statement: Statement) -> Terminal:
     rows = tuple(i for i in range(end.size) if end.lower[i] == end.upper[i] and i not in by_control)
     z = ca.MX.sym("z", statement.nx + statement.ne)
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
-    x, e = z[: statement.nx], z[statement.nx :]
-    cost = statement.terminal(x, e, duration, p)
+    behind = statement.entries(statement.behind)
+    x, e, y = z[: statement.nx], z[statement.nx :], ca.MX.sym("y", len(behind))
+    cost, through = statement.terminal(x, e, duration, p), ca.MX.zeros(z.shape[0])
+    adjoint = cost
+    if statement.matrix_end is not None:
+        ends, own = statement.matrix_end(x, duration, p), [statement.nx + k for k in behind]
+        weights = ca.gradient(cost, z)[own] - y
+        through = ca.jtimes(ends, z, weights, True)
+        through[own] = -weights
+        e = ca.MX(e)
+        e[behind] = ends
+        adjoint = statement.terminal(x, e, duration, p) - ca.dot(y, ends)
     values = [z[list(fixed)]] if fixed else []
     if rows:
         values.append(end.function(x, ca.DM.zeros(statement.nu), e, duration, duration, p)[list(rows)])
     conditions = ca.vertcat(ca.MX(0, 1), *values)
-    stacked = ca.vertcat(cost, conditions)
+    stacked = ca.vertcat(adjoint, conditions)
     slopes = [ca.densify(ca.jacobian(stacked, z)).T, ca.densify(ca.jacobian(stacked, duration)).T]
     names = (*statement.state_names, *statement.matrix_names)
     return Terminal(
@@ -163,7 +256,7 @@ def terminal_conditions(statement: Statement) -> Terminal:
         names=(*(f"final value of {names[i]}" for i in fixed), *(end.names[i] for i in rows)),
         matrices=statement.coupled
         or any(j >= statement.nx for j in ca.jacobian(conditions, z).sparsity().get_triplet()[1]),
-        function=ca.Function("terminal", [z, duration, p], [cost, conditions, *slopes]),
+        function=ca.Function("terminal", [z, duration, p, y], [cost, conditions, *slopes, ca.densify(through)]),
     )
 
 
@@ -237,19 +330,19 @@ def _point(statement: Statement, cost: bool, matrices: bool) -> tuple[list[Any],
 
 
 def sweep_forward(sweeps: Sweeps, u: Array, duration: float, start: Array, parameters: Array) -> Run:
-    """Integrate x and e forward (step 2).
+    """Integrate x and E forward, S backward along them (step 2; in appendix E steps 2 and 3).
 
     Args:
         sweeps: compiled.
         u: controls, (K, nu).
         duration: T [s].
-        start: z(0), (size,).
+        start: z(0), (size,); S(0) follows from the others.
         parameters: of the statement.
     """
     common = common_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
-    ends, _, cost = sweeps.forward(start, *common)
-    z = np.vstack([start, np.asarray(ends.full()).T])
-    terminal, values, _, _ = sweeps.terminal.function(z[-1], duration, parameters)
+    nodes, cost = sweeps.forward(start, *common)
+    z = np.ascontiguousarray(nodes.full().T)
+    terminal, values, *_ = sweeps.terminal.function(z[-1], duration, parameters, 0.0)
     targets = sweeps.terminal.targets(sweeps.statement, parameters)
     return Run(
         u=u,
@@ -262,7 +355,7 @@ def sweep_forward(sweeps: Sweeps, u: Array, duration: float, start: Array, param
 
 
 def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) -> Slopes:
-    """Integrate p, P and R backward and form the integrals of h_u and H_u (steps 3 and 4).
+    """Integrate Y forward, p, P and R backward, and form the integrals of h_u and H_u (steps 3 to 6).
 
     Args:
         sweeps: compiled.
@@ -273,32 +366,41 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     mesh, pairs = sweeps.mesh, sweeps.pairs
     n, size, width = mesh.intervals, run.z.shape[1], 1 + len(sweeps.terminal.names)
     common = common_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
-    _, fine, _ = sweeps.refine(ca.DM(run.z[:-1].T), *common)
-    inside = np.asarray(fine.full()).T.reshape(n, 2 * pairs, size)
-    z = np.concatenate([run.z[:-1, None, :], inside], axis=1)
-    _, _, last, by_duration = (
-        np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters)
+    points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+    z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
+    given, given_end = _given(sweeps, points, common)
+    _, _, last, by_duration, through = (
+        np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters, given_end)
     )
+    behind = [sweeps.statement.nx + k for k in sweeps.statement.entries(sweeps.statement.behind)]
     last[:, 0] += jumps[-1]
+    last[behind, 0] = given_end
     order = list(range(n - 1, -1, -1))
-    points = ca.DM(z[::-1].transpose(2, 0, 1).reshape(size, -1))
+    stacked = [ca.DM(v[::-1].transpose(2, 0, 1).reshape(v.shape[2], n * v.shape[1])) for v in (z, given)]
     columns = [column[:, order] for column in common]
-    starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), points, *columns)
+    starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), *stacked, *columns)
     at_nodes = np.asarray(starts.full()).reshape(size, n, width)[:, ::-1].transpose(1, 0, 2)
     at_pairs = np.asarray(passed.full()).reshape(size, n, pairs * width)[:, ::-1].transpose(1, 0, 2)
-    at_nodes = np.concatenate([at_nodes, last[None]])
-    return _slopes(sweeps, run.u, run.duration, parameters, (z, at_nodes, at_pairs, by_duration.ravel()))
+    middles = (z, np.concatenate([at_nodes, last[None]]), at_pairs, by_duration.ravel(), through.ravel())
+    return _slopes(sweeps, run.u, run.duration, parameters, middles)
+
+
+def _given(sweeps: Sweeps, points: Any, common: tuple[Any, ...]) -> tuple[Array, Array]:
+    """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
+    shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
+    if sweeps.given is None:
+        return np.zeros(shape), np.zeros(0)
+    ends, inside = sweeps.given(np.zeros(shape[2]), points, *common)
+    return np.asarray(inside.full()).T.reshape(shape), np.asarray(ends.full())[:, -1]
 
 
 def reweigh(sweeps: Sweeps, slopes: Slopes, u: Array, duration: float, parameters: Array) -> Slopes:
-    """The slopes with another control along the same x, E, p, P and R: what the chord variant needs [4.2-10]."""
+    """The slopes with another control along the same z and costates: what the chord variant needs [4.2-10]."""
     return _slopes(sweeps, u, duration, parameters, slopes.middles)
 
 
-def _slopes(
-    sweeps: Sweeps, u: Array, duration: float, parameters: Array, middles: tuple[Array, Array, Array, Array]
-) -> Slopes:
-    z, at_nodes, at_pairs, by_duration = middles
+def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middles: tuple[Array, ...]) -> Slopes:
+    z, at_nodes, at_pairs, by_duration, through = middles
     n, size, width = sweeps.mesh.intervals, z.shape[2], at_nodes.shape[2]
     nu = sweeps.statement.nu
 
@@ -325,6 +427,7 @@ def _slopes(
         duration=by_duration + by_time.reshape(n, width).sum(axis=0),
         start=at_nodes[0].T,
         columns=at_nodes,
+        through=through,
         middles=middles,
     )
 

@@ -8,8 +8,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.checks import column
 from covocp.errors import ProblemError, describe
-from covocp.matrices import half_length, unpack_indices
+from covocp.matrices import Array, half_length, unpack_indices
+from covocp.statement import Statement
 
 
 def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
@@ -32,6 +34,42 @@ def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, mis
     if missing_ok:
         return ""
     raise unknown_name(key, names)
+
+
+def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Array | None = None) -> Array:
+    """The stacked parameters (and means of unknowns) of a statement with some of them replaced by name.
+
+    Args:
+        statement: the problem.
+        given: values by name.
+        base: the others; None: as they were declared.
+
+    Raises:
+        ProblemError: no dict, an unknown name, a value of the wrong size.
+    """
+    values = (statement.values if base is None else base).copy()
+    blocks = {b.name: b for b in (*statement.of_kind("parameter"), *statement.of_kind("unknown"))}
+    if not isinstance(given, Mapping):
+        raise ProblemError(
+            describe(
+                "The parameters are not given by name.",
+                expected="a dict of name to value",
+                received=repr(given)[:100],
+                remedy="write parameters={'name': value}",
+            )
+        )
+    for name, value in given.items():
+        if name not in blocks:
+            raise ProblemError(
+                describe(
+                    f"There is no parameter '{name}'.",
+                    expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
+                    received=repr(name),
+                    remedy="declare it by Problem.parameter",
+                )
+            )
+        values[blocks[name].span] = column(name, "value", value, blocks[name].size)
+    return values
 
 
 def _is_matrix_of(key: Any, half: Any) -> bool:

@@ -11,10 +11,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from covocp.checks import column
 from covocp.densities import impossible_density
-from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
+from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe
+from covocp.evaluate import evaluate_controls, evaluation_mesh
+from covocp.expected import deterministic
 from covocp.extremal import Guess, Outcome, Prepared
+from covocp.lookup import stacked_parameters
 from covocp.matrices import Array
 from covocp.mesh import Options
 from covocp.problem import Problem
@@ -34,6 +36,9 @@ UNMOVED = 1e-6
 NEGATIVE_CURVATURE = -1e-6
 ESCAPES = (1.0, -1.0)
 STARTS = 8
+NOMINALS = ("combined", "deterministic")
+# Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
+WORSE = 1e-6
 
 
 def methods() -> tuple[str, ...]:
@@ -48,6 +53,8 @@ class Solver:
         problem: what to solve.
         method: a name in `methods()`.
         intervals: number of control intervals.
+        nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
+            the cost without noise (quadratic synthesis), filter and feedback around it.
         options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`) and of the
             method.
 
@@ -55,7 +62,15 @@ class Solver:
         ProblemError: unknown method or option, or a statement that is wrong.
     """
 
-    def __init__(self, problem: Problem, method: str = "ipopt", *, intervals: int = 100, **options: Any) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        method: str = "ipopt",
+        *,
+        intervals: int = 100,
+        nominal: str = "combined",
+        **options: Any,
+    ) -> None:
         """Build the statement and make the method ready."""
         if method not in METHODS:
             raise ProblemError(
@@ -88,10 +103,25 @@ class Solver:
                         remedy="correct or remove it",
                     )
                 )
+        if nominal not in NOMINALS:
+            raise ProblemError(
+                describe(
+                    "The option 'nominal' has an unknown value.",
+                    expected="'combined' or 'deterministic'",
+                    received=repr(nominal),
+                    remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
+                )
+            )
         self.method = method
+        self.nominal = nominal
         self.statement: Statement = problem.statement()
-        mesh = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
-        self._prepared = cast(Prepared, prepare(self.statement, mesh, **{k: v for k, v in options.items() if k in own}))
+        self._problem, self._classical = problem, cast("Solver | None", None)
+        self._options = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        solved = self.statement if nominal == "combined" else deterministic(problem).statement()
+        self._solved = solved
+        self._prepared = cast(
+            Prepared, prepare(solved, self._options, **{k: v for k, v in options.items() if k in own})
+        )
 
     def solve(
         self,
@@ -121,41 +151,64 @@ class Solver:
             ProblemError: a name or a guess is wrong.
             SolveError: the method did not converge (carries the last iterate).
         """
-        values = self._values(parameters or {})
+        values = stacked_parameters(self.statement, parameters or {})
         with Progress(self.statement.name or "solving", progress) as reporter:
             if isinstance(guess, str):
                 outcome = self._multistart(guess, values, starts, seed, reporter)
             else:
-                start = make_guess(self.statement, self._prepared.mesh, values, guess)
+                start = make_guess(self._solved, self._prepared.mesh, values, guess)
                 outcome = self._prepared.solve(values, start, reporter)
                 outcome = self._leave_saddle(outcome, values, reporter, start)
-        return self._finish(outcome, allow_failure, interrupted=reporter.stop)
+        if self.nominal == "deterministic":
+            outcome = self._closed(outcome)
+        solution = self._finish(outcome, allow_failure, interrupted=reporter.stop)
+        return self._beside_classical(solution, values)
 
-    def _values(self, parameters: Mapping[str, Any]) -> Array:
-        """The stacked parameters with some of them replaced."""
-        values = self.statement.values.copy()
-        blocks = {b.name: b for b in (*self.statement.of_kind("parameter"), *self.statement.of_kind("unknown"))}
-        if not isinstance(parameters, Mapping):
-            raise ProblemError(
-                describe(
-                    "The parameters are not given by name.",
-                    expected="a dict of name to value",
-                    received=repr(parameters)[:100],
-                    remedy="write parameters={'name': value}",
-                )
+    def _closed(self, outcome: Outcome) -> Outcome:
+        """Filter and feedback around the nominal of the deterministic cost."""
+        found = outcome.extremal
+        mesh = evaluation_mesh(self.statement, self._options, found.parameters)
+        t = found.trajectory
+        closed = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+        return replace(
+            closed,
+            converged=outcome.converged and closed.converged,
+            message=f"{outcome.message}: nominal of the deterministic cost, filter and feedback around it",
+            violations={**closed.violations, **outcome.violations},
+            stats={**outcome.stats, "nominal": "deterministic"},
+        )
+
+    def _beside_classical(self, solution: Solution, values: Array) -> Solution:
+        """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
+        if self.nominal != "combined" or not self.statement.behind or not solution.converged:
+            return solution
+        try:
+            if self._classical is None:
+                mesh = {field.name: getattr(self._options, field.name) for field in fields(Options)}
+                self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", CovocpWarning)  # they concern another solution
+                given = values[: self.statement.np]
+                classical = self._classical._solve_values(given)
+        except CovocpError:  # no deterministic cost, or no solution of it: there is nothing to compare with
+            return solution
+        if classical is None:
+            return solution
+        if solution.cost > classical + WORSE * abs(classical):
+            warnings.warn(
+                f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
+                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic').",
+                CovocpWarning,
+                stacklevel=3,
             )
-        for name, value in parameters.items():
-            if name not in blocks:
-                raise ProblemError(
-                    describe(
-                        f"There is no parameter '{name}'.",
-                        expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
-                        received=repr(name),
-                        remedy="declare it by Problem.parameter",
-                    )
-                )
-            values[blocks[name].span] = column(name, "value", value, blocks[name].size)
-        return values
+        return replace(solution, stats={**solution.stats, "classical_cost": classical})
+
+    def _solve_values(self, values: Array) -> float | None:
+        """Cost of the classical design for stacked parameters; None where it was not found."""
+        with Progress("", show=False) as reporter:
+            start = make_guess(self._solved, self._prepared.mesh, values, None)
+            outcome = self._closed(self._prepared.solve(values, start, reporter))
+        return float(sum(outcome.cost_terms.values())) if outcome.converged and not outcome.violations else None
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
         """The best of the problem's own start and several random ones."""
@@ -180,7 +233,7 @@ class Solver:
                 )
         best: Outcome | None = None
         costs = []
-        for start in random_guesses(self.statement, self._prepared.mesh, values, starts, seed):
+        for start in random_guesses(self._solved, self._prepared.mesh, values, starts, seed):
             outcome = self._prepared.solve(values, start, reporter)
             cost = sum(outcome.cost_terms.values())
             costs.append(cost if outcome.converged else np.nan)
@@ -208,7 +261,7 @@ class Solver:
         candidates = []
         for sign in ESCAPES:
             moved = curvature.displaced(outcome.extremal, sign)
-            displaced = make_guess(self.statement, self._prepared.mesh, values, moved)
+            displaced = make_guess(self._solved, self._prepared.mesh, values, moved)
             candidates.append(self._prepared.solve(values, displaced, reporter))
         better = [
             c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())
@@ -272,6 +325,7 @@ def solve(
     *,
     intervals: int = 100,
     guess: Any = None,
+    nominal: str = "combined",
     progress: bool = True,
     allow_failure: bool = False,
     parameters: Mapping[str, Any] | None = None,
@@ -284,6 +338,7 @@ def solve(
         method: a name in `methods()`.
         intervals: number of control intervals.
         guess: where to start; see `Solver.solve`.
+        nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
         progress: whether to show the iterations on a terminal.
         allow_failure: return the last iterate of a run that did not converge instead of raising.
         parameters: values of parameters other than the declared ones, by name.
@@ -306,5 +361,5 @@ def solve(
                 remedy="add guess='multistart', or remove them",
             )
         )
-    solver = Solver(problem, method, intervals=intervals, **options)
+    solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
     return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

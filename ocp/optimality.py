@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.closed_loop import ClosedLoop
 from covocp.curvature import smallest_curvature
 from covocp.extremal import Extremal
 from covocp.guess import quadrature_weights
@@ -31,7 +32,7 @@ QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4
 
 @dataclass(frozen=True, kw_only=True)
 class Optimality:
-    """How well a solution meets the necessary conditions.
+    """How well a solution meets the necessary conditions; None where one does not apply.
 
     Attributes:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
@@ -48,17 +49,26 @@ class Optimality:
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, relative to its largest; None where it cannot be had.
             Negative: the solution is a saddle.
+        cost_identity: relative difference of both forms of the expected cost, (E-1) from the covariances of the loop
+            and (E-20) from S; None without a closed loop.
+        cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
+            without a closed loop.
+        conservation: largest relative error of the variances E + Xhat that no control changes, such as those of unknown
+            constants; None where there are none.
     """
 
-    stationarity: float
-    control_slope: float
-    costate_difference: float
+    stationarity: float | None
+    control_slope: float | None
+    costate_difference: float | None
     hamiltonian_variation: float | None
     transversality: float | None
     mesh_error: float
-    control_error: float
+    control_error: float | None
     smallest_eigenvalue: float
     curvature: float | None
+    cost_identity: float | None = None
+    cross_covariance: float | None = None
+    conservation: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The values by name."""
@@ -72,7 +82,13 @@ class Optimality:
         )
 
 
-def assess(extremal: Extremal, costates: Costates, mesh_error: float, smallest_eigenvalue: float) -> Optimality:
+def assess(
+    extremal: Extremal,
+    costates: Costates,
+    mesh_error: float,
+    smallest_eigenvalue: float,
+    loop: ClosedLoop | None = None,
+) -> Optimality:
     """Evaluate all necessary conditions along an extremal.
 
     Args:
@@ -80,6 +96,7 @@ def assess(extremal: Extremal, costates: Costates, mesh_error: float, smallest_e
         costates: of its multipliers.
         mesh_error: estimated before.
         smallest_eigenvalue: of its covariances.
+        loop: its closed loop.
 
     Returns:
         The record.
@@ -109,7 +126,42 @@ def assess(extremal: Extremal, costates: Costates, mesh_error: float, smallest_e
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=_curvature(extremal),
+        **_loop_identities(loop),
     )
+
+
+def identities(mesh_error: float, smallest_eigenvalue: float, loop: ClosedLoop | None) -> Optimality:
+    """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
+    return Optimality(
+        stationarity=None,
+        control_slope=None,
+        costate_difference=None,
+        hamiltonian_variation=None,
+        transversality=None,
+        mesh_error=mesh_error,
+        control_error=None,
+        smallest_eigenvalue=smallest_eigenvalue,
+        curvature=None,
+        **_loop_identities(loop),
+    )
+
+
+def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
+    """What must hold along every nominal: it checks the integration, not the optimum [spec of chapter 6, 2.1]."""
+    if loop is None:
+        return {}
+    tiny = np.finfo(float).tiny
+    identity = None
+    if loop.other_cost is not None:
+        identity = abs(loop.expected_cost - loop.other_cost) / max(abs(loop.other_cost), tiny)
+    errors, estimates = (np.sqrt(np.diagonal(v, axis1=1, axis2=2).clip(0.0)) for v in (loop.E, loop.X))
+    size = errors[:, :, None] * estimates[:, None, :]
+    cross = np.abs(loop.Z) / np.where(size > tiny, size, np.inf)
+    return {
+        "cost_identity": identity,
+        "cross_covariance": float(cross.max(initial=0.0)),
+        "conservation": loop.conservation,
+    }
 
 
 def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array, Array]:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 WIDTH = 100
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 LARGEST_MATRIX = 6
+# Multipliers below this share of the cost are not shown.
+NEGLIGIBLE = 1e-9
 
 RESIDUALS = {
     "stationarity": "largest slope of the Lagrangian by a control (relative)",
@@ -30,6 +32,9 @@ RESIDUALS = {
     "mesh_error": "cost: change by halving the integration steps (relative)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
     "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
+    "cost_identity": "expected cost: from the covariances against from S(0) (relative)",
+    "cross_covariance": "correlation of the estimate and its error, zero in theory",
+    "conservation": "variances E + Xhat that no control changes: error (relative)",
     "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
 }
 
@@ -171,7 +176,7 @@ def _matrix(solution: Solution, block: Block) -> str:
     fixed = [
         [f"{block.name}[{labels[min(i, j)]}, {labels[max(i, j)]}]", number(value)]
         for i, j, value in pairs
-        if value != 0
+        if abs(value) > NEGLIGIBLE * abs(solution.cost) and not block.backward  # bounds at the end leave tiny ones
     ]
     return text + ("\n" + render_table(["fixed at T", "multiplier"], fixed) if fixed else "")
 

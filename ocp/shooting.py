@@ -225,8 +225,10 @@ def _of(kicks: Any, statement: Statement, positions: tuple[int, ...]) -> Any:
 def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
     """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
     n, m = mesh.intervals, mesh.substeps
-    first = first if kicks is None else first + kicks[:, 0]
-    arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, None if kicks is None else kicks[:, 1:])
+    later = None
+    if kicks is not None:
+        first, later = first + kicks[:, 0], kicks[:, 1:]
+    arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, later)
     nodes = ca.horzcat(first, passed[:, m - 1 :: m])
     return nodes, nodes[:, :n], arrived
 
@@ -235,14 +237,11 @@ def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, .
     """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
     n, m = mesh.intervals, mesh.substeps
     before, after, start, end, s, ds, duration, parameters = columns
-    turned = tuple(
-        column[:, list(range(n * m - 1, -1, -1))]
-        for column in (after, before, end, start, s + ds, -ds, duration, parameters)
-    )
-    last = last if kicks is None else last + kicks[:, n]
-    kicks = None if kicks is None else kicks[:, list(range(n - 1, -1, -1))]
-    arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
     order = list(range(n * m - 1, -1, -1))
+    turned = tuple(column[:, order] for column in (after, before, end, start, s + ds, -ds, duration, parameters))
+    if kicks is not None:
+        last, kicks = last + kicks[:, n], kicks[:, list(range(n - 1, -1, -1))]
+    arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
     points = ca.horzcat(passed[:, order], last)
     return points[:, ::m], arrived[:, order][:, ::m], points[:, 1:]
 
@@ -257,9 +256,7 @@ def _sequence(
         matrices = [column for k, column in enumerate(columns) if k != 1]
     else:
         step = propagate_step(statement, positions, mesh.linear_solver)
-        matrices = [
-            step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions
-        ]
+        matrices = [step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions]
     if kicks is None:
         values = step.mapaccum("propagate", count)(first, *matrices)
         return values, values

@@ -13,7 +13,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.accuracy import mesh_error
+from covocp.along import filter_gain, rates_along
 from covocp.checks import as_number
+from covocp.closed_loop import ClosedLoop, close_loop
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
 from covocp.hamiltonian import Costates, discrete_costates
@@ -27,7 +29,7 @@ from covocp.matrices import (
     unpack_costate,
 )
 from covocp.mesh import Mesh
-from covocp.optimality import Optimality, assess, path_violations
+from covocp.optimality import Optimality, assess, identities, path_violations
 from covocp.statement import Block, Statement, entry_names
 from covocp.trajectory import Multipliers, Trajectory
 
@@ -68,6 +70,7 @@ class Solution:
         rates: of x and e stacked, at the nodes, (K, nx + ne).
         end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
         filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
+        loop: covariances, gain and expected cost of the closed loop; None where nothing is fed back.
         mesh_error: relative change of the cost by halving the integration steps (estimated to first order).
         violations: of constraints, by name.
         stats: iterations, times, what the method counts.
@@ -97,6 +100,7 @@ class Solution:
     augmented: tuple[str, ...]
     targets: Array
     constraints: Mapping[str, tuple[str, ...]]
+    loop: ClosedLoop | None = field(default=None, repr=False)
     statement: Statement | None = field(default=None, repr=False)
     stored_costates: Costates | None = field(default=None, repr=False)
     stored_optimality: Optimality | None = field(default=None, repr=False)
@@ -106,7 +110,8 @@ class Solution:
         """The solution of an outcome, with the estimate of its mesh error."""
         extremal = outcome.extremal
         st, trajectory = extremal.statement, extremal.trajectory
-        rates, end_rates = _rates(extremal)
+        rates, end_rates = rates_along(extremal)
+        loop = close_loop(extremal) if st.loop is not None and np.isfinite(rates).all() else None
         for array in (trajectory.x, trajectory.u, trajectory.e, rates, end_rates):
             array.setflags(write=False)
         return Solution(
@@ -114,14 +119,14 @@ class Solution:
             method=method,
             converged=outcome.converged,
             message=outcome.message,
-            cost_terms=dict(outcome.cost_terms),
+            cost_terms=_split_cost(outcome.cost_terms, loop),
             mesh=extremal.mesh,
             trajectory=trajectory,
             parameters=extremal.parameters,
             multipliers=extremal.multipliers,
             rates=rates,
             end_rates=end_rates,
-            filter_gain=_filter_gain(extremal),
+            filter_gain=filter_gain(extremal),
             mesh_error=mesh_error(extremal, outcome.cost_terms["running"]),
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),
@@ -129,6 +134,7 @@ class Solution:
             augmented=st.augmented,
             targets=st.boundary_values(extremal.parameters)[1],
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
+            loop=loop,
             statement=st,
         )
 
@@ -136,6 +142,11 @@ class Solution:
     def cost(self) -> float:
         """The cost, sum of its terms."""
         return float(sum(self.cost_terms.values()))
+
+    @property
+    def optimised(self) -> bool:
+        """Whether the nominal was chosen for this cost, not given nor taken from the deterministic one."""
+        return self.method != "evaluate" and self.stats.get("nominal") != "deterministic"
 
     @property
     def status(self) -> str:
@@ -154,8 +165,9 @@ class Solution:
 
     @property
     def gains(self) -> Mapping[str, Array]:
-        """Gains at the nodes: "K", the filter's, (K, n, m) over the augmented state."""
-        return {} if self.filter_gain is None else {"K": self.filter_gain}
+        """Gains at the nodes over the augmented state: "K" of the filter (K, n, m), "C" of the feedback (K, nu, n)."""
+        gains = {} if self.filter_gain is None else {"K": self.filter_gain}
+        return gains if self.loop is None else {**gains, "C": self.loop.gain}
 
     @property
     def symbols(self) -> Mapping[str, Any]:
@@ -196,17 +208,23 @@ class Solution:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
         if self.stored_optimality is not None:
             return self.stored_optimality
-        return assess(self.extremal, self.costates, self.mesh_error, self.smallest_eigenvalue)
+        if not self.optimised:
+            return identities(self.mesh_error, self.smallest_eigenvalue, self.loop)
+        return assess(self.extremal, self.costates, self.mesh_error, self.smallest_eigenvalue, self.loop)
 
     @cached_property
     def smallest_eigenvalue(self) -> float:
         """Smallest eigenvalue of the covariances at all nodes; inf without covariances."""
-        return min((smallest_eigenvalue(self._matrix(b)) for b in self._covariances()), default=np.inf)
+        return min((smallest_eigenvalue(matrix) for matrix in self._all_covariances()), default=np.inf)
 
     @cached_property
     def semidefinite(self) -> bool:
         """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-        return all(is_semidefinite(self._matrix(b)) for b in self._covariances())
+        return all(is_semidefinite(matrix) for matrix in self._all_covariances())
+
+    def _all_covariances(self) -> list[Array]:
+        loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]
+        return [self._matrix(b) for b in self._covariances()] + loop
 
     def _covariances(self) -> list[Block]:
         return [b for b in self.blocks if b.kind == "matrix" and b.covariance]
@@ -364,6 +382,9 @@ class Solution:
     def covariance(self, a: Any, b: Any = None) -> Array:
         """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).
 
+        That of the errors of the estimate where nothing is fed back, E + Xhat (and Z, where the statistics are not
+        those of the design) in a closed loop.
+
         Args:
             a: a state or an unknown, symbol or name.
             b: another one; None: a itself.
@@ -381,7 +402,7 @@ class Solution:
                     remedy="index the matrices of the problem by their names",
                 )
             )
-        full = self._matrix(block)
+        full = self._matrix(block) if self.loop is None else self.loop.X
         rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
         return np.asarray(full[:, rows, columns])
 
@@ -445,41 +466,14 @@ class Solution:
         return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
 
 
+def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str, float]:
+    """Cost by term; of an expected cost the nominal's terms and what the deviations add."""
+    if loop is None:
+        return dict(terms)
+    nominal = {name: loop.cost[name] for name in ("terminal", "running")}
+    return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
+
+
 def _later(module: str) -> Any:
     """A module that is built on solutions; imported when it is used."""
     return importlib.import_module(f"covocp.{module}")
-
-
-def _rates(extremal: Extremal) -> tuple[Array, Array]:
-    """Rates of x and e stacked at the nodes, and at the ends of the intervals with the control of the interval."""
-    function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
-
-    def stacked(columns: tuple[Any, ...]) -> Array:
-        state, matrices, _ = function(*columns)
-        return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
-
-    x, u, *rest = extremal.columns()
-    rates = stacked((x, u, *rest))
-    if extremal.mesh.control == "linear":
-        return rates, rates[1:].copy()
-    before = np.hstack([np.asarray(u)[:, :1], np.asarray(u)[:, :-1]])
-    return rates, stacked((x, before, *rest))[1:]
-
-
-def _filter_gain(extremal: Extremal) -> Array | None:
-    """Kalman gain K = E M' U^-1 at the nodes [Schmidt 2.5-3]."""
-    st = extremal.statement
-    block = next((b for b in st.matrices if b.estimation), None)
-    if block is None or st.measurement is None:
-        return None
-    x, u, _, t, duration, p = extremal.columns()
-    count = extremal.mesh.intervals + 1
-    _, jacobian, density = st.measurement.map(count)(x, u, t, duration, p)
-    size, m = block.size, density.shape[0]
-    M = np.asarray(jacobian.full()).reshape(m, count, size).transpose(1, 0, 2)
-    U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
-    E = unpack(extremal.trajectory.e[:, block.span], size)
-    try:
-        return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
-    except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
-        return None

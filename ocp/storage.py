@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from covocp.problem import Problem
 
 FORMAT = "covocp solution"
-VERSION = 1
+VERSION = 2
 SUFFIXES = (".npz", ".json")
 # Relative difference of the stored rates to those of a problem above which it is another problem; well above what
 # another version or compiler changes, well below what another number in the dynamics does.

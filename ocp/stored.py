@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.closed_loop import ClosedLoop
 from covocp.encoding import DamagedFileError
 from covocp.errors import CovocpError
 from covocp.hamiltonian import Costates
@@ -23,7 +24,9 @@ PARTS: dict[str, Any] = {
     "multipliers": Multipliers,
     "stored_costates": Costates,
     "stored_optimality": Optimality,
+    "loop": ClosedLoop,
 }
+OPTIONAL = ("stored_optimality", "loop")
 ARRAYS = {
     "parameters",
     "rates",
@@ -33,12 +36,13 @@ ARRAYS = {
     *(f"trajectory.{name}" for name in ("x", "u", "e")),
     *(f"stored_costates.{f.name}" for f in fields(Costates)),
     *(f"multipliers.{f.name}" for f in fields(Multipliers)),
+    *(f"loop.{name}" for name in ("E", "Xhat", "Z", "gain")),
 }
 WORDS = {"name", "method", "message", "mesh.control", "mesh.step"}
 NUMBERS = {"mesh_error", "trajectory.duration"}
 WHOLE = {"mesh.substeps"}
 TRUTHS = {"converged", "mesh.eliminated"}
-MAPPINGS = {"cost_terms", "violations"}  # of numbers by name
+MAPPINGS = {"cost_terms", "violations", "loop.cost"}  # of numbers by name
 
 
 def to_tree(solution: Solution) -> dict[str, Any]:
@@ -86,7 +90,7 @@ def _check_types(tree: Mapping[str, Any]) -> None:
     flat = {name: tree[name] for name in tree if name not in PARTS}
     for name, part in PARTS.items():
         content = tree.get(name)
-        if content is None and name == "stored_optimality":
+        if content is None and name in OPTIONAL:
             continue
         if not isinstance(content, Mapping):
             missing += [name] * (name in tree)
@@ -114,7 +118,7 @@ def _of_type(name: str, value: Any) -> bool:
         return _is_number(value)
     if name in MAPPINGS:
         return isinstance(value, Mapping) and all(isinstance(k, str) and _is_number(v) for k, v in value.items())
-    if name.startswith("stored_optimality."):
+    if name.startswith("stored_optimality.") or name in ("loop.other_cost", "loop.conservation"):
         return value is None or _is_number(value)
     if name == "filter_gain":
         return value is None or (isinstance(value, np.ndarray) and value.dtype == np.float64)
@@ -144,7 +148,7 @@ def _is_block(entry: Any) -> bool:
         and entry["kind"] in kinds
         and all(_is_whole(entry[name]) and entry[name] >= 0 for name in ("size", "offset"))
         and isinstance(entry["labels"], tuple)
-        and all(isinstance(entry[name], bool) for name in ("covariance", "estimation"))
+        and all(isinstance(entry[name], bool) for name in ("covariance", "estimation", "backward"))
     )
 
 
@@ -186,6 +190,10 @@ def _check_shapes(solution: Solution) -> None:
     if solution.filter_gain is not None:
         gain = solution.filter_gain
         expected.append(("filter_gain", gain, (count, len(solution.augmented), gain.shape[-1])))
+    if solution.loop is not None:
+        size = len(solution.augmented)
+        expected += [(f"loop.{name}", getattr(solution.loop, name), (count, size, size)) for name in ("E", "Xhat", "Z")]
+        expected.append(("loop.gain", solution.loop.gain, (count, solution.loop.gain.shape[1], size)))
     wrong = [f"{name} {array.shape} instead of {shape}" for name, array, shape in expected if array.shape != shape]
     if wrong:
         raise DamagedFileError("entries of the wrong shape: " + ", ".join(wrong))
