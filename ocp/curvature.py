@@ -60,7 +60,7 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
         return None
     from scipy.linalg import cholesky, solve_triangular  # here: importing scipy takes longer than all of covocp
 
-    root = cholesky(_mass_matrix(mesh, extremal.trajectory.duration, st.nu)[np.ix_(free, free)], lower=True)
+    root = cholesky(mass_matrix(mesh, extremal.trajectory.duration, st.nu)[np.ix_(free, free)], lower=True)
     u = extremal.trajectory.u.ravel()
     rows = np.asarray(jacobian(u, *arguments).full())[:, free]
     if not np.isfinite(rows).all():
@@ -87,7 +87,14 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     )
 
 
-def _mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:
+def held_jacobian(extremal: Extremal) -> Array:
+    """Jacobian by the control values, node by node, of what is held: final values, active inequalities and bounds."""
+    st, mesh = extremal.statement, extremal.mesh
+    _, jacobian = _functions(st, mesh, _Active.of(extremal))
+    return np.asarray(jacobian(extremal.trajectory.u.ravel(), *_arguments(extremal)).full())
+
+
+def mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:
     """The matrix of int du' du dt for the control values, each of `count` entries."""
     h = np.diff(mesh.nodes) * duration
     if mesh.control == "constant":
