@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from covocp.solvers.compare import Comparison as Comparison
     from covocp.solvers.compare import compare as compare
     from covocp.storage import load as load
-    from covocp.worth import Worth as Worth
-    from covocp.worth import worth as worth
+    from covocp.merit import Worth as Worth
+    from covocp.merit import worth as worth
 else:
     # What is done with a solution is imported when it is first asked for: so the import stays as light as CasADi's,
     # and nothing here imports a method.
@@ -41,8 +41,8 @@ else:
         "Comparison": "covocp.solvers.compare",
         "compare": "covocp.solvers.compare",
         "load": "covocp.storage",
-        "Worth": "covocp.worth",
-        "worth": "covocp.worth",
+        "Worth": "covocp.merit",
+        "worth": "covocp.merit",
     }
 
     def __getattr__(name):

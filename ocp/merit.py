@@ -126,9 +126,8 @@ def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
     rows = held_jacobian(extremal)
     scale = np.concatenate([control_scale(st, b, u[:, b.span]) for b in st.controls])
     given = _metric(extremal)
-    metric = given
-    if metric is None:
-        metric = np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), np.diag(scale**-2.0))
+    plain = np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), np.diag(scale**-2.0)))
+    metric = plain if given is None else given
     lower, upper = st.control_bounds
     free = np.ones(u.size, dtype=bool)
     for _ in range(u.size):
@@ -142,10 +141,10 @@ def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
         if not stuck.any():
             break
         free &= ~stuck
-    direction = direction.reshape(mesh.control_nodes, st.nu)
+    step = np.asarray(direction.reshape(mesh.control_nodes, st.nu))
     if given is None:  # no curvature tells how far to go: as far as the control's own scale
-        direction /= max(float(np.abs(direction / scale).max(initial=0.0)), np.finfo(float).tiny)
-    return direction, ell, slopes
+        step /= max(float(np.abs(step / scale).max(initial=0.0)), float(np.finfo(float).tiny))
+    return step, ell, slopes
 
 
 def _metric(extremal: Extremal) -> Array | None:
