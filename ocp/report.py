@@ -22,6 +22,8 @@ WIDTH = 100
 LARGEST_MATRIX = 6
 # Multipliers below this share of the cost are not shown.
 NEGLIGIBLE = 1e-9
+# Relative difference of costs below which two starts count as having found the same optimum.
+SAME_OPTIMUM = 1e-5
 
 RESIDUALS = {
     "stationarity": "largest slope of the Lagrangian by a control (relative)",
@@ -227,9 +229,26 @@ def _effort(solution: Solution) -> str:
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
     if "starts" in stats:
-        effort.append(f"best of {np.size(stats['starts'])} starts")
+        effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
+    if stats.get("classical_cost"):
+        gain = 1.0 - solution.cost / stats["classical_cost"]
+        effort.append(f"the classical design costs {stats['classical_cost']:.8g}: {100 * gain:.3g} % are gained")
     lines = [wrapped("mesh: " + ", ".join(words))]
     return "\n".join(lines + ([wrapped("effort: " + ", ".join(effort))] if effort else []))
+
+
+def _starts(costs: Any) -> str:
+    """What the starts of a multistart found."""
+    found = np.sort(costs[np.isfinite(costs)])
+    text = f"best of {costs.size} starts"
+    if found.size > 1:
+        gaps = np.diff(found) > SAME_OPTIMUM * np.maximum(np.abs(found[1:]), np.abs(found[:-1]))
+        optima = 1 + int(gaps.sum())
+        if optima > 1:
+            text += f", which found {optima} local optima with costs from {found[0]:.6g} to {found[-1]:.6g}"
+    if found.size < costs.size:
+        text += f"; {costs.size - found.size} did not converge"
+    return text
 
 
 def solution_seconds(stats: Mapping[str, Any]) -> float | None:
