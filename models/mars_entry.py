@@ -104,8 +104,8 @@ DATA = {
     ),
 }
 
-# Tables 7-1 and 7-2 against altitude [ft]: density [slug/ft^3] and scale height [ft]. From node to node they agree within
-# 3 %, but for the low atmosphere between 32,810 and 65,620 ft (8 %).
+# Tables 7-1 and 7-2 against altitude [ft]: density [slug/ft^3] and scale height [ft]. From node to node they agree
+# within 3 %, but for the low atmosphere between 32,810 and 65,620 ft (8 %).
 TABLE_ALTITUDE = (0.0, 16405.0, 32810.0, 65620.0, 98430.0, 131240.0, 164050.0, 246075.0, 328100.0, 492150.0)
 TABLE_DENSITY = {
     "high": (2.79e-5, 2.25e-5, 1.79e-5, 1.06e-5, 5.70e-6, 2.77e-6, 1.23e-6, 1.31e-7, 1.38e-8, 1.68e-10),
