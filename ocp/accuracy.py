@@ -24,15 +24,13 @@ def mesh_error(extremal: Extremal, running: float) -> float:
         |change| / |cost|; nan where the run is not finite.
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    starts = list(mesh.starts)
-    outputs = refined_run(st, mesh)(t.x[starts].T, t.e[starts].T, t.u.T, t.duration, extremal.parameters)
-    jumps, refined, last = (np.asarray(value.full()) for value in outputs)
+    jumps, refined, last = refined_run(st, mesh, t, extremal.parameters)
     weights = extremal.multipliers.gaps
-    if weights.shape != jumps.T.shape:  # a method without segments
+    if weights.shape != jumps.shape:  # a method without segments
         costates, _, _ = discrete_costates(extremal)
-        weights = np.hstack([costates.state, costates.matrices])[starts[1:], : jumps.shape[0]]
-    change = float(np.sum(weights * jumps.T)) + float(refined.item()) - running
-    change += _at_the_end(extremal, last.ravel()) - _at_the_end(extremal, t.e[-1])
+        weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
+    change = float(np.sum(weights * jumps)) + refined - running
+    change += _at_the_end(extremal, last) - _at_the_end(extremal, t.e[-1])
     cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
     return abs(change) / max(abs(cost), float(np.finfo(float).tiny)) if change else 0.0
 

@@ -72,7 +72,8 @@ class Model:
 
     def figures(self) -> dict[str, list[tuple[str, Problem]]]:
         """What the figures of the source show: labelled problems by title; empty where the model names none."""
-        if self.script is not None or not hasattr(self.module, "figures"):
+        own = self.make is getattr(self.module, "problem", None)
+        if self.script is not None or not own or not hasattr(self.module, "figures"):
             return {}
         figures: dict[str, list[tuple[str, Problem]]] = self.module.figures()
         return figures
@@ -123,7 +124,8 @@ def find_model(text: str) -> Model:
     """The model of that name, or the function of a script.
 
     Args:
-        text: a name of `models()`, or path/to/script.py:function.
+        text: a name of `models()`, the name of a model and one of its functions (unknown_lag:steering), or
+            path/to/script.py:function.
 
     Raises:
         ProblemError: no such model, script or function, or the script failed.
@@ -135,6 +137,8 @@ def find_model(text: str) -> Model:
     for model in available:
         if model.name == text:
             return model
+        if colon and model.name == path:
+            return _other_function(model, function)
     raise ProblemError(
         describe(
             f"There is no model '{text}'.",
@@ -143,6 +147,28 @@ def find_model(text: str) -> Model:
             remedy="correct the name; `covocp list` shows what the models are",
         )
     )
+
+
+def _other_function(model: Model, name: str) -> Model:
+    """Another function of a model's module that makes a problem."""
+    module = model.module
+    own = [
+        n
+        for n, v in vars(module).items()
+        if inspect.isfunction(v)
+        and v.__module__ == module.__name__
+        and str(inspect.signature(v).return_annotation).endswith("Problem")
+    ]
+    if name not in own:
+        raise ProblemError(
+            describe(
+                f"The model '{model.name}' has no problem '{name}'.",
+                expected="one of " + ", ".join(f"{model.name}:{n}" for n in own),
+                received=f"{model.name}:{name}",
+                remedy="correct the name",
+            )
+        )
+    return Model(name=f"{model.name}_{name}", make=getattr(module, name), module=module)
 
 
 def _from_script(path: Path, name: str) -> Model:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,6 @@ import casadi as ca
 import numpy as np
 
 from covocp.integrators import (
-    KEPT,
     full_interval,
     interval_symbols,
     joint_interval,
@@ -26,6 +24,7 @@ from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.nlp import NLP, Rows, Scales
 from covocp.statement import Conditions, Statement
+from covocp.trajectory import Trajectory
 
 
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
@@ -112,7 +111,7 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables | SimpleNames
     nx = statement.nx
     result = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
     if not statement.matrices:
-        return result | {"e": ca.MX(0, mesh.intervals + 1)}
+        return result | {"e": ca.DM(0, mesh.intervals + 1)}
     if not mesh.eliminated or statement.coupled:
         return result | {"e": nodes[nx:, :]}
     e0 = None if variables.e is None else variables.e[:, 0]
@@ -120,23 +119,35 @@ def _shoot(statement: Statement, mesh: Mesh, variables: _Variables | SimpleNames
     return result | {"e": e, "cost": cost + matrix_cost}
 
 
-@lru_cache(maxsize=KEPT)
-def refined_run(statement: Statement, mesh: Mesh) -> ca.Function:
-    """Run the segments again with half the integration steps.
+def refined_run(
+    statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array
+) -> tuple[Array, float, Array]:
+    """Run the segments of a trajectory again with half the integration steps.
+
+    The intervals are halved, not the substeps doubled: so the functions of the transcription serve again.
 
     Returns:
-        (states at the starts of the segments and at the end (nx, S + 1), half-vectors there (ne, S + 1), controls, T,
-        parameters) -> jumps at the ends of the segments (nx, or nx + ne where the matrices are variables; S), running
-        cost, half-vectors at the end.
+        Jumps at the ends of the segments (segments, nx, or nx + ne where the matrices are variables), running cost,
+        half-vectors at the end (ne,).
     """
-    count = len(mesh.starts)
-    x, e = ca.MX.sym("x", statement.nx, count), ca.MX.sym("e", statement.ne, count)
-    u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
-    duration, parameters = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
-    start = SimpleNamespace(x=x, e=e, u=u, duration=duration, parameters=parameters)
-    nodes = _shoot(statement, replace(mesh, substeps=2 * mesh.substeps), start)
-    jumps = ca.vertcat(nodes["gap_x"], nodes["gap_e"])
-    return ca.Function("refined", [x, e, u, duration, parameters], [jumps, ca.sum2(nodes["cost"]), nodes["e"][:, -1]])
+    starts, u = list(mesh.starts), trajectory.u
+    nodes = np.insert(mesh.nodes, np.arange(1, mesh.intervals + 1), 0.5 * (mesh.nodes[1:] + mesh.nodes[:-1]))
+    halved = replace(mesh, nodes=nodes, segments=tuple(2 * length for length in mesh.segments))
+    if mesh.control == "linear":
+        between = np.insert(u, np.arange(1, mesh.intervals + 1), 0.5 * (u[1:] + u[:-1]), axis=0)
+    else:
+        between = np.repeat(u, 2, axis=0)
+    start = SimpleNamespace(
+        x=ca.DM(trajectory.x[starts].T),
+        e=ca.DM(trajectory.e[starts].T),
+        u=ca.DM(between.T),
+        duration=ca.DM(trajectory.duration),
+        parameters=ca.DM(parameters),
+    )
+    values = _shoot(statement, halved, start)
+    jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
+    running, last = ca.DM(ca.sum2(values["cost"])), ca.DM(values["e"][:, -1])
+    return jumps, float(running), np.asarray(last.full()).ravel()
 
 
 def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
@@ -160,7 +171,7 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, .
 def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
     """Values at all nodes: variables where segments start and at the end, computed ones between."""
     if len(mesh.segments) == mesh.intervals:
-        return start
+        return start  # each node starts a segment
     columns = []
     for j, (i, k) in enumerate(zip(mesh.starts[:-1], mesh.starts[1:], strict=True)):
         columns += [start[:, j], ends[:, i : k - 1]]
