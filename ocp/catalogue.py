@@ -281,6 +281,8 @@ def _fitting(name: str, text: str, parameter: inspect.Parameter) -> Any:
     if isinstance(sample, str) or (sample is None and "str" in annotation):
         return text
     value = parse_value(text)
+    if value is None and "None" in annotation:
+        return None
     kind = "a number"
     if isinstance(sample, bool):
         fits, kind = isinstance(value, bool), "true or false"

@@ -276,3 +276,14 @@ def test_a_reader_that_has_gone_is_no_error():
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "0"
     assert done.stderr == ""
+
+
+def test_other_problems_of_a_model_and_none_as_a_value() -> None:
+    from covocp.catalogue import find_model
+
+    steering = find_model("unknown_lag:steering")
+    assert steering.build(["duration=5"]).expected is not None
+    assert not steering.figures()
+    assert find_model("mars_entry").build(["regularization=none"]).expected is not None
+    with pytest.raises(ProblemError, match="unknown_lag:steering"):
+        find_model("unknown_lag:steer")
