@@ -18,6 +18,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from covocp.checks import check_kind
 from covocp.extremal import Extremal
 from covocp.matrices import Array, unpack
 from covocp.mesh import Mesh
@@ -94,7 +95,9 @@ def certify(solution: Solution) -> Certificate:
 
     Raises:
         CovocpError: where the solution was read from a file without its problem.
+        ProblemError: where it is no solution.
     """
+    check_kind(solution, Solution, "certify(solve(problem))")
     extremal = solution.extremal
     obstacle = why_not(extremal.statement, solution.parameters)
     if obstacle:

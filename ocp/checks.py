@@ -28,6 +28,23 @@ def is_symbolic(value: Any) -> bool:
     return isinstance(value, ca.MX)
 
 
+def check_kind(value: Any, kind: type, remedy: str) -> None:
+    """A value must be of a kind, such as a Problem or a Solution.
+
+    Raises:
+        ProblemError: it is of another.
+    """
+    if not isinstance(value, kind):
+        raise ProblemError(
+            describe(
+                f"This is not a {kind.__name__.lower()}.",
+                expected=f"a {kind.__name__}",
+                received=f"{type(value).__name__}: {str(value)[:60]}",
+                remedy=remedy,
+            )
+        )
+
+
 def as_number(name: str, what: str, value: Any) -> Array:
     """The value as an array of floats, or an error that names the symbol."""
     if isinstance(value, (ca.SX, ca.MX)):
@@ -302,7 +319,7 @@ def check_name(name: Any, declared: list[Any]) -> None:
             )
         )
     for entry in declared:
-        if entry.name == name:
+        if name in (entry.name, *(f"{entry.name}[{i}]" for i in range(getattr(entry, "size", 0)))):
             raise ProblemError(
                 describe(
                     f"The name '{name}' is used twice.",

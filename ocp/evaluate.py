@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.checks import check_kind
 from covocp.closed_loop import Statistics, close_loop, densities
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Outcome
@@ -80,15 +81,7 @@ def _along(
     problem: Problem, nominal: Any, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
 ) -> Solution:
     """The problem along a nominal."""
-    if not isinstance(problem, Problem):
-        raise ProblemError(
-            describe(
-                "This cannot be evaluated.",
-                expected="a Problem, or a Solution with truth=",
-                received=type(problem).__name__,
-                remedy="evaluate(problem, nominal=...)",
-            )
-        )
+    check_kind(problem, Problem, "evaluate(problem, nominal=...), or evaluate(solution, truth=...)")
     st = problem.statement()
     values = stacked_parameters(st, parameters)
     given = Options(intervals=intervals, **_known(options))

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.checks import check_kind
 from covocp.curvature import held_jacobian, mass_matrix
 from covocp.errors import ProblemError, describe
 from covocp.evaluate import evaluate, evaluate_controls
@@ -93,12 +94,13 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
         ProblemError: no expected cost, constrained gains, or no deterministic cost and no `nominal`.
         SolveError: the deterministic problem was not solved.
     """
-    if not isinstance(problem, Problem) or problem.expected is None or problem.expected.gain is not None:
+    check_kind(problem, Problem, "worth(problem), with minimize_expected()")
+    if problem.expected is None or problem.expected.gain is not None:
         raise ProblemError(
             describe(
                 "worth() compares the classical with the combined design.",
                 expected="a problem with minimize_expected() and the best gain",
-                received=_received(problem),
+                received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
                 remedy="compare solutions by their costs instead",
             )
         )
@@ -117,12 +119,6 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
         elif best:
             break
     return Worth(classical=classical, first_order=first, gain=gain, direction=direction, step=best)
-
-
-def _received(problem: Any) -> str:
-    if not isinstance(problem, Problem):
-        return type(problem).__name__
-    return f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()")
 
 
 def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:

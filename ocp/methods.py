@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from covocp.checks import check_kind
 from covocp.densities import impossible_density
 from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe
 from covocp.evaluate import evaluate_controls, evaluation_mesh
@@ -44,6 +45,15 @@ WORSE = 1e-6
 def methods() -> tuple[str, ...]:
     """Names of the methods installed."""
     return tuple(METHODS)
+
+
+def check_problem(problem: Any) -> None:
+    """What is solved or compared must be a problem.
+
+    Raises:
+        ProblemError: it is something else.
+    """
+    check_kind(problem, Problem, "pass the Problem itself (solutions go into guess=)")
 
 
 class Solver:
@@ -81,15 +91,7 @@ class Solver:
                     remedy="correct method=",
                 )
             )
-        if not isinstance(problem, Problem):
-            raise ProblemError(
-                describe(
-                    "This is not a problem.",
-                    expected="a Problem",
-                    received=type(problem).__name__,
-                    remedy="pass the Problem itself (solutions go into guess=)",
-                )
-            )
+        check_problem(problem)
         prepare = importlib.import_module(METHODS[method]).prepare
         known = {field.name for field in fields(Options)}
         own = {name: p for name, p in inspect.signature(prepare).parameters.items() if p.kind is p.KEYWORD_ONLY}

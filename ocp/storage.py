@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.checks import check_kind
 from covocp.encoding import DamagedFileError, decode, encode
 from covocp.errors import ExportError, ProblemError, describe
 from covocp.files import written_whole
@@ -102,7 +103,12 @@ def load(path: str | Path, problem: Problem | None = None) -> Solution:
         solution = from_tree(tree)
     except DamagedFileError as error:
         raise _unreadable(file, str(error), "solve and save again") from error
-    return solution if problem is None else _attached(solution, problem.statement())
+    if problem is None:
+        return solution
+    from covocp.problem import Problem  # here: reading a file needs no builder
+
+    check_kind(problem, Problem, "give the problem that was solved, or load without one")
+    return _attached(solution, problem.statement())
 
 
 def _read(file: Path) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.mesh import Options
-from covocp.methods import METHODS, Solver
+from covocp.methods import METHODS, Solver, check_problem
 from covocp.report import number, render_table, wrapped
 from covocp.solution import Solution
 
@@ -165,6 +165,7 @@ def compare(
     Raises:
         ProblemError: the statement is wrong, a method or an option is unknown, or two runs have the same label.
     """
+    check_problem(problem)
     statement = problem.statement()
     runs = _runs(methods, {"intervals": intervals, "guess": guess, **options}, dict(method_options or {}))
     rows: list[Row] = []

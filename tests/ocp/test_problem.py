@@ -928,3 +928,18 @@ def test_variances_become_the_initial_covariance():
     ocp.minimize(terminal=E[y, y][0, 0])
     half = ocp.statement().boundary_values(np.array([2.0, 1.0, 2.0]))[2]
     np.testing.assert_allclose(half, [1, 0.5, 0, 0, 1, 0, 0, 6, 0, 8])
+
+
+def test_what_is_no_problem_or_solution_is_refused_by_name() -> None:
+    for wrong in (lambda: co.solve(3), lambda: co.compare(3), lambda: co.evaluate(3), lambda: co.worth(3)):
+        with pytest.raises(co.ProblemError, match=r"This is not a problem(.|\n)*received: int: 3"):
+            wrong()
+    with pytest.raises(co.ProblemError, match="This is not a solution"):
+        co.certify(None)
+
+
+def test_a_name_of_an_entry_is_taken() -> None:
+    problem = co.Problem(duration=1.0)
+    problem.state("x", 2, initial=0.0)
+    with pytest.raises(co.ProblemError, match=r"'x\[1\]' is used twice"):
+        problem.state("x[1]", initial=0.0)
