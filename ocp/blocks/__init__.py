@@ -1,0 +1,5 @@
+"""Laws as symbolic functions: each written once, for optimal control problems, simulations, scripts and C code.
+
+Arguments may be numbers, numpy arrays or CasADi expressions; what comes back is numeric when all of them are. Blocks
+know nothing of problems, grids or solvers.
+"""

@@ -1,0 +1,110 @@
+"""What every block does with its arguments: numbers and expressions go in, of the same kind they come back.
+
+A block computes with CasADi matrices (`matrix`), numeric ones (DM) where all its arguments are numbers, and hands its
+results to `restored`, which makes numpy arrays of numeric ones, in the shape of the argument that they replace.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.errors import ProblemError, describe
+
+SYMBOLIC = (ca.SX, ca.MX)
+# Relative asymmetry, and relative size of a negative eigenvalue, that count as roundoff.
+ROUNDOFF = 1e-9
+
+
+def is_symbolic(*values: Any) -> bool:
+    """Whether any of the values is a CasADi expression."""
+    return any(isinstance(value, SYMBOLIC) for value in values)
+
+
+def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, None)) -> Any:
+    """A value as a CasADi matrix: SX or MX as it is, numbers as DM; one-dimensional arrays become columns.
+
+    Args:
+        name: of the argument, for messages.
+        value: number, array or expression.
+        shape: what is expected, None: any number.
+
+    Raises:
+        ProblemError: no numbers, NaN or inf, or another shape.
+    """
+    if isinstance(value, SYMBOLIC):
+        result: Any = value
+    else:
+        try:
+            numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise _wrong(name, "numbers or a CasADi expression", f"{type(value).__name__}: {value!r}"[:100]) from error
+        if numbers.ndim > 2:
+            raise _wrong(name, "a matrix", f"an array of {numbers.ndim} dimensions")
+        if not np.isfinite(numbers).all():
+            raise _wrong(name, "finite numbers", "NaN or inf")
+        result = ca.DM(numbers)
+    if any(wanted is not None and wanted != have for wanted, have in zip(shape, result.shape, strict=True)):
+        wanted = " x ".join("n" if size is None else str(size) for size in shape)
+        raise _wrong(name, f"shape {wanted}", " x ".join(str(size) for size in result.shape))
+    return result
+
+
+def square(name: str, value: Any, size: int | None = None) -> Any:
+    """A square matrix of a size; see `matrix`.
+
+    Raises:
+        ProblemError: it is not square or not of that size.
+    """
+    result = matrix(name, value, (size, size))
+    if result.shape[0] != result.shape[1]:
+        raise _wrong(name, "a square matrix", " x ".join(str(size) for size in result.shape))
+    return result
+
+
+def weight(name: str, value: Any, size: int | None = None, *, definite: bool = False) -> Any:
+    """A symmetric matrix, numeric ones checked to be positive semidefinite (or definite).
+
+    Raises:
+        ProblemError: not symmetric, or with a negative (or zero) eigenvalue.
+    """
+    result = square(name, value, size)
+    if not isinstance(result, ca.DM):
+        return result
+    numbers = result.full()
+    scale = float(np.abs(numbers).max(initial=0.0))
+    if np.abs(numbers - numbers.T).max(initial=0.0) > ROUNDOFF * scale:
+        raise _wrong(name, "a symmetric matrix", f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}")
+    if numbers.size:
+        smallest = float(np.linalg.eigvalsh(numbers)[0])
+        if smallest < -ROUNDOFF * scale or (definite and smallest <= 0.0):
+            kind = "positive definite" if definite else "positive semidefinite"
+            raise _wrong(name, f"a {kind} matrix", f"a smallest eigenvalue of {smallest:.3g}")
+    return result
+
+
+def restored(value: Any, like: Any) -> Any:
+    """A result in the kind and shape of an argument: numpy where it is numeric, flat where that was, else as it is."""
+    if not isinstance(value, ca.DM):
+        return value
+    numbers: NDArray[np.float64] = np.asarray(value.full())
+    dimensions = np.ndim(like) if not isinstance(like, (ca.DM, *SYMBOLIC)) else 2
+    if dimensions == 0 and numbers.size == 1:
+        return float(numbers.item())
+    return numbers.ravel() if dimensions == 1 else numbers
+
+
+def symmetrised(value: Any) -> Any:
+    """The symmetric part."""
+    return 0.5 * (value + value.T)
+
+
+def _wrong(name: str, expected: str, received: str) -> ProblemError:
+    return ProblemError(
+        describe(
+            f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}"
+        )
+    )
