@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from covocp.checks import as_expression, as_number, caller, check_density, density_matrix, find_name
+from covocp.checks import as_expression, as_number, caller, density_matrix, find_name
 from covocp.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, Matrix, State
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
@@ -87,11 +87,13 @@ def derive(problem: Problem) -> Problem:
         A problem on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
 
     Raises:
-        ProblemError: the system is deterministic, a control has no weight, a terminal condition has none.
+        ProblemError: the system is deterministic or has no control, it contains matrices, a control has no weight, a
+            terminal condition has none.
     """
     expected = problem.expected
     assert expected is not None
     _check_random(problem)
+    _check_contents(problem, expected)
     derived = _copied(problem)
     if not any(matrix.estimation for matrix in derived.matrices):
         derived.estimation_covariance()
@@ -121,7 +123,8 @@ def deterministic(problem: Problem) -> Problem:
     """The problem without its noise: what quadratic synthesis takes the nominal from [Schmidt 6.3].
 
     Raises:
-        ProblemError: where the deterministic part of the expected cost depends on nothing that can be chosen.
+        ProblemError: no expected cost, constrained gains, or a deterministic part of the cost that depends on nothing
+            that can be chosen.
     """
     expected = problem.expected
     if expected is None:
@@ -131,6 +134,15 @@ def deterministic(problem: Problem) -> Problem:
                 expected="a problem with minimize_expected()",
                 received=f"'{problem.name}' with minimize()",
                 remedy="leave nominal= out: the cost is deterministic already",
+            )
+        )
+    if expected.gain is not None:
+        raise ProblemError(
+            describe(
+                "nominal='deterministic' needs the best gain.",
+                expected="minimize_expected() without gain=: the gain follows from the nominal",
+                received=str(expected.gain),
+                remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
             )
         )
     plain = _copied(problem)
@@ -179,6 +191,45 @@ def _check_random(problem: Problem) -> None:
                 remedy="use minimize() for a deterministic problem, or say what is uncertain",
             )
         )
+
+
+def _check_contents(problem: Problem, expected: Expected) -> None:
+    """There is a control, the actual system contains no matrices, and the weights no symbols of another problem."""
+    if not problem.controls:
+        raise ProblemError(
+            describe(
+                "An expected cost needs a control: without one nothing is fed back.",
+                expected="control(...), whose deviations the feedback chooses",
+                received="none",
+                remedy="declare one; or state a cost of the covariance, by estimation_covariance() and minimize()",
+            )
+        )
+    own: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
+    known = {symbol.__hash__() for symbol in (problem.time, problem.duration, *(entry.symbol for entry in own))}
+    matrices = {entry.symbol.__hash__(): entry.name for entry in problem.matrices}
+    contents: list[tuple[str, Any]] = [("running cost", expected.running), ("terminal cost", expected.terminal)]
+    for what, given in (("terminal weight", expected.terminal_weight), ("control weight", expected.control_weight)):
+        values = given.values() if isinstance(given, Mapping) else [given]
+        contents += [(what, value) for value in values if isinstance(value, ca.MX)]
+    rates = [(s.name, problem.rates[s.name]) for s in problem.states if s.name in problem.rates]
+    contents += [(f"rate of '{name}'", entry.rate) for name, entry in rates]
+    contents += [(f"noise of '{name}'", entry.noise) for name, entry in rates if entry.noise is not None]
+    contents += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
+    for what, expression in contents:
+        for symbol in ca.symvar(expression):
+            matrix = matrices.get(symbol.__hash__())
+            if matrix is not None or (symbol.__hash__() not in known and what.endswith("weight")):
+                content = f"the matrix '{matrix}'" if matrix else f"'{symbol.name()}', which is not a symbol of it"
+                raise ProblemError(
+                    describe(
+                        f"The {what} of a problem with an expected cost contains {content}.",
+                        expected="states, unknowns, controls, parameters, time: the actual system has no covariance",
+                        received=str(expression)[:200],
+                        remedy="state a cost or a condition of covariances by minimize() or subject_to()"
+                        if matrix
+                        else f"declare '{symbol.name()}' in this problem",
+                    )
+                )
 
 
 def _check_free_names(problem: Problem) -> None:
@@ -290,8 +341,15 @@ def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> An
                     remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
                 )
             )
-    if numbers is not None:
-        check_density(", ".join(names), "control weight", numbers, definite=True)
+    if numbers is not None and np.linalg.eigvalsh(numbers)[0] <= 0:
+        raise ProblemError(
+            describe(
+                f"The weight of the controls {', '.join(names)} is not positive definite.",
+                expected="a minimum of the running cost by the controls, or control_weight= in its place",
+                received=f"second derivatives {numbers.tolist()}",
+                remedy="give control_weight={...} to minimize_expected(), or correct the running cost",
+            )
+        )
     return ca.sparsify(ca.evalf(weights)) if constant else weights
 
 
