@@ -48,6 +48,9 @@ from covocp.mesh import Mesh
 from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Statement
 
+# Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.
+LARGEST_FLAT = 10_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class Terminal:
@@ -151,7 +154,9 @@ def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
     n, count = mesh.intervals, len(terminal.names)
     make = hamiltonian(statement)
     curvature = make("curvature", lambda h, x, u, e, t: [ca.hessian(h, u)[0] if statement.nu else ca.DM(0, 0)])
-    given = forward_costates(statement, pairs).mapaccum("given", n) if statement.behind else None
+    given = _flat(statement, pairs, forward_costates(statement, pairs)) if statement.behind else None
+    backward = _flat(statement, pairs, backward_interval(statement, pairs, count, matrices=terminal.matrices))
+    quadrature = _flat(statement, pairs, quadrature_interval(statement, pairs, count, matrices=terminal.matrices))
     return Sweeps(
         statement=statement,
         mesh=mesh,
@@ -159,11 +164,18 @@ def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
         terminal=terminal,
         forward=_passage(statement, mesh),
         refine=_fine_interval(statement, mesh, 2 * pairs).map(n),
-        given=given,
-        backward=backward_interval(statement, pairs, count, matrices=terminal.matrices).mapaccum("backward", n),
-        quadrature=quadrature_interval(statement, pairs, count, matrices=terminal.matrices).map(n),
+        given=None if given is None else given.mapaccum("given", n),
+        backward=backward.mapaccum("backward", n),
+        quadrature=quadrature.map(n),
         curvature=curvature.map(n + 1),
     )
+
+
+def _flat(statement: Statement, pairs: int, function: ca.Function) -> ca.Function:
+    """A function of an interval in scalar operations, where they are not too many: what is not used is not computed."""
+    if statement.symbolic is not ca.SX or pairs * statement.rates.n_instructions() > LARGEST_FLAT:
+        return function
+    return function.expand()
 
 
 def _passage(statement: Statement, mesh: Mesh) -> ca.Function:

@@ -75,7 +75,7 @@ class Measures:
     """What the stop test reads; none of it depends on the weighting of the step.
 
     ell: least-squares multipliers; residual: slopes of the Lagrangian with them, (n,); active: entries at a bound that
-    the residual pushes outward; slope, miss: relative; transversality: dJ/dT of the Lagrangian.
+    the residual pushes outward; slope, miss: relative; transversality: dJ/dT of the Lagrangian; through: of `Slopes`.
     """
 
     ell: Array
@@ -84,6 +84,7 @@ class Measures:
     slope: float
     miss: float
     transversality: float
+    through: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +222,7 @@ class Space:
             slope=max(slope, float(extra)),
             miss=float((np.abs(iterate.run.miss) / self.miss_scale).max(initial=0.0)),
             transversality=float(residual[count]) if self.sweeps.statement.duration.free else 0.0,
+            through=linear.slopes.through,
         )
 
     def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Any) -> Any:
@@ -310,8 +312,8 @@ class Space:
         st, mesh = self.sweeps.statement, self.sweeps.mesh
         zero = Multipliers.zero(st, mesh)
         terminal = self.sweeps.terminal
-        final = np.zeros(st.nx + st.ne)
-        final[list(terminal.fixed)] = measures.ell[: len(terminal.fixed)]
+        final = measures.through.copy()
+        final[list(terminal.fixed)] += measures.ell[: len(terminal.fixed)]
         end, bounds = zero.end.copy(), np.zeros((mesh.intervals + 1, st.nx + st.ne))
         end[list(terminal.rows)] = measures.ell[len(terminal.fixed) :]
         path, start = zero.path, zero.start
@@ -386,6 +388,7 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
     """
     st, mesh = sweeps.statement, sweeps.mesh
     x0, _, e0, _ = st.boundary_values(parameters)
+    e0[st.entries(st.behind)] = 0.0  # what runs backward has no initial value of its own
     known = np.concatenate([x0, e0])
     free = np.flatnonzero(np.isnan(known))
     guessed = np.concatenate([guess.trajectory.x[0], guess.trajectory.e[0]])
@@ -409,7 +412,7 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
     areas = np.repeat(quadrature_weights(mesh) * scales.duration, st.nu)
     metric = np.concatenate([areas, np.full(timed + free.size, scales.duration)]) / unit**2
     size = max(abs(run.running) + abs(run.terminal), np.finfo(float).tiny) if run.finite else 1.0
-    _, _, by_z, _ = sweeps.terminal.function(finite[-1], duration, parameters)
+    _, _, by_z, *_ = sweeps.terminal.function(finite[-1], duration, parameters, 0.0)
     reach = np.abs(np.asarray(by_z.full()))[:, 1:].T @ z_scale
     count = mesh.control_nodes * st.nu
     return Space(

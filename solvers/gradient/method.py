@@ -17,6 +17,8 @@ Beyond the source:
 - Bounds on the controls and on T: projection of the step in the metric W. Inequalities: penalties (`penalty`).
 - Terminal conditions on matrices and equalities between final values have influence functions like those on x.
 - Free initial values: p(0) and P(0) are the slopes by them.
+- Expected costs (appendix E, with free T and inequalities as above): S is integrated backward after x and E, and its
+  costate -Xhat/2 forward before p and P; see `covocp.influence`. The weight of the terminal conditions is part of S(T).
 
 The stop test does not depend on W; see `prepare`.
 """
