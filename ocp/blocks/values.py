@@ -86,6 +86,17 @@ def weight(name: str, value: Any, size: int | None = None, *, definite: bool = F
     return result
 
 
+def numeric(name: str, value: Any) -> NDArray[np.float64]:
+    """A matrix as an array of two dimensions, for what has no symbolic form.
+
+    Raises:
+        ProblemError: it is an expression.
+    """
+    if is_symbolic(value):
+        raise _wrong(name, "numbers: this is solved by iteration", f"an expression, {str(value)[:60]}")
+    return np.asarray(value.full())
+
+
 def restored(value: Any, like: Any) -> Any:
     """A result in the kind and shape of an argument: numpy where it is numeric, flat where that was, else as it is."""
     if not isinstance(value, ca.DM):
