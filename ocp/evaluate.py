@@ -28,10 +28,12 @@ from covocp.statement import Statement
 from covocp.trajectory import Multipliers, Trajectory
 
 METHOD = "evaluate"
-# Relative miss of a prescribed final value that is reported.
+# Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions absolute.
 MISS = 1e-6
-# Relative difference of rates above which the truth is another system.
-SAME_RATES = 1e-9
+# By how much Ipopt may pass a bound of a variable of the order of 1: a nominal of its is no miss.
+RELAXED = 1e-8
+# Relative difference of rates or slopes above which the truth is another system.
+SAME = 1e-9
 
 
 def evaluate(
@@ -91,8 +93,21 @@ def _along(
     mesh = evaluation_mesh(st, given, values)
     u, duration = _controls(st, mesh, nominal)
     x0, e0 = starts(st, mesh, values)
+    if isinstance(nominal, Solution):
+        x0 = _started_like(st, nominal, x0, values)
     check_model(st, x0, u[:1].ravel(), e0, duration, values)
     return Solution.of(evaluate_controls(st, mesh, u, duration, values, x0), METHOD)
+
+
+def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters: Array) -> Array:
+    """The initial state, with what is free there as in a solution that has it: constant gains are such states."""
+    result, known = x0.copy(), statement.boundary_values(parameters)[0]
+    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
+    for block in statement.states:
+        if block.name in own and own[block.name].size == block.size:
+            first = nominal.trajectory.x[0, own[block.name].span]
+            result[block.span] = np.where(np.isnan(known[block.span]), first, x0[block.span])
+    return result
 
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
@@ -165,7 +180,7 @@ def evaluate_controls(
 
 
 def _missed(extremal: Extremal) -> dict[str, float]:
-    """Prescribed final values and terminal and path inequalities that the nominal does not meet, by name."""
+    """Prescribed final values, bounds, terminal and path inequalities that the nominal does not meet, by name."""
     st, t = extremal.statement, extremal.trajectory
     result = {}
     target = st.boundary_values(extremal.parameters)[1]
@@ -173,6 +188,13 @@ def _missed(extremal: Extremal) -> dict[str, float]:
     for name, value, goal, size in zip(st.state_names, t.x[-1], target, scale, strict=True):
         if abs(value - goal) > MISS * size:  # NaN where it is free
             result[f"final value of {name}"] = float(abs(value - goal))
+    for names, rows, (lower, upper) in (
+        (st.state_names, t.x, st.state_bounds),
+        (st.control_names, t.u, st.control_bounds),
+    ):
+        excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=0.0)
+        allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED
+        result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
     columns = [np.asarray(c) for c in extremal.columns()]
     for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(-1, None))):
         if not conditions.size:
@@ -257,7 +279,8 @@ def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
     """Initial covariance and noise densities of a truth.
 
     Raises:
-        ProblemError: where it is neither a problem nor a dict, or has other symbols or rates.
+        ProblemError: where it is neither a problem nor a dict, or has other symbols, initial means, rates, measurements
+            or another duration.
     """
     st = extremal.statement
     if isinstance(truth, Mapping):
@@ -275,7 +298,7 @@ def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
                 remedy="correct truth=",
             )
         )
-    _check_rates(extremal, other, values)
+    _check_system(extremal, other, values)
     block = next((b for b in other.matrices if b.estimation), None)
     if block is None or other.loop is None:
         raise ProblemError(
@@ -314,24 +337,42 @@ def _check_same(design: Statement, truth: Statement) -> None:
         )
 
 
-def _check_rates(design: Extremal, truth: Statement, parameters: Array) -> None:
-    """The linear covariance equations know one system: only its statistics may differ."""
+def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None:
+    """The linear covariance equations know one nominal and one system along it: only its statistics may differ."""
     st = design.statement
-    x, u, _, t, duration, own = design.columns()
+    x, u, _, t, duration, own = (np.asarray(column) for column in design.columns())
     count = design.mesh.intervals + 1
     others = np.tile(parameters[:, None], (1, count))
-    if st.nominal is None or truth.nominal is None:
-        return
-    one = np.asarray(st.nominal.map(count)(x, u, t, duration, own)[0].full())
-    two = np.asarray(truth.nominal.map(count)(x, u, t, duration, others)[0].full())
-    off = np.abs(one - two).max(axis=1) > SAME_RATES * np.maximum(np.abs(one).max(axis=1), np.finfo(float).tiny)
-    if off.any():
-        name = st.state_names[int(np.flatnonzero(off)[0])]
-        raise ProblemError(
-            describe(
-                f"The truth moves differently: the rate of '{name}' along the nominal is another one.",
-                expected="the dynamics of the design, with other variances and noise densities",
-                received=f"'{truth.name}' with other rates",
-                remedy="use simulate(solution, truth=...), which takes any dynamics",
+    start, known = truth.boundary_values(parameters)[0], truth.duration
+    first, lasts = x[:, :1], design.trajectory.duration if known.free else known.guess
+    measured = (", ".join(st.measurement_names),)
+    first_loop, other_loop = (None if s.loop is None else s.loop.expansion for s in (st, truth))
+    compared: list[tuple[str, tuple[str, ...], Any, Any]] = [
+        ("starts elsewhere: the initial mean", st.state_names, first, np.where(np.isnan(start), x[:, 0], start)),
+        ("takes another time: the value", ("duration",), duration[:, :1], np.array([lasts])),
+    ]
+    functions: tuple[tuple[str, tuple[str, ...], int, Any, Any], ...] = (
+        ("moves differently: the rate", st.state_names, 0, st.nominal, truth.nominal),
+        ("moves differently: the slope", st.augmented, 0, first_loop, other_loop),
+        ("is controlled differently: the slope", st.augmented, 1, first_loop, other_loop),
+        ("is measured differently: the slope", measured, 1, st.measurement, truth.measurement),
+    )
+    for what, names, output, one, two in functions:
+        if one is not None and two is not None:
+            values = [f.map(count)(x, u, t, duration, p)[output].full() for f, p in ((one, own), (two, others))]
+            compared.append((what, names, *values))
+    for what, names, one, two in compared:
+        two = two.reshape(two.shape[0], -1)
+        off = np.array([True])
+        if one.shape == two.shape:
+            off = np.abs(one - two).max(axis=1) > SAME * np.maximum(np.abs(one).max(axis=1), np.finfo(float).tiny)
+        if off.any():
+            name = names[min(int(np.flatnonzero(off)[0]), len(names) - 1)]
+            raise ProblemError(
+                describe(
+                    f"The truth {what} of '{name}' along the nominal is another one.",
+                    expected="the system of the design, with other variances and noise densities",
+                    received=f"'{truth.name}', which differs in more",
+                    remedy="use simulate(solution, truth=...), which takes any dynamics",
+                )
             )
-        )
