@@ -209,32 +209,38 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     st, mesh = extremal.statement, extremal.mesh
     n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
     X = joint[:, :size, :size] + joint[:, size:, size:] - joint[:, :size, size:] - joint[:, size:, :size]
-    units = np.sqrt(np.diagonal(X, axis1=1, axis2=2).max(axis=0).clip(np.finfo(float).tiny))
-    z = np.concatenate([fine[:, :-1].reshape(n * m, -1), fine[-1:, -1]])
-    u, h = extremal.controls, np.diff(extremal.time)
-    at = np.interp(np.arange(n * m + 1) / m, np.arange(n + 1), extremal.time)
-    controls = (
-        np.column_stack([np.interp(at, extremal.time, column) for column in u.T]) if st.nu else np.zeros((at.size, 0))
-    )
-    rest = (at[None, :], np.full((1, at.size), extremal.trajectory.duration))
-    own, true = (np.tile(p[:, None], (1, at.size)) for p in (extremal.parameters, statistics.parameters))
-    arguments = (z[:, : st.nx].T, controls.T, *rest)
-    F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(at.size)(*arguments, own)[:2])
-    F = F.reshape(size, at.size, size) * units / units[:, None, None]
-    slopes = np.hstack([F.reshape(size, -1), G / units[:, None]])
+    units = np.sqrt(np.diagonal(X, axis1=1, axis2=2).max(axis=0).clip(0.0))
+    uncertain = np.flatnonzero(units)  # what is known exactly never deviates
+    units, X = units[uncertain], X[:, uncertain[:, None], uncertain]
+    count = n * (m + 1)
+    arguments = [column.reshape(count, -1).T for column in _points(extremal, fine)]
+    own, true = (np.tile(p[:, None], (1, count)) for p in (extremal.parameters, statistics.parameters))
+    F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
+    F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
+    slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
     vectors, values, _ = np.linalg.svd(slopes, full_matrices=True)
-    values = np.append(values, np.zeros(size - values.size))
+    values = np.append(values, np.zeros(units.size - values.size))
     kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
     if not kept.shape[1]:
         return None
-    noise = np.asarray(statistics.density.map(at.size)(*arguments, true)[0].full()).reshape(size, at.size, size)
-    growth = np.einsum("iw,ikj,jw->kw", kept, noise, kept)
+    noise = np.asarray(statistics.density.map(count)(*arguments, true)[0].full()).reshape(size, count, size)
+    growth = np.einsum("iw,ikj,jw->kw", kept, noise[uncertain][:, :, uncertain], kept).reshape(n, m + 1, -1)
     weights = np.array([1.0 if j in (0, m) else 4.0 if j % 2 else 2.0 for j in range(m + 1)]) / (3 * m)
-    index = m * np.arange(n)[:, None] + np.arange(m + 1)
-    grown = np.cumsum(np.einsum("k,j,kjw->kw", h, weights, growth[index]), axis=0)
+    grown = np.cumsum(np.einsum("k,j,kjw->kw", np.diff(extremal.time), weights, growth), axis=0)
     variance = np.einsum("iw,kij,jw->kw", kept, X[::m], kept)
     error = np.abs(variance[1:] - variance[0] - grown)
     return float((error / np.maximum(variance[1:], np.finfo(float).tiny)).max())
+
+
+def _points(extremal: Extremal, fine: Array) -> tuple[Array, Array, Array, Array]:
+    """x, u, t, T at the ends of all substeps, with the control of their interval; (N, substeps + 1, entries)."""
+    n, points, _ = fine.shape
+    u, nodes = extremal.controls, extremal.time
+    after = u[:-1] if extremal.mesh.control == "constant" else u[1:]
+    c = np.linspace(0.0, 1.0, points)[:, None]
+    time = nodes[:-1, None, None] + c * np.diff(nodes)[:, None, None]
+    controls = u[:-1, None, :] + c * (after - u[:-1])[:, None, :]
+    return fine[:, :, : extremal.statement.nx], controls, time, np.full(time.shape, extremal.trajectory.duration)
 
 
 def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple[dict[str, float], float | None]:
@@ -243,25 +249,14 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
     best = bool(st.behind) and design
     function = _running(st)
-    u = extremal.controls
-    after = u[:-1] if mesh.control == "constant" else u[1:]
-    h = np.diff(extremal.time)
+    h, x, u, time, duration = np.diff(extremal.time), *_points(extremal, fine)
+    p = np.tile(extremal.parameters[:, None], (1, n))
     running = deviations = other = 0.0
     for j in range(m + 1):
-        c = j / m
         weight = (1 if j in (0, m) else 4 if j % 2 else 2) / (3 * m) * h
-        z = fine[:, j]
-        covariance = joint[j::m][:n]
-        arguments = (
-            z[:, : st.nx].T,
-            (u[:-1] + c * (after - u[:-1])).T,
-            z[:, st.nx :].T,
-            (extremal.time[:-1] + c * h)[None, :],
-            np.full((1, n), t.duration),
-            np.tile(extremal.parameters[:, None], (1, n)),
-        )
-        values = function.map(n)(*arguments, covariance.transpose(1, 0, 2).reshape(2 * size, -1))
-        L, fed, alternative = (np.asarray(v.full()).ravel() for v in values)
+        covariance = joint[j::m][:n].transpose(1, 0, 2).reshape(2 * size, -1)
+        at = (x[:, j].T, u[:, j].T, fine[:, j, st.nx :].T, time[:, j].T, duration[:, j].T, p)
+        L, fed, alternative = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))
         running += float(weight @ L)
         deviations += float(weight @ fed)
         other += float(weight @ alternative)
