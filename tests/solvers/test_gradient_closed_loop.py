@@ -30,6 +30,7 @@ from covocp.starting import make_guess
 DURATION, START, INTERVALS, LIMIT = 1.6, (0.8, -0.3), 6, 0.1
 VARIANCE = np.diag([0.2, 0.1])
 CONTROL = np.array([0.1, -0.1, 0.45, 0.1, -0.4, 0.25, 0.9])
+POINT = np.array([*CONTROL, DURATION, START[1]])
 
 
 def spring(duration: Any) -> co.Problem:
@@ -105,29 +106,23 @@ def linearised(substeps: int) -> Linearised:
     return Linearised(space=space, iterate=iterate, linear=space.linearise(iterate))
 
 
-@cache
-def differences() -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of (6.3-14) and of E_11(T) by control values, T and x_2(0): differences of the reference."""
-    point, step = np.array([*CONTROL, DURATION, START[1]]), 1e-3
-    slopes = []
-    for direction in step * np.eye(point.size):
-        ahead, behind = spring_loop(point + direction), spring_loop(point - direction)
-        slopes.append([(ahead.cost - behind.cost) / (2 * step), (ahead.E[-1] - behind.E[-1])[0, 0] / (2 * step)])
-    return np.array(slopes).T
+def test_slopes_by_controls_duration_and_start() -> None:
+    # Against differences of (6.3-14) and of E_11(T): of second order, with third derivatives of order one.
+    along = np.zeros((5, POINT.size))
+    along[:3, :-2] = np.random.default_rng(6).choice([-1.0, 0.0, 1.0], (3, CONTROL.size))
+    along[3, -2] = along[4, -1] = 1.0
+    linear, step = linearised(8).linear, 1e-3
+    for direction in along:
+        ahead, behind = spring_loop(POINT + step * direction), spring_loop(POINT - step * direction)
+        assert linear.slope @ direction == pytest.approx((ahead.cost - behind.cost) / (2 * step), abs=5e-7)
+        change = (ahead.E[-1] - behind.E[-1])[0, 0] / (2 * step)
+        assert linear.rows[0] @ direction == pytest.approx(change, abs=5e-7)
 
 
 def test_cost_is_the_printed_one() -> None:
-    loop = spring_loop(np.array([*CONTROL, DURATION, START[1]]))
+    loop = spring_loop(POINT)
     assert linearised(8).iterate.run.cost == pytest.approx(loop.cost, abs=1e-7)
     assert linearised(8).iterate.run.miss[0] == pytest.approx(loop.E[-1, 0, 0] - LIMIT, abs=1e-8)
-
-
-def test_slopes_by_controls_duration_and_start() -> None:
-    # the differences are of second order, with third derivatives of order one: an error near 1e-6/6
-    by_cost, by_condition = differences()
-    linear = linearised(8).linear
-    np.testing.assert_allclose(linear.slope, by_cost, atol=5e-7)
-    np.testing.assert_allclose(linear.rows[0], by_condition, atol=5e-7)
 
 
 def test_slopes_are_of_fourth_order() -> None:
@@ -137,20 +132,28 @@ def test_slopes_are_of_fourth_order() -> None:
     assert linregress(np.log(1 / sizes), np.log(errors)).slope > 3.6
 
 
+def test_trajectory_between_the_nodes() -> None:
+    # Starts, middles and ends of the pairs: x and E come from the left, S from the right.
+    inside = linearised(8).linear.slopes.middles[0]
+    count = inside.shape[1] - 1
+    loop = spring_loop(POINT, times=np.linspace(0, DURATION, INTERVALS * count + 1))
+    expected = np.hstack([loop.x, pack(loop.E), pack(loop.S)])
+    for j in range(INTERVALS):
+        np.testing.assert_allclose(inside[j], expected[j * count : (j + 1) * count + 1], atol=3e-7)
+
+
 def test_costates_of_the_matrices() -> None:
     # That of S is -Xhat/2, at every node; that of E at t = 0 is the slope of the cost by E(0).
-    point = np.array([*CONTROL, DURATION, START[1]])
     at = linearised(8)
     statement = at.space.sweeps.statement
     columns = at.linear.slopes.columns[:, :, 0]
-    loop = spring_loop(point, times=np.linspace(0, DURATION, INTERVALS + 1))
+    loop = spring_loop(POINT, times=np.linspace(0, DURATION, INTERVALS + 1))
     behind = [statement.nx + k for k in statement.entries(statement.behind)]
     np.testing.assert_allclose(columns[:, behind], -pack_costate(loop.Xhat) / 2, atol=1e-7)
-    np.testing.assert_allclose(at.iterate.run.z[:, behind], pack(loop.S), atol=1e-6)
     slopes = []
     for direction in ([[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]):
         change = 1e-3 * np.array(direction)
-        costs = [spring_loop(point, VARIANCE + sign * change).cost for sign in (1, -1)]
+        costs = [spring_loop(POINT, VARIANCE + sign * change).cost for sign in (1, -1)]
         slopes.append((costs[0] - costs[1]) / 2e-3)
     ahead = [statement.nx + k for k in statement.entries(statement.ahead)]
     np.testing.assert_allclose(columns[0, ahead], slopes, atol=5e-7)
