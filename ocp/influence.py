@@ -63,7 +63,7 @@ class Terminal:
         matrices: whether the matrices have an influence on them.
         function: (z, T, p, Y) -> terminal cost k, the values of the conditions, the slopes of both by z (size,
             1 + q) and by T (1, 1 + q), S(T) = s(x(T), T) inserted and the slopes of k with -Y' s; the part of the
-            slope of k by x(T) that comes through S(T), and Y - k_S.
+            slope by x(T) that comes through S(T) (size, 1).
     """
 
     fixed: tuple[int, ...]
@@ -129,7 +129,7 @@ class Slopes:
     control: slopes by the control values, (1 + q, K, nu); cost: the part of the running cost alone, (K, nu).
     duration: by T, (1 + q,). start: by z(0), (1 + q, size), the columns p, P, R at t = 0.
     columns: costates and influence functions at the nodes, (N + 1, size, 1 + q).
-    through: the part of p(T) that comes through S(T), and Y(T) - k_S at the entries of S, (size,).
+    through: the part of p(T) that comes through S(T), (size,).
     middles: values of z in the intervals, and columns at the ends of the pairs: what `reweigh` needs.
     """
 
@@ -249,9 +249,7 @@ def terminal_conditions(statement: Statement) -> Terminal:
     adjoint = cost
     if statement.matrix_end is not None:
         ends, own = statement.matrix_end(x, duration, p), [statement.nx + k for k in behind]
-        weights = ca.gradient(cost, z)[own] - y
-        through = ca.jtimes(ends, z, weights, True)
-        through[own] = -weights
+        through = ca.jtimes(ends, z, ca.gradient(cost, z)[own] - y, True)
         e = ca.MX(e)
         e[behind] = ends
         adjoint = statement.terminal(x, e, duration, p) - ca.dot(y, ends)
