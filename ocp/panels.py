@@ -4,98 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.errors import ProblemError
+from covocp.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
+from covocp.errors import ProblemError, describe
 from covocp.lookup import name_of
+from covocp.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.matrices import Array, half_indices
-from covocp.solution import Sample, Solution
+from covocp.solution import Solution
 from covocp.statement import Block, Statement, entry_names
 
-# Curves are sampled at the nodes, on coarser meshes at least this often.
-SAMPLES = 200
-# Vectors up to this size get a panel an entry, larger ones share one; matrices up to this size are shown whole, larger
-# ones by their diagonal.
-SEPARATE_ENTRIES = 3
+# Matrices up to this size are shown whole, larger ones by their diagonal.
 WHOLE_MATRIX = 2
-LONGEST_LABEL = 40
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curve:
-    """One curve.
+class Quantity:
+    """What a panel shows that is no symbol: a word of `loop_panels`, and of which symbol or expression."""
 
-    Args:
-        t: times [s].
-        y: values, the shape of t.
-        deviation: standard deviation, the shape of t; None: no band.
-        order: number of its solution.
-        entry: number of its entry in a panel of several.
-        steps: whether the value holds until the next time.
-        target: value asked for at the end.
-    """
-
-    t: Array
-    y: Array
-    deviation: Array | None = None
-    order: int = 0
-    entry: int = 0
-    steps: bool = False
-    target: float | None = None
+    word: str
+    of: Any = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Panel:
-    """One pair of axes: its label, the names of its entries (one: all curves are of the same), curves and bounds."""
+class Labelled:
+    """A key with a label of its own."""
 
     label: str
-    entries: tuple[str, ...]
-    curves: tuple[Curve, ...]
-    bounds: tuple[float, ...] = ()
-
-
-class Drawn:
-    """A solution sampled for drawing."""
-
-    def __init__(self, solution: Solution, order: int) -> None:
-        """Choose the times."""
-        self.solution, self.order = solution, order
-        self.names = {b.name for b in solution.blocks}
-        self.estimated = any(b.estimation for b in solution.blocks)
-        nodes, parts = solution.t, -(-SAMPLES // solution.mesh.intervals)
-        if solution.mesh.control == "constant":  # rates jump at the nodes, which a smooth curve would follow
-            parts = 1
-        inner = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
-        self.t = np.append(inner.ravel(), nodes[-1])
-
-    @cached_property
-    def sample(self) -> Sample:
-        """Values between the nodes."""
-        return self.solution.at(self.t)
-
-    def deviation(self, name: str) -> Array | None:
-        """Standard deviation of a state or an unknown at the times, (K, size); None where nothing is estimated."""
-        if not self.estimated:
-            return None
-        order = [b for kind in ("state", "unknown") for b in self.solution.blocks if b.kind == kind]
-        owners = [b.name for b in order for _ in range(b.size)]
-        rows = [i for i, owner in enumerate(owners) if owner == name]
-        covariance = self.sample[next(b.name for b in self.solution.blocks if b.estimation)]
-        return np.sqrt(np.maximum(covariance[:, rows, rows], 0.0))
-
-    def target(self, block: Block) -> Array:
-        """What a state should be at the end, NaN where it is free."""
-        if block.kind != "state":
-            return np.full(block.size, np.nan)
-        return self.solution.targets[block.span]
+    key: Any
 
 
 def choose_panels(
-    solutions: list[Solution], names: tuple[Any, ...], *, costates: bool, units: Mapping[str, str]
+    solutions: list[Solution],
+    names: tuple[Any, ...],
+    *,
+    costates: bool,
+    gains: bool = False,
+    over: Any = None,
+    units: Mapping[str, str],
 ) -> list[Panel]:
     """The panels of a figure; see `covocp.plot.plot_solutions`.
 
@@ -107,39 +56,102 @@ def choose_panels(
     for solution in solutions:
         for block in solution.blocks:
             blocks.setdefault(block.name, block)
-    keys = [_resolved(solutions, key) for key in names]
-    if not names:
-        kinds = ("state", "control", "unknown", "matrix")
-        keys = [b.name for kind in kinds for b in blocks.values() if b.kind == kind]
+    keys = [key for name in names for key in _keys(solutions, name)] or _usual(drawn, blocks)
+    if gains:
+        keys += [Quantity(word=w) for w in (GAIN, FILTER) if any(knows(solution, w) for solution in solutions)]
     panels: list[Panel] = []
     for key in keys:
         panels += _of_key(drawn, key, blocks, units)
     for key in keys if costates else ():
         if isinstance(key, str) and blocks[key].kind in ("state", "matrix"):
             panels += _costates(drawn, blocks[key])
-    return panels
+    panels = _explained_once(panels)
+    return panels if over is None else _over(drawn, panels, _resolved(solutions, over))
+
+
+def _explained_once(panels: list[Panel]) -> list[Panel]:
+    """Where several panels have the same entries the first one explains them."""
+    return [replace(p, legend=all(p.entries != other.entries for other in panels[:i])) for i, p in enumerate(panels)]
+
+
+def _usual(drawn: list[Drawn], blocks: Mapping[str, Block]) -> list[Any]:
+    """What is drawn where nothing is asked for.
+
+    Of closed loops root mean squares stand in place of the covariances that they come from.
+    """
+    kinds = ("state", "control", "unknown", "matrix")
+    ordered = [b for kind in kinds for b in blocks.values() if b.kind == kind]
+    if all(d.solution.loop is None for d in drawn):
+        return [b.name for b in ordered]
+    plain = [b for b in ordered if b.name not in (GAIN, *COVARIANCES) and not (b.estimation or b.backward)]
+    uncertain = [b.name for b in plain if b.kind == "state" and any(_varies(d, b) for d in drawn)]
+    return [*(b.name for b in plain), *(Quantity(word=RMS, of=name) for name in uncertain)]
+
+
+def _varies(drawn: Drawn, block: Block) -> bool:
+    """Whether a state is uncertain."""
+    deviation = drawn.deviation(block) if block.name in drawn.names else None
+    return deviation is not None and bool(np.any(deviation))
+
+
+def _keys(solutions: list[Solution], name: Any) -> list[Any]:
+    """What a name given by the user stands for; a dict gives its entries labels.
+
+    Raises:
+        ProblemError: no solution knows it.
+    """
+    if isinstance(name, Mapping):
+        return [Labelled(label=str(label), key=_resolved(solutions, key)) for label, key in name.items()]
+    return [_resolved(solutions, name)]
 
 
 def _of_key(drawn: list[Drawn], key: Any, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Panels of one quantity."""
+    if isinstance(key, Labelled):
+        panels = _of_key(drawn, key.key, blocks, units)
+        if len(panels) == 1:
+            return [replace(panels[0], label=key.label)]
+        return [replace(panel, label=f"{key.label}: {panel.label}") for panel in panels]
+    if isinstance(key, Quantity):
+        return _quantity([d for d in drawn if knows(d.solution, key.word)], key, blocks, units)
     if isinstance(key, tuple):
         return _pair(drawn, key, units)
     if not isinstance(key, str):
         return _expression(drawn, key)
     if blocks[key].kind == "matrix":
-        return _matrix(drawn, blocks[key], units)
+        return _matrix([(d, d.t, d.sample[key]) for d in drawn if key in d.names], blocks[key], units)
     return _vector(drawn, blocks[key], units)
 
 
+def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
+    """Root mean squares, gains or covariances, of the solutions that have them."""
+    if key.word in (GAIN, FILTER):
+        return gain(drawn, key.word, key.of, units)
+    if key.word == RMS:
+        every = [b.name for b in blocks.values() if b.kind in ("state", "unknown") and drawn[0].rows(b.name)]
+        chosen = every if key.of is None else [key.of]
+        return [panel for of in chosen for panel in rms(drawn, of, blocks, units)]
+    labels = drawn[0].solution.augmented
+    block = Block(name=key.word, kind="matrix", size=len(labels), offset=0, labels=labels, estimation=True)
+    return _matrix([(d, d.t, d.between(getattr(d.solution.loop, key.word))) for d in drawn], block, units)
+
+
 def _resolved(solutions: list[Solution], key: Any) -> Any:
-    """A name, a pair of names, or the expression itself.
+    """A name, a pair of names, a quantity, or the expression itself.
 
     Raises:
         ProblemError: no solution knows it.
     """
     if isinstance(key, tuple):
+        word = key[0] if len(key) == 2 and isinstance(key[0], str) and key[0] in (RMS, GAIN, FILTER) else ""
+        if word and any(knows(solution, word) for solution in solutions) and not _declared(solutions, word):
+            return Quantity(word=word, of=_resolved(solutions, key[1]))
         return tuple(_resolved(solutions, part) for part in key)
     error: ProblemError | None = None
+    if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
+        if any(knows(solution, key) for solution in solutions):
+            return Quantity(word=key)
+        raise _unknown_word(key)
     for solution in solutions:
         try:
             return name_of(key, solution.symbols, tuple(b.name for b in solution.blocks))
@@ -150,16 +162,76 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
     raise error
 
 
+def _declared(solutions: list[Solution], word: str) -> bool:
+    """Whether a word is a name of the user's; the gain of a constrained feedback is drawn as a gain."""
+    names = [(b.name, solution) for solution in solutions for b in solution.blocks]
+    return any(name == word and not (word == GAIN and solution.loop) for name, solution in names)
+
+
+def _unknown_word(word: str) -> ProblemError:
+    needed = {FILTER: "a measurement and an estimation covariance", RMS: "an estimation covariance"}
+    return ProblemError(
+        describe(
+            f"'{word}' is not in this solution.",
+            expected=f"a problem with {needed.get(word, 'minimize_expected()')}",
+            received=f"'{word}' of a problem without",
+            remedy="draw something else",
+        )
+    )
+
+
+def _over(drawn: list[Drawn], panels: list[Panel], key: Any) -> list[Panel]:
+    """The panels with another quantity than time as abscissa.
+
+    Raises:
+        ProblemError: it is not a scalar.
+    """
+    changed = []
+    for panel in panels:
+        curves = []
+        for curve in panel.curves:
+            solution = drawn[curve.order].solution
+            at_nodes = solution[key]
+            if at_nodes.ndim != 1:
+                raise ProblemError(
+                    describe(
+                        "The abscissa of a figure is one number at each time.",
+                        expected="a scalar state, control or expression",
+                        received=f"{shortened(key)}, {at_nodes[0].size} numbers",
+                        remedy="choose over= among the scalars, or one entry of it",
+                    )
+                )
+            smooth = solution.at(curve.t)[key] if isinstance(key, str) else np.interp(curve.t, solution.t, at_nodes)
+            curves.append(replace(curve, t=smooth))
+        changed.append(replace(panel, curves=tuple(curves)))
+    return changed
+
+
+def abscissa_label(solutions: list[Solution], over: Any, units: Mapping[str, str]) -> str:
+    """Label of an abscissa that is not time."""
+    key = _resolved(solutions, over)
+    return key + unit_of(key, units) if isinstance(key, str) else shortened(key)
+
+
 def _expression(drawn: list[Drawn], key: Any) -> list[Panel]:
-    """An expression of the symbols, at the nodes."""
-    curves, count = [], 1
+    """An expression of the symbols with its band, through its values at the nodes."""
+    curves: list[Curve] = []
+    count = 1
     for d in drawn:
-        values = d.solution[key].reshape(d.solution.t.size, -1)
+        values = d.between(d.solution[key].reshape(d.solution.t.size, -1))
         count = values.shape[1]
-        curves += [Curve(t=d.solution.t, y=values[:, i], order=d.order, entry=i) for i in range(count)]
-    text = str(key)
-    label = text if len(text) <= LONGEST_LABEL else text[: LONGEST_LABEL - 3] + "..."
-    return [Panel(label=label, entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
+        spread = d.spread(key)[0] if d.covariance is not None and key.shape[1] == 1 else np.zeros_like(values)
+        curves += [
+            Curve(
+                t=d.t,
+                y=values[:, i],
+                deviation=spread[:, i] if np.any(spread[:, i]) else None,
+                order=d.order,
+                entry=i,
+            )
+            for i in range(count)
+        ]
+    return [Panel(label=shortened(key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
 
 
 def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[Panel]:
@@ -174,7 +246,7 @@ def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
         if steps:
             t, values = d.solution.t, d.solution.values[block.name]
         values = values.reshape(t.size, -1)
-        deviation = d.deviation(block.name) if own.kind in ("state", "unknown") else None
+        deviation = d.deviation(own) if own.kind in ("state", "unknown", "control") else None
         target = d.target(own)
         curves += [
             Curve(
@@ -190,7 +262,7 @@ def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
         ]
     bounds = _bounds(drawn[0].solution.statement, block)
     suffix = " (estimate)" if block.kind == "unknown" else ""
-    return _separated(block.name + suffix, entry_names((block,)), curves, bounds, units.get(block.name, ""))
+    return _separated(block, suffix + unit_of(block.name, units), curves, bounds)
 
 
 def _bounds(statement: Statement | None, block: Block) -> Array:
@@ -201,16 +273,15 @@ def _bounds(statement: Statement | None, block: Block) -> Array:
     return np.array([bound[block.span] for bound in bounds])
 
 
-def _separated(name: str, entries: tuple[str, ...], curves: list[Curve], bounds: Array, unit: str) -> list[Panel]:
+def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Array) -> list[Panel]:
     """A panel an entry, or one for many of them (then without bands)."""
-    unit = f" [{unit}]" if unit else ""
+    entries = entry_names((block,))
     if len(entries) > SEPARATE_ENTRIES:
         plain = tuple(replace(curve, deviation=None) for curve in curves)
-        return [Panel(label=name + unit, entries=entries, curves=plain)]
-    suffix = name.removeprefix(name.split(" ")[0])
+        return [Panel(label=block.name + suffix, entries=entries, curves=plain)]
     return [
         Panel(
-            label=entry + suffix + unit,
+            label=entry + suffix,
             entries=(entry,),
             curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
             bounds=tuple(float(b) for b in bounds[:, i] if np.isfinite(b)),
@@ -219,10 +290,8 @@ def _separated(name: str, entries: tuple[str, ...], curves: list[Curve], bounds:
     ]
 
 
-def _matrix(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[Panel]:
+def _matrix(histories: list[tuple[Drawn, Array, Array]], block: Block, units: Mapping[str, str]) -> list[Panel]:
     """Entries of a matrix, of a large one its diagonal, grouped by the symbols of its rows."""
-    chosen = [d for d in drawn if block.name in d.names]
-    histories = [(d.order, d.t, d.sample[block.name]) for d in chosen]
     panels = []
     for pairs in _pairs(block):
         names = tuple(f"{block.name}[{block.labels[i]}, {block.labels[j]}]" for i, j in pairs)
@@ -231,15 +300,14 @@ def _matrix(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
         elif block.size == 1:
             names = (block.name,)
         curves = [
-            Curve(t=t, y=values[:, i, j], order=order, entry=k)
-            for order, t, values in histories
+            Curve(t=t, y=values[:, i, j], order=d.order, entry=k)
+            for d, t, values in histories
             for k, (i, j) in enumerate(pairs)
         ]
         owners = [block.labels[i].split("[")[0] for i in pairs[0]]
         group = f" of {owners[0]}" if block.estimation else ""
         label = names[0] if len(pairs) == 1 else f"{block.name}, diagonal{group}"
-        own = f" [{units[block.name]}]" if units.get(block.name) else ""
-        unit = _product(owners, units) if block.estimation else own
+        unit = product_unit(owners, units) if block.estimation else unit_of(block.name, units)
         panels.append(Panel(label=label + unit, entries=tuple(names), curves=tuple(curves)))
     return panels
 
@@ -259,7 +327,7 @@ def _pairs(block: Block) -> list[list[tuple[int, int]]]:
 
 
 def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) -> list[Panel]:
-    """A block of the estimation covariance, at the nodes."""
+    """A block of the covariance of the actual deviations, at the nodes."""
     curves: list[Curve] = []
     names: tuple[str, ...] = ()
     for d in drawn:
@@ -267,18 +335,10 @@ def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) ->
         names = tuple(f"{i}, {j}" for i in range(values.shape[1]) for j in range(values.shape[2]))
         flat = values.reshape(values.shape[0], -1)
         curves += [Curve(t=d.solution.t, y=flat[:, k], order=d.order, entry=k) for k in range(flat.shape[1])]
-    matrix = next(b.name for b in drawn[0].solution.blocks if b.estimation)
-    label = f"{matrix}[{key[0]}, {key[1]}]" + _product(list(key), units)
+    closed = any(d.solution.loop is not None for d in drawn)
+    matrix = COVARIANCES[0] if closed else next(b.name for b in drawn[0].solution.blocks if b.estimation)
+    label = f"{matrix}[{key[0]}, {key[1]}]" + product_unit(list(key), units)
     return [Panel(label=label, entries=names, curves=tuple(curves))]
-
-
-def _product(owners: list[str], units: Mapping[str, str]) -> str:
-    """Unit of a covariance between two symbols."""
-    words = [units.get(owner, "") for owner in owners]
-    if not all(words):
-        return ""
-    words = [word if word.isalnum() else f"({word})" for word in words]
-    return f" [{words[0]}²]" if words[0] == words[-1] else f" [{words[0]} {words[1]}]"
 
 
 def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.curves import Panel
 from covocp.errors import ProblemError, describe
 from covocp.files import written_whole
-from covocp.panels import Panel, choose_panels
+from covocp.panels import abscissa_label, choose_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,6 +37,7 @@ TARGET: dict[str, Any] = {
 BAND = 0.13  # opacity
 NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
 PANEL = (3.3, 2.15)  # width, height in inches
+LONGEST_LINE = 26  # characters along the height of a panel
 HEAD = 0.6  # inches for title and legend
 RESOLUTION = 200  # dots an inch
 # Backends of matplotlib that show nothing by themselves.
@@ -69,6 +71,8 @@ def plot_solutions(
     *names: Any,
     labels: Sequence[str] | None = None,
     costates: bool = False,
+    gains: bool = False,
+    over: Any = None,
     sigmas: Sequence[float] = (1.0,),
     units: Mapping[str, str] | None = None,
     title: str | None = None,
@@ -79,11 +83,17 @@ def plot_solutions(
     Args:
         solutions: one or more, of the same problem or of problems with the same names.
         names: what to draw: symbols or names of states, controls, unknowns and matrices, pairs of states and unknowns
-            (entries of the estimation covariance), other expressions of the problem's symbols. None: states, controls
-            and unknowns with bands of their standard deviations, and matrices (of large ones the diagonal).
+            (entries of the covariance of the actual deviations), other expressions of the problem's symbols. Besides
+            "rms" (root mean squares), "C" and "K" (gains of feedback and filter), "X", "Xhat" and "Z" (covariances of
+            the closed loop); ("rms", h), ("C", h), ("K", h) those of one symbol, or of an expression ("rms"). A dict
+            gives labels: {"load factor [g]": expression}. None: states, controls and unknowns with bands, then
+            covariances and other matrices (of large ones the diagonal), of a closed loop root mean squares instead.
         labels: of the solutions, for the legend; by default what tells them apart.
         costates: whether to draw the costates of the states and matrices drawn.
-        sigmas: widths of the bands in standard deviations, such as (1, 3); (): none.
+        gains: whether to add the gains of feedback and filter.
+        over: what is the abscissa: a scalar state, control or expression; None: time.
+        sigmas: widths of the bands in standard deviations, such as (1, 3); (): none. The bands are those of the actual
+            states, of what the feedback adds to the controls, and of the estimates of the unknowns.
         units: by name, for the axes, such as {"y": "m"}, where the problem does not say or says something else.
         title: of the figure; by default the name of the problem. A solution that did not converge is named below it.
         path: also write the figure there (.png, .pdf or .svg).
@@ -100,7 +110,9 @@ def plot_solutions(
     given = list(solutions)
     legend = _labels(given, labels)
     known = {block.name: block.unit for solution in given for block in solution.blocks}
-    panels = choose_panels(given, names, costates=costates, units=known | dict(units or {}))
+    words = known | dict(units or {})
+    panels = choose_panels(given, names, costates=costates, gains=gains, over=over, units=words)
+    abscissa = "time [s]" if over is None else abscissa_label(given, over, words)
     rows, columns = _grid(len(panels))
     with matplotlib.rc_context(STYLE):
         figure = _figure((PANEL[0] * columns, PANEL[1] * rows + HEAD))
@@ -111,7 +123,7 @@ def plot_solutions(
             place.set_visible(False)
         for column in range(columns):
             last = max(row for row in range(rows) if row * columns + column < len(panels))
-            axes[last, column].set_xlabel("time [s]")
+            axes[last, column].set_xlabel(_plain(abscissa))
         figure.align_ylabels(list(axes.ravel()[: len(panels)]))
         _title(figure, given, legend, title)
         _legend(figure, given, legend, panels, tuple(sigmas))
@@ -141,10 +153,17 @@ def _labels(solutions: list[Solution], labels: Sequence[str] | None) -> list[str
                 )
             )
         return words
-    for candidates in ([s.method for s in solutions], [s.name for s in solutions]):
+    for candidates in ([s.method for s in solutions], [s.name for s in solutions], [_kind(s) for s in solutions]):
         if len(set(candidates)) == len(solutions):
             return candidates
     return [f"{i + 1}: {s.method}" for i, s in enumerate(solutions)]
+
+
+def _kind(solution: Solution) -> str:
+    """How the nominal came about."""
+    if solution.method == "evaluate":
+        return "evaluated"
+    return "classical" if solution.stats.get("nominal") == "deterministic" else "combined"
 
 
 def _grid(count: int) -> tuple[int, int]:
@@ -229,22 +248,24 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
     grouped = len(panel.entries) > 1
     for curve in panel.curves:
         line = _line(curve.order if count > 1 else curve.entry)
+        style: Any = "steps-post" if curve.steps else "default"
         if count > 1 and grouped:
             line["linestyle"] = DASHES[curve.entry % len(DASHES)]
         for width in sorted(sigmas, reverse=True):
             if curve.deviation is None:
                 break
             low, high = curve.y - width * curve.deviation, curve.y + width * curve.deviation
-            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0)
+            step: Any = "post" if curve.steps else None
+            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0, step=step)
             for edge in (low, high):
-                axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7)
-        axes.plot(curve.t, curve.y, drawstyle="steps-post" if curve.steps else "default", **line)
+                axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7, drawstyle=style)
+        axes.plot(curve.t, curve.y, drawstyle=style, **line)
     _targets(axes, panel)
     for bound in _near_bounds(panel):
         axes.axhline(bound, zorder=1, **BOUND)
-    axes.set_ylabel(_plain(panel.label))
+    axes.set_ylabel(_plain(_folded(panel.label)))
     axes.margins(x=0)
-    if grouped:
+    if grouped and panel.legend:
         _entry_legend(axes, panel, count)
 
 
@@ -281,6 +302,12 @@ def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
 def _used(panel: Panel) -> list[int]:
     """Numbers of the entries that are drawn."""
     return sorted({curve.entry for curve in panel.curves})
+
+
+def _folded(label: str) -> str:
+    """A label whose unit stands on a line of its own where the axis is too short for both."""
+    name, bracket, unit = label.rpartition(" [")
+    return label if len(label) <= LONGEST_LINE or not name else f"{name}\n{bracket.strip()}{unit}"
 
 
 def _plain(text: str) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.errors import CovocpError
-from covocp.matrices import half_indices
+from covocp.matrices import Array, half_indices
 from covocp.statement import Block, entry_names
 
 if TYPE_CHECKING:
@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 WIDTH = 100
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 LARGEST_MATRIX = 6
+# Feedback gains of more entries than this are not shown.
+MOST_GAINS = 12
+# Share of the largest feedback, or of the largest gain, that counts as none.
+NO_FEEDBACK = 1e-6
+# Name of the gain of a constrained feedback, and of what the deviations add to an expected cost.
+GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
 # Multipliers below this share of the cost are not shown.
 NEGLIGIBLE = 1e-9
 # Relative difference of costs below which two starts count as having found the same optimum.
@@ -48,15 +54,24 @@ def summary(solution: Solution) -> str:
         solution: converged or not; the first line says which.
 
     Returns:
-        The text: status, violations, cost by term, values at the end, residuals of optimality, mesh and effort.
+        The text: status, violations, cost by term, values at the end, what the closed loop does, residuals of
+        optimality, mesh and effort.
     """
+    closed = solution.loop is not None
+
+    def shown(block: Block) -> bool:  # the covariances of a closed loop are in its tables
+        return not closed or not (block.estimation or block.backward)
+
     parts = [
         _head(solution),
         _violations(solution.violations),
         _costs(solution),
         _states(solution),
         _unknowns(solution),
-        *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix"),
+        _deviations(solution),
+        _feedback(solution),
+        _gains(solution),
+        *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix" and shown(block)),
         _optimality(solution),
         _effort(solution),
     ]
@@ -116,16 +131,25 @@ def _violations(violations: Mapping[str, float]) -> str:
 
 def _costs(solution: Solution) -> str:
     terms = [[name, number(value)] for name, value in solution.cost_terms.items()]
-    return render_table(["cost", ""], [*terms, ["total", number(solution.cost)]])
+    text = render_table(["cost", ""], [*terms, ["total", number(solution.cost)]])
+    words = []
+    if solution.loop is not None and DEVIATIONS in solution.cost_terms:
+        ended, on_the_way = (number(solution.loop.cost[f"{DEVIATIONS} {where}"], 6) for where in PLACES)
+        words.append(f"deviations: {ended} at the end, {on_the_way} on the way")
+    classical = solution.stats.get("classical_cost")
+    if classical and solution.optimised:
+        gain = 1.0 - solution.cost / classical
+        words.append(f"classical design: {number(classical)}, of which {100 * gain:.3g} % are gained")
+    return "\n".join([text, *words])
 
 
 def _states(solution: Solution) -> str:
-    """Terminal values with targets, multipliers and standard deviations."""
+    """Terminal values with targets, multipliers and, where nothing is fed back, standard deviations."""
     blocks = tuple(b for b in solution.blocks if b.kind == "state")
     if not blocks:
         return ""
     target = solution.targets
-    bound = ~np.isnan(target)
+    bound = ~np.isnan(target) if solution.optimised else np.zeros(target.size, dtype=bool)
     columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
     rows = [
         [name, number(x), number(goal), number(multiplier if fixed else None)]
@@ -133,7 +157,10 @@ def _states(solution: Solution) -> str:
             entry_names(blocks), solution.trajectory.x[-1], target, solution.multipliers.final, bound, strict=True
         )
     ]
-    if _estimated(solution):
+    if solution.loop is not None:  # a gain that is constant is a state, which has its own table
+        own = [b.name != GAIN for b in blocks for _ in range(b.size)]
+        rows = [row for row, kept in zip(rows, own, strict=True) if kept]
+    elif _estimated(solution):
         columns.append("standard deviation")
         deviations = np.concatenate([np.atleast_1d(solution.deviation(b.name)[-1]) for b in blocks])
         rows = [[*row, number(value)] for row, value in zip(rows, deviations, strict=True)]
@@ -141,18 +168,105 @@ def _states(solution: Solution) -> str:
 
 
 def _unknowns(solution: Solution) -> str:
-    """Unknown constants: mean, standard deviation at the start and at the end."""
+    """Unknown constants: mean, standard deviation of their estimate at the start and at the end."""
     rows = []
     for b in solution.blocks:
         if b.kind != "unknown":
             continue
         means = np.atleast_1d(solution.values[b.name][0])
-        deviations = (
-            solution.deviation(b.name).reshape(-1, b.size) if _estimated(solution) else np.full((2, b.size), np.nan)
-        )
+        deviations = np.full((2, b.size), np.nan)
+        if solution.loop is not None:
+            deviations = _roots(solution.loop.E)[:, _rows(solution, b.name)]
+        elif _estimated(solution):
+            deviations = solution.deviation(b.name).reshape(-1, b.size)
         entries = zip(entry_names((b,)), means, deviations[0], deviations[-1], strict=True)
         rows += [[name, number(mean), number(first), number(last)] for name, mean, first, last in entries]
     return render_table(["unknown", "mean", "deviation at 0", "deviation at T"], rows) if rows else ""
+
+
+def _rows(solution: Solution, name: str) -> list[int]:
+    """Rows of the augmented state that belong to a symbol."""
+    return [i for i, label in enumerate(solution.augmented) if label.split("[")[0] == name]
+
+
+def _roots(covariance: Array) -> Array:
+    """Standard deviations over time, (K, n)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)))
+
+
+def _deviations(solution: Solution) -> str:
+    """What the actual states of a closed loop do at the end, and how much of it the filter does not know."""
+    loop = solution.loop
+    if loop is None:
+        return ""
+    total, error = _roots(loop.X), _roots(loop.E)
+    states = [i for b in solution.blocks if b.kind == "state" for i in _rows(solution, b.name)]
+    rows = [
+        [
+            solution.augmented[i],
+            number(total[0, i], 6),
+            number(total[-1, i]),
+            number(error[-1, i]),
+            f"{100 * (error[-1, i] / total[-1, i]) ** 2:.3g} %" if total[-1, i] > 0 else "-",
+        ]
+        for i in states
+    ]
+    columns = ["closed loop, root mean squares", "at 0", "at T", "error of the estimate", "of the variance"]
+    return render_table(columns, rows) if rows else ""
+
+
+def _feedback(solution: Solution) -> str:
+    """What the feedback asks of the controls, and how far the nominal stays from their bounds in units of it."""
+    loop = solution.loop
+    if loop is None or not loop.gain.shape[1]:
+        return ""
+    spread = np.sqrt(np.maximum(np.einsum("kui,kij,kuj->ku", loop.gain, loop.Xhat, loop.gain), 0.0))
+    names = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
+    room = _room(solution, spread)
+    rows = []
+    for i, name in enumerate(names):
+        k = int(np.argmax(spread[:, i]))
+        rows.append([name, number(spread[k, i], 6), number(solution.t[k], 4), number(spread[-1, i], 6)])
+        rows[-1] += [] if room is None else [number(room[i], 3)]
+    columns = ["feedback, root mean squares", "largest", "at t [s]", "at T"]
+    return render_table(columns + ([] if room is None else ["nearest bound, in rms"]), rows)
+
+
+def _room(solution: Solution, spread: Array) -> Array | None:
+    """Least distance of each control from its bounds, in root mean squares of its feedback; None without bounds."""
+    if solution.statement is None:
+        return None
+    count = spread.shape[1]
+    lower, upper = (bound[:count] for bound in solution.statement.control_bounds)
+    if not np.isfinite([lower, upper]).any():
+        return None
+    u = solution.controls[:, :count]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.minimum(u - lower, upper - u) / spread
+    ratio[spread <= NO_FEEDBACK * spread.max(axis=0)] = np.inf
+    least = ratio.min(axis=0)
+    return np.where(np.isfinite(least), np.maximum(least, 0.0), np.nan)
+
+
+def _gains(solution: Solution) -> str:
+    """A few numbers of each entry of the feedback gain; nothing where there are many."""
+    if solution.loop is None:
+        return ""
+    gain = solution.loop.gain
+    controls = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
+    entries = [(u, i) for u in range(gain.shape[1]) for i in range(gain.shape[2])]
+    if not entries or len(entries) > MOST_GAINS:
+        return ""
+    middle = int(np.argmin(np.abs(solution.mesh.nodes - 0.5)))
+    rows = []
+    for u, i in entries:
+        history = gain[:, u, i]
+        k = int(np.argmax(np.abs(history)))
+        chosen = [number(history[j], 5) for j in (0, middle, -1, k)]
+        rows.append([f"{controls[u]}, {solution.augmented[i]}", *chosen, number(solution.t[k], 4)])
+    if np.ptp(gain, axis=0).max() <= NO_FEEDBACK * np.abs(gain).max():
+        return render_table(["gain C, constant", ""], [row[:2] for row in rows])
+    return render_table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)
 
 
 def _estimated(solution: Solution) -> bool:
@@ -230,9 +344,6 @@ def _effort(solution: Solution) -> str:
         effort.append("started again from a saddle")
     if "starts" in stats:
         effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
-    if stats.get("classical_cost"):
-        gain = 1.0 - solution.cost / stats["classical_cost"]
-        effort.append(f"the classical design costs {stats['classical_cost']:.8g}: {100 * gain:.3g} % are gained")
     lines = [wrapped("mesh: " + ", ".join(words))]
     return "\n".join(lines + ([wrapped("effort: " + ", ".join(effort))] if effort else []))
 

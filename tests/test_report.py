@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import covocp as co
-from covocp.models import free_time_integrator, mass_chain, unknown_lag
+from covocp.models import free_time_integrator, mars_entry, mass_chain, unknown_lag
 from covocp.optimality import Optimality
 from covocp.report import RESIDUALS, render_table, summary
 
@@ -134,3 +134,97 @@ def test_values_that_are_not_numbers_are_dashes(lag):
     text = summary(replace(lag, stored_optimality=replace(lag.optimality, control_error=np.nan)))
     line = next(line for line in text.splitlines() if line.startswith(RESIDUALS["control_error"]))
     assert line.split()[-1] == "-"
+
+
+# --- closed loops -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def steered():
+    return co.solve(unknown_lag.steering(), intervals=60, progress=False)
+
+
+def block_of(text, beginning):
+    """The table that begins so."""
+    return text[text.index(beginning) :].split("\n\n")[0]
+
+
+def words_after(text, beginning):
+    line = next(line for line in text.splitlines() if line.startswith(beginning))
+    return line[len(beginning) :].split()
+
+
+def test_a_closed_loop_in_root_mean_squares(steered):
+    text, loop = str(steered), steered.loop
+    row = words_after(block_of(text, "closed loop, root mean squares"), "x ")
+    X, E = loop.X[-1, 0, 0], loop.E[-1, 0, 0]
+    assert [float(word) for word in row[:-1]] == pytest.approx([1.0, X**0.5, E**0.5, 100 * E / X], rel=5e-3)
+    assert [float(word) for word in row[1:3]] == pytest.approx([X**0.5, E**0.5], rel=1e-7)
+    assert numbers_after(text, "b  ") == pytest.approx([1.0, 5**0.5, loop.E[-1, 1, 1] ** 0.5], rel=1e-7)
+    assert "standard deviation" not in text
+    assert "covariance E at T" not in text
+    assert "matrix S" not in text
+
+
+def test_the_feedback_and_its_gain(steered):
+    text, loop = str(steered), steered.loop
+    spread = np.sqrt(np.einsum("ki,kij,kj->k", loop.gain[:, 0], loop.Xhat, loop.gain[:, 0]))
+    k = spread.argmax()
+    expected = [spread[k], steered.t[k], spread[-1]]
+    assert numbers_after(block_of(text, "feedback, root mean squares"), "u ") == pytest.approx(expected, rel=1e-5)
+    gain = loop.gain[:, 0, 1]
+    k = np.abs(gain).argmax()
+    expected = [gain[0], gain[30], gain[-1], gain[k], steered.t[k]]
+    assert numbers_after(block_of(text, "gain C"), "u, b") == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_deviations_are_split_and_the_classical_design_is_beside_them(steered):
+    steered = replace(steered, stats={**steered.stats, "classical_cost": 2.5})
+    text, cost = str(steered), steered.loop.cost
+    words = words_after(text, "deviations: ")
+    expected = [cost["deviations at the end"], cost["deviations on the way"]]
+    assert [float(words[0]), float(words[4])] == pytest.approx(expected, rel=1e-5)
+    words = words_after(text, "classical design: ")
+    assert words[0] == "2.5,"
+    assert float(words[3]) == pytest.approx(100 * (1 - steered.cost / 2.5), rel=1e-2)
+
+
+def test_what_was_not_optimised_has_no_multipliers_and_no_gain_over_the_classical_design(steered):
+    steered = replace(steered, stats={**steered.stats, "classical_cost": 2.5})
+    true = co.evaluate(steered, truth=unknown_lag.steering(process_noise=2.0, measurement_noise=0.5))
+    for solution in (true, co.solve(unknown_lag.steering(), nominal="deterministic", progress=False)):
+        text = str(solution)
+        assert "classical design:" not in text
+        assert words_after(block_of(text, "state at T"), "x ")[-1] == "-"
+    row = words_after(block_of(str(true), "closed loop, root"), "x ")
+    assert row[1] == f"{true.loop.X[-1, 0, 0] ** 0.5:.8g}"
+
+
+def test_the_room_to_the_bounds_is_counted_in_root_mean_squares():
+    flight = co.evaluate(mars_entry.problem(upper=0.6), nominal=mars_entry.reference(), intervals=60)
+    text, loop = str(flight), flight.loop
+    spread = np.sqrt(np.einsum("ki,kij,kj->k", loop.gain[:, 0], loop.Xhat, loop.gain[:, 0]))
+    row = numbers_after(block_of(text, "feedback, root mean squares"), "lift_to_drag")
+    assert row[-1] == pytest.approx(0.1 / spread.max(), rel=1e-2)
+    assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_a_constant_gain_is_one_number():
+    problem = co.Problem(duration=2.0)
+    x, u = problem.state("x", initial=1.0, variance=1.0), problem.control("u")
+    problem.dynamics(x, -x + u, noise=0.1)
+    problem.measurement("m", x, noise=0.1)
+    gain = co.Gain(constant=True, lower=0.0, upper=3.0)
+    problem.minimize_expected(running=0.5 * (x**2 + u**2), gain=gain)
+    solution = co.solve(problem, intervals=20, progress=False)
+    text = str(solution)
+    assert numbers_after(block_of(text, "gain C, constant"), "u, x") == pytest.approx(
+        [solution.gains["C"][0, 0, 0]], rel=1e-4
+    )
+    assert len(block_of(text, "state at T").splitlines()) == 2
+
+
+def test_a_loaded_closed_loop_prints_what_it_knows(steered, tmp_path):
+    path = steered.save(tmp_path / "solution.npz")
+    assert str(co.load(path)) == str(steered)
+    assert str(co.load(path, unknown_lag.steering())) == str(steered)
