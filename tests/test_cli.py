@@ -285,5 +285,5 @@ def test_other_problems_of_a_model_and_none_as_a_value() -> None:
     assert steering.build(["duration=5"]).expected is not None
     assert not steering.figures()
     assert find_model("mars_entry").build(["regularization=none"]).expected is not None
-    with pytest.raises(ProblemError, match="unknown_lag:steering"):
+    with pytest.raises(co.ProblemError, match="unknown_lag:steering"):
         find_model("unknown_lag:steer")
