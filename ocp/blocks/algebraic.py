@@ -5,12 +5,14 @@ Everything here is numeric (scipy); a Lyapunov equation, being linear, may also 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.blocks.arithmetic import apply
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
 from covocp.errors import ProblemError, describe
 
@@ -42,7 +44,7 @@ def continuous(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
         ProblemError: expressions, shapes that do not fit, indefinite weights, (A, B) not stabilisable or a mode on the
             imaginary axis that the weights do not see (names the mode).
     """
-    return restored(ca.DM(_riccati(A, B, Q, R, cross, discrete=False)), A)
+    return restored(stabilising(*weights(A, B, Q, R, cross), discrete=False), A)
 
 
 def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
@@ -61,7 +63,7 @@ def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
     Raises:
         ProblemError: as for `continuous`, with the unit circle in place of the imaginary axis.
     """
-    return restored(ca.DM(_riccati(A, B, Q, R, cross, discrete=True)), A)
+    return restored(stabilising(*weights(A, B, Q, R, cross), discrete=True), A)
 
 
 def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
@@ -104,7 +106,7 @@ def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
     solution = np.asarray(solve(transition, right if discrete else -right), dtype=float)
     if np.array_equal(right, right.T):
         solution = symmetrised(solution)
-    return restored(ca.DM(solution), A)
+    return restored(solution, A)
 
 
 def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
@@ -181,30 +183,56 @@ def root(weights: Array) -> Array:
     return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
 
 
-def lost_mode(modes: Modes, pair: str, needed: str, remedy: str) -> ProblemError:
+def lost_mode(modes: Modes, pair: str, needed: str, remedy: str, why: str = "") -> ProblemError:
     """The error that names the first of some modes."""
     return ProblemError(
         describe(
             f"The pair {pair} is not {needed}.",
             expected=f"a {needed} pair",
-            received="the mode " + ", ".join(mode_text(mode) for mode in modes[:3]) + f", out of reach of {pair}",
+            received="the mode " + ", ".join(mode_text(mode) for mode in modes[:3]) + (f", which {why}" if why else ""),
             remedy=remedy,
         )
     )
 
 
-def weights(
-    A: Any, B: Any, Q: Any, R: Any, cross: Any, names: tuple[str, ...] = ("A", "B", "Q", "R")
-) -> tuple[Array, Array, Array, Array, Array]:
+@dataclass(frozen=True, kw_only=True)
+class Words:
+    """What the user calls the matrices of a Riccati equation, and the two ways in which a mode can be lost.
+
+    Args:
+        names: of A, B, Q, R.
+        reach: of (A, B): the pair, what it should be, the remedy, why a mode is lost.
+        see: of (A, Q^1/2): the same.
+    """
+
+    names: tuple[str, str, str, str] = ("A", "B", "Q", "R")
+    reach: tuple[str, str, str, str] = (
+        "(A, B)",
+        "stabilisable",
+        "add an input, or take the mode out of the model",
+        "B does not reach",
+    )
+    see: tuple[str, str, str, str] = (
+        "(A, Q^1/2)",
+        "detectable",
+        "give the mode a weight, or take it out of the model",
+        "Q gives no weight",
+    )
+
+
+CONTROL = Words()
+
+
+def weights(A: Any, B: Any, Q: Any, R: Any, cross: Any, words: Words = CONTROL) -> tuple[Array, ...]:
     """The five matrices of a linear-quadratic problem as checked numbers.
 
     Raises:
         ProblemError: expressions, shapes that do not fit, Q or [Q N; N' R] not positive semidefinite, R not definite.
     """
+    names = words.names
     a = numeric(names[0], square(names[0], A))
-    size = a.shape[0]
-    b = numeric(names[1], matrix(names[1], B, (size, None)))
-    q = numeric(names[2], weight(names[2], Q, size))
+    b = numeric(names[1], matrix(names[1], B, (a.shape[0], None)))
+    q = numeric(names[2], weight(names[2], Q, a.shape[0]))
     r = numeric(names[3], weight(names[3], R, b.shape[1], definite=True))
     n = np.zeros(b.shape) if cross is None else numeric("cross", matrix("cross", cross, b.shape))
     if cross is not None:
@@ -212,26 +240,40 @@ def weights(
     return a, b, symmetrised(q), symmetrised(r), n
 
 
-def _riccati(A: Any, B: Any, Q: Any, R: Any, cross: Any, *, discrete: bool) -> Array:
-    """The stabilising solution, one Newton step after scipy's."""
+def stabilising(
+    A: Array,
+    B: Array,
+    Q: Array,
+    R: Array,
+    N: Array,
+    *,
+    discrete: bool,
+    detectable: bool = False,
+    words: Words = CONTROL,
+) -> Array:
+    """The stabilising solution, one Newton step after scipy's; `detectable`: refuse every unstable mode without weight.
+
+    Raises:
+        ProblemError: a mode that is not reached, or has no weight and is marginal or must be detectable; no solution.
+    """
     from scipy import linalg
 
-    a, b, q, r, n = weights(A, B, Q, R, cross)
-    reached = lost_modes(a, b, discrete=discrete)
+    reached = lost_modes(A, B, discrete=discrete)
     if reached.size:
-        raise lost_mode(reached, "(A, B)", "stabilisable", "add an input, or take the mode out of the model")
-    back = np.linalg.solve(r, n.T)
-    unseen = lost_modes((a - b @ back).T, root(symmetrised(q - n @ back)), discrete=discrete, marginal=True)
+        raise lost_mode(reached, *words.reach)
+    back = np.linalg.solve(R, N.T)
+    cost = root(symmetrised(Q - N @ back))
+    unseen = lost_modes((A - B @ back).T, cost, discrete=discrete, marginal=not detectable)
     if unseen.size:
-        raise lost_mode(unseen, "(A, Q^1/2)", "detectable", "give the mode a weight: it is neither stable nor unstable")
+        raise lost_mode(unseen, *words.see)
     solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
     try:
-        start = np.asarray(solve(a, b, q, r, s=n), dtype=float)
+        start = np.asarray(solve(A, B, Q, R, s=N), dtype=float)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise _unsolved(str(error)) from error
-    solution, stable = _newton(a, b, q, r, n, symmetrised(start), discrete)
-    residual = np.abs(_residual(a, b, q, r, n, solution, discrete)).max(initial=0.0)
-    scale = max(np.abs(q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(a).max(initial=0.0))
+    solution, stable = _newton(A, B, Q, R, N, symmetrised(start), discrete)
+    residual = np.abs(_residual(A, B, Q, R, N, solution, discrete)).max(initial=0.0)
+    scale = max(np.abs(Q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(A).max(initial=0.0))
     if not stable or not residual <= RESIDUAL * scale:
         raise _unsolved("the closed loop is not stable" if not stable else f"a residual of {residual:.3g}")
     return solution
@@ -248,11 +290,24 @@ def _unsolved(received: str) -> ProblemError:
     )
 
 
-def gain(A: Array, B: Array, R: Array, cross: Array, S: Array, *, discrete: bool) -> Array:
+def gain_of(A: Array, B: Array, R: Array, cross: Array, S: Array, *, discrete: bool) -> Array:
     """K = R^-1 (B'S + N'), or (R + B'S B)^-1 (B'S A + N') of item 5."""
     if discrete:
         return np.asarray(np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A + cross.T))
     return np.asarray(np.linalg.solve(R, B.T @ S + cross.T))
+
+
+def frozen(numbers: Any) -> Any:
+    """A copy of an array that cannot be written to."""
+    result = np.array(numbers)
+    result.setflags(write=False)
+    return result
+
+
+def sorted_modes(A: Array) -> Modes:
+    """Eigenvalues, sorted by real part; read-only."""
+    result: Modes = frozen(np.sort_complex(np.linalg.eigvals(A)))
+    return result
 
 
 def is_stable(A: Array, *, discrete: bool) -> bool:
@@ -263,7 +318,7 @@ def is_stable(A: Array, *, discrete: bool) -> bool:
 
 def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, bool]:
     """One step of Kleinman's iteration (quadratic convergence: the result is exact to rounding); closed loop stable."""
-    K = gain(A, B, R, N, S, discrete=discrete)
+    K = gain_of(A, B, R, N, S, discrete=discrete)
     closed = A - B @ K
     if not is_stable(closed, discrete=discrete):
         return S, False
@@ -272,14 +327,18 @@ def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete
 
 
 def _residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> Array:
-    K = gain(A, B, R, N, S, discrete=discrete)
+    K = gain_of(A, B, R, N, S, discrete=discrete)
     if discrete:
         return A.T @ S @ A - S + Q - (A.T @ S @ B + N) @ K
     return A.T @ S + S @ A + Q - (S @ B + N) @ K
 
 
 def _linear_lyapunov(A: Any, Q: Any, discrete: bool) -> Any:
-    """The equation as one linear system of n^2 unknowns."""
-    unit = ca.DM.eye(A.shape[0])
-    operator = ca.kron(A, A) - ca.DM.eye(A.shape[0] ** 2) if discrete else ca.kron(unit, A) + ca.kron(A, unit)
-    return ca.reshape(ca.solve(operator, -ca.vec(Q)), A.shape)
+    """The equation as one linear system of n^2 unknowns, which expands to SX."""
+
+    def lyapunov(a: Any, q: Any) -> tuple[Any]:
+        unit = ca.SX.eye(a.shape[0])
+        operator = ca.kron(a, a) - ca.SX.eye(a.shape[0] ** 2) if discrete else ca.kron(unit, a) + ca.kron(a, unit)
+        return (ca.reshape(ca.solve(operator, -ca.vec(q)), a.shape),)
+
+    return apply(lyapunov, A, Q)[0]

@@ -17,6 +17,7 @@ from covocp.errors import ProblemError, describe
 SYMBOLIC = (ca.SX, ca.MX)
 # Relative asymmetry, and relative size of a negative eigenvalue, that count as roundoff.
 ROUNDOFF = 1e-9
+SINGLE_ROUNDOFF = 1e-5  # in arrays of float32
 
 
 def is_symbolic(*values: Any) -> bool:
@@ -75,12 +76,13 @@ def weight(name: str, value: Any, size: int | None = None, *, definite: bool = F
     if not isinstance(result, ca.DM):
         return result
     numbers = result.full()
-    scale = float(np.abs(numbers).max(initial=0.0))
-    if np.abs(numbers - numbers.T).max(initial=0.0) > ROUNDOFF * scale:
+    single = getattr(value, "dtype", None) == np.float32
+    tolerance = (SINGLE_ROUNDOFF if single else ROUNDOFF) * float(np.abs(numbers).max(initial=0.0))
+    if np.abs(numbers - numbers.T).max(initial=0.0) > tolerance:
         raise _wrong(name, "a symmetric matrix", f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}")
     if numbers.size:
         smallest = float(np.linalg.eigvalsh(numbers)[0])
-        if smallest < -ROUNDOFF * scale or (definite and smallest <= 0.0):
+        if smallest < -tolerance or (definite and smallest <= 0.0):
             kind = "positive definite" if definite else "positive semidefinite"
             raise _wrong(name, f"a {kind} matrix", f"a smallest eigenvalue of {smallest:.3g}")
     return result
@@ -99,9 +101,9 @@ def numeric(name: str, value: Any) -> NDArray[np.float64]:
 
 def restored(value: Any, like: Any) -> Any:
     """A result in the kind and shape of an argument: numpy where it is numeric, flat where that was, else as it is."""
-    if not isinstance(value, ca.DM):
+    if isinstance(value, SYMBOLIC):
         return value
-    numbers: NDArray[np.float64] = np.asarray(value.full())
+    numbers: NDArray[Any] = np.asarray(value.full() if isinstance(value, ca.DM) else value)
     dimensions = np.ndim(like) if not isinstance(like, (ca.DM, *SYMBOLIC)) else 2
     if dimensions == 0 and numbers.size == 1:
         return float(numbers.item())
@@ -115,7 +117,5 @@ def symmetrised(value: Any) -> Any:
 
 def _wrong(name: str, expected: str, received: str) -> ProblemError:
     return ProblemError(
-        describe(
-            f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}"
-        )
+        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}")
     )
