@@ -175,9 +175,11 @@ class _Active:
 def _arguments(extremal: Extremal) -> tuple[Any, ...]:
     """The arguments of `_functions` after the control: start, T, parameters, multipliers."""
     t, m = extremal.trajectory, extremal.multipliers
+    final_matrices = m.final_matrices.copy()
+    final_matrices[extremal.statement.entries(extremal.statement.behind)] = 0.0  # they start there: nothing holds them
     return (
         *(t.x[0], t.e[0], t.duration, extremal.parameters),
-        *(m.final, m.final_matrices, m.end, m.path.T, m.states.T),
+        *(m.final, final_matrices, m.end, m.path.T, m.states.T),
     )
 
 

@@ -11,7 +11,7 @@ values (`discrete_costates`), and by integrating the continuous adjoint equation
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -200,10 +200,46 @@ def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
     by_x, by_u, by_duration, kicks = (np.asarray(v.full()).T for v in outputs)
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
-    by_x[-1] = 0.0  # the slope by x(T) through the matrices that start there is part of the multipliers `final`
+    last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
     interval = adjoint_interval(st, mesh.substeps, None)
     costates, slopes, total = _swept(extremal, interval, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T))
     return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
+
+
+def without_passage(extremal: Extremal) -> Extremal:
+    """The extremal whose multipliers `final` are l of p(T) = k_x + l + (slope through the matrices that start at T).
+
+    A transcription that eliminates these matrices sees l and the slope as one.
+    """
+    st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
+    if st.matrix_end is None or not st.matrix_end.jac_sparsity(0, 0).nnz():
+        return extremal
+    weights = impulses(extremal)[:, st.nx :]
+    weights[-1] = terminal_costates(extremal)[1]
+    behind = st.entries(st.behind)
+    weights[-1, behind] -= m.final_matrices[behind]
+    outputs = passage_slopes(st, extremal.mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    through = np.asarray(outputs[0].full())[:, -1]
+    return replace(extremal, multipliers=replace(m, final=m.final - through))
+
+
+def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float]:
+    """Slopes by x(T) and by T through the matrices that start at T, nu' S(T), nu = k_S - P_S.
+
+    Args:
+        extremal: the solution.
+        given: costates P_S of these matrices at T.
+    """
+    st, t = extremal.statement, extremal.trajectory
+    if st.matrix_end is None:
+        return np.zeros(st.nx), 0.0
+    behind = st.entries(st.behind)
+    nu = terminal_costates(extremal)[1][behind] - extremal.multipliers.final_matrices[behind] - given
+    x, duration = ca.MX.sym("x", st.nx), ca.MX.sym("T")
+    value = ca.dot(ca.DM(nu), st.matrix_end(x, duration, extremal.parameters))
+    function = ca.Function("passage_end", [x, duration], [ca.gradient(value, x), ca.gradient(value, duration)])
+    by_x, by_duration = function(t.x[-1], t.duration)
+    return np.asarray(by_x.full()).ravel(), float(by_duration)
 
 
 @lru_cache(maxsize=KEPT)
@@ -230,22 +266,27 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
 
 
-def fine_trajectory(extremal: Extremal, substeps: int) -> tuple[Array, Array, Array]:
-    """Each interval integrated again from its node with other substeps.
+def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
+    """Each interval integrated again from its node with other substeps; what runs backward from its later node.
 
     Returns:
-        x and e stacked at the starts of the substeps and at the end (N, substeps + 1, nx + ne), the jump between the
-        ends of the intervals and the next nodes (N, nx + ne), the running cost of each interval (N,).
+        x and e stacked at the starts of the substeps and at the end, (N, substeps + 1, nx + ne).
     """
-    n = extremal.mesh.intervals
-    start = _stack(extremal)
-    interval = full_interval(extremal.statement, substeps, extremal.mesh.step)
-    end, fine, cost = interval.map(n)(start[:, :n], *_columns(extremal))
-    size = start.shape[0]
-    inside = np.asarray(fine.full()).T.reshape(n, substeps, size)
-    first = np.asarray(start.full()).T
-    values = np.concatenate([first[:-1, None, :], inside], axis=1)
-    return values, np.asarray(end.full()).T - first[1:], np.asarray(cost.full()).ravel()
+    st, n = extremal.statement, extremal.mesh.intervals
+    z, common = _stack(extremal), _columns(extremal)
+    interval = full_interval(st, substeps, extremal.mesh.step).map(n)
+    size = z.shape[0]
+
+    def run(start: Any, columns: tuple[Any, ...]) -> Array:
+        inside = np.asarray(interval(start, *columns)[1].full()).T.reshape(n, substeps, size)
+        return np.concatenate([np.asarray(start.full()).T[:, None, :], inside], axis=1)
+
+    values = run(z[:, :n], common)
+    if st.behind:
+        before, after, s, ds, duration, parameters = common
+        turned = run(z[:, 1:], (after, before, s + ds, -ds, duration, parameters))
+        values[:, :, _behind(st)] = turned[:, ::-1, _behind(st)]
+    return values
 
 
 def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
@@ -391,7 +432,7 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     """
     st, n = extremal.statement, extremal.mesh.intervals
     size = st.nx + st.ne
-    values, _, _ = fine_trajectory(extremal, 2 * pairs)
+    values = fine_trajectory(extremal, 2 * pairs)
     interval = backward_interval(st, pairs)
     after, *rest = interval.mx_in()
     keep, known = ca.MX.sym("keep", size), ca.MX.sym("known", size)
@@ -403,6 +444,7 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
+    last[: st.nx] += passage_end(extremal, last_given)[0]
     reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
     result = sweep(last, *stacked, points, reversed_given, *(column[:, backward] for column in _columns(extremal)))
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])

@@ -62,8 +62,7 @@ class Terminal:
         names: of all of them, in this order.
         matrices: whether the matrices have an influence on them.
         function: (z, T, p, Y) -> terminal cost k, the values of the conditions, the slopes of both by z (size,
-            1 + q) and by T (1, 1 + q), S(T) = s(x(T), T) inserted and the slopes of k with -Y' s; the part of the
-            slope by x(T) that comes through S(T) (size, 1).
+            1 + q) and by T (1, 1 + q), S(T) = s(x(T), T) inserted and the slopes of k with -Y' s.
     """
 
     fixed: tuple[int, ...]
@@ -129,7 +128,6 @@ class Slopes:
     control: slopes by the control values, (1 + q, K, nu); cost: the part of the running cost alone, (K, nu).
     duration: by T, (1 + q,). start: by z(0), (1 + q, size), the columns p, P, R at t = 0.
     columns: costates and influence functions at the nodes, (N + 1, size, 1 + q).
-    through: the part of p(T) that comes through S(T), (size,).
     middles: values of z in the intervals, and columns at the ends of the pairs: what `reweigh` needs.
     """
 
@@ -138,7 +136,6 @@ class Slopes:
     duration: Array
     start: Array
     columns: Array
-    through: Array
     middles: tuple[Array, ...]
 
 
@@ -245,11 +242,10 @@ def terminal_conditions(statement: Statement) -> Terminal:
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     behind = statement.entries(statement.behind)
     x, e, y = z[: statement.nx], z[statement.nx :], ca.MX.sym("y", len(behind))
-    cost, through = statement.terminal(x, e, duration, p), ca.MX.zeros(z.shape[0])
+    cost = statement.terminal(x, e, duration, p)
     adjoint = cost
     if statement.matrix_end is not None:
-        ends, own = statement.matrix_end(x, duration, p), [statement.nx + k for k in behind]
-        through = ca.jtimes(ends, z, ca.gradient(cost, z)[own] - y, True)
+        ends = statement.matrix_end(x, duration, p)
         e = ca.MX(e)
         e[behind] = ends
         adjoint = statement.terminal(x, e, duration, p) - ca.dot(y, ends)
@@ -266,7 +262,7 @@ def terminal_conditions(statement: Statement) -> Terminal:
         names=(*(f"final value of {names[i]}" for i in fixed), *(end.names[i] for i in rows)),
         matrices=statement.coupled
         or any(j >= statement.nx for j in ca.jacobian(conditions, z).sparsity().get_triplet()[1]),
-        function=ca.Function("terminal", [z, duration, p, y], [cost, conditions, *slopes, ca.densify(through)]),
+        function=ca.Function("terminal", [z, duration, p, y], [cost, conditions, *slopes]),
     )
 
 
@@ -379,7 +375,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
     z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
     given, given_end = _given(sweeps, points, common)
-    _, _, last, by_duration, through = (
+    _, _, last, by_duration = (
         np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters, given_end)
     )
     behind = [sweeps.statement.nx + k for k in sweeps.statement.entries(sweeps.statement.behind)]
@@ -391,7 +387,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), *stacked, *columns)
     at_nodes = np.asarray(starts.full()).reshape(size, n, width)[:, ::-1].transpose(1, 0, 2)
     at_pairs = np.asarray(passed.full()).reshape(size, n, pairs * width)[:, ::-1].transpose(1, 0, 2)
-    middles = (z, np.concatenate([at_nodes, last[None]]), at_pairs, by_duration.ravel(), through.ravel())
+    middles = (z, np.concatenate([at_nodes, last[None]]), at_pairs, by_duration.ravel())
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
@@ -410,7 +406,7 @@ def reweigh(sweeps: Sweeps, slopes: Slopes, u: Array, duration: float, parameter
 
 
 def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middles: tuple[Array, ...]) -> Slopes:
-    z, at_nodes, at_pairs, by_duration, through = middles
+    z, at_nodes, at_pairs, by_duration = middles
     n, size, width = sweeps.mesh.intervals, z.shape[2], at_nodes.shape[2]
     nu = sweeps.statement.nu
 
@@ -437,7 +433,6 @@ def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middle
         duration=by_duration + by_time.reshape(n, width).sum(axis=0),
         start=at_nodes[0].T,
         columns=at_nodes,
-        through=through,
         middles=middles,
     )
 

@@ -21,6 +21,7 @@ from covocp.hamiltonian import (
     fine_trajectory,
     hamiltonian,
     integrated_costates,
+    passage_end,
 )
 from covocp.matrices import Array
 
@@ -103,7 +104,7 @@ def assess(
     """
     st = extremal.statement
     slope, curvature, values, size = _along(extremal, costates)
-    _, slopes, by_duration = discrete_costates(extremal)
+    _, slopes, _ = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
     residual = (
@@ -121,7 +122,7 @@ def assess(
         control_slope=control_slope / scale,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(values) if st.autonomous else None,
-        transversality=_transversality(extremal, by_duration, values) if st.duration.free else None,
+        transversality=_transversality(extremal, costates, values) if st.duration.free else None,
         mesh_error=mesh_error,
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
@@ -214,7 +215,7 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     (not `free`, at the nodes) do not count; nan where H_uu is not positive definite.
     """
     st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
-    values, _, _ = fine_trajectory(extremal, 2 * mesh.substeps)
+    values = fine_trajectory(extremal, 2 * mesh.substeps)
     h = np.diff(extremal.time)[:, None]
     after, rates = np.hstack([costates.state, costates.matrices]), _costate_rates(extremal, costates)
     middle = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
@@ -275,7 +276,7 @@ def _variation(values: Array) -> float:
     return float(np.ptp(values[:, 0]) / max(float(values[:, 1].max()), np.finfo(float).tiny))
 
 
-def _transversality(extremal: Extremal, by_duration: float, values: Array) -> float:
+def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
     """k_T + end conditions' slope + H(T), relative to the largest terms of H."""
     st, trajectory = extremal.statement, extremal.trajectory
     duration = ca.MX.sym("T")
@@ -284,6 +285,8 @@ def _transversality(extremal: Extremal, by_duration: float, values: Array) -> fl
         arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
         value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
     slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
+    behind = st.entries(st.behind)
+    slope += passage_end(extremal, costates.matrices[-1, behind])[1]
     residual = slope + float(values[-1, 0])
     at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
     at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
@@ -301,7 +304,7 @@ def path_violations(extremal: Extremal, points: int) -> Mapping[str, float]:
     """Largest violations of path constraints and state bounds at `points` parts of each interval, by name."""
     st, mesh = extremal.statement, extremal.mesh
     factor = 2 * points if st.running_uses_matrices else points
-    values, _, _ = fine_trajectory(extremal, factor)
+    values = fine_trajectory(extremal, factor)
     n = mesh.intervals
     u = extremal.controls
     c = np.arange(factor + 1) / factor

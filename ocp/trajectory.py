@@ -25,7 +25,8 @@ class Trajectory:
 class Multipliers:
     """Multipliers of the constraints of a statement, in the units of cost per unit of the constraint.
 
-    final: l of p(T) = k_x + l, shape (nx,); zero where the final state is free.
+    final: l of p(T) = k_x + l, shape (nx,); zero where the final state is free. (Where S(T) of an expected cost depends
+        on x(T), its part of p(T) comes beside l.)
     final_matrices: the same for the half-vectors, shape (ne,).
     end, start: of the terminal and initial inequalities.
     path: of the path inequalities at the nodes, shape (N + 1, rows).

@@ -14,6 +14,7 @@ from covocp.checks import check_positive
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
 from covocp.guess import choose_scales, quadrature_weights, stiffness
+from covocp.hamiltonian import without_passage
 from covocp.integrators import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, choose_mesh, choose_step
@@ -207,7 +208,7 @@ class ShootingSolver:
         )
         status = stats["return_status"]
         return Outcome(
-            extremal=extremal,
+            extremal=without_passage(extremal),
             cost_terms={"terminal": values["terminal"], "running": values["running"]},
             converged=success,
             message=self._message(success, status),

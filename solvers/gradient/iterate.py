@@ -75,7 +75,7 @@ class Measures:
     """What the stop test reads; none of it depends on the weighting of the step.
 
     ell: least-squares multipliers; residual: slopes of the Lagrangian with them, (n,); active: entries at a bound that
-    the residual pushes outward; slope, miss: relative; transversality: dJ/dT of the Lagrangian; through: of `Slopes`.
+    the residual pushes outward; slope, miss: relative; transversality: dJ/dT of the Lagrangian.
     """
 
     ell: Array
@@ -84,7 +84,6 @@ class Measures:
     slope: float
     miss: float
     transversality: float
-    through: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +221,6 @@ class Space:
             slope=max(slope, float(extra)),
             miss=float((np.abs(iterate.run.miss) / self.miss_scale).max(initial=0.0)),
             transversality=float(residual[count]) if self.sweeps.statement.duration.free else 0.0,
-            through=linear.slopes.through,
         )
 
     def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Any) -> Any:
@@ -312,7 +310,7 @@ class Space:
         st, mesh = self.sweeps.statement, self.sweeps.mesh
         zero = Multipliers.zero(st, mesh)
         terminal = self.sweeps.terminal
-        final = measures.through.copy()
+        final = np.zeros(st.nx + st.ne)
         final[list(terminal.fixed)] += measures.ell[: len(terminal.fixed)]
         end, bounds = zero.end.copy(), np.zeros((mesh.intervals + 1, st.nx + st.ne))
         end[list(terminal.rows)] = measures.ell[len(terminal.fixed) :]
