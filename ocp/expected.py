@@ -103,7 +103,7 @@ def derive(problem: Problem) -> Problem:
     size = E.shape[0]
     jacobian, density = _measured(derived, size)
     innovation = E @ jacobian.T  # K U
-    information = innovation @ inverse(density) @ innovation.T if jacobian.shape[0] else ca.MX(size, size)
+    information = innovation @ _inverse(density) @ innovation.T if jacobian.shape[0] else ca.MX(size, size)
     if expected.gain is None:
         S, expansion = _add_feedback(derived, expansion)
         running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
@@ -302,6 +302,14 @@ def _trace(a: Any, b: Any) -> Any:
     return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
 
 
+def _inverse(density: Any) -> Any:
+    """`inverse`, in scalar operations where it is a full matrix of expressions: CasADi solves those numerically."""
+    if density.is_constant() or density.sparsity().is_diag():
+        return inverse(density)
+    entries = ca.SX.sym("entries", *density.shape)
+    return ca.Function("inverse", [entries], [ca.inv(entries)])(density)
+
+
 def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
     """One matrix over some entries from weights by name, a number or a matrix; None without weights."""
     if weights is None:
@@ -392,7 +400,7 @@ def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansio
     half = ca.MX.sym(FEEDBACK, half_length(size))
     S = unpack_symbolic(half, size)
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
-    weight = inverse(expansion.B)
+    weight = _inverse(expansion.B)
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
     problem.matrices.append(
         Matrix(
