@@ -38,7 +38,9 @@ BAND = 0.13  # opacity
 NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
 PANEL = (3.3, 2.15)  # width, height in inches
 LONGEST_LINE = 26  # characters along the height of a panel
+SINGLE = (4.8, 3.2)  # of a panel alone
 HEAD = 0.6  # inches for title and legend
+LEGEND_HANDLE, LEGEND_LETTER = 0.62, 0.067  # inches of a line with its blanks, and of a letter
 RESOLUTION = 200  # dots an inch
 # Backends of matplotlib that show nothing by themselves.
 SILENT = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
@@ -115,7 +117,8 @@ def plot_solutions(
     abscissa = "time [s]" if over is None else abscissa_label(given, over, words)
     rows, columns = _grid(len(panels))
     with matplotlib.rc_context(STYLE):
-        figure = _figure((PANEL[0] * columns, PANEL[1] * rows + HEAD))
+        width, height = SINGLE if len(panels) == 1 else PANEL
+        figure = _figure((width * columns, height * rows + HEAD))
         axes = figure.subplots(rows, columns, squeeze=False)
         for place, panel in zip(axes.ravel(), panels, strict=False):
             _draw(place, panel, len(given), tuple(sigmas))
@@ -228,7 +231,18 @@ def _legend(
     if any(_near_bounds(panel) for panel in panels):
         handles.append(Line2D([], [], label="bound", **BOUND))
     if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5))
+        labels = [str(handle.get_label()) for handle in handles]
+        ncols = _legend_columns(labels, figure.get_figwidth())
+        figure.legend(handles=handles, loc="outside lower center", ncols=ncols)
+
+
+def _legend_columns(labels: list[str], width: float) -> int:
+    """As many columns, filled one after the other, as fit into a width in inches."""
+    for columns in range(len(labels), 1, -1):
+        longest = [max(map(len, part)) for part in np.array_split(labels, columns)]
+        if sum(LEGEND_HANDLE + LEGEND_LETTER * n for n in longest) <= width:
+            return columns
+    return 1
 
 
 def _line(i: int) -> dict[str, Any]:
