@@ -30,6 +30,9 @@ from covocp.statement import Loop, Statement
 
 # Share of the largest slope below which a direction of the state counts as moved by nothing.
 UNMOVED = 1e-10
+# Pairs of substeps for one time constant of filter or loop in an interval, and the most of them.
+STEPS_PER_RATE = 1.0
+LARGEST_PAIRS = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +94,7 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
     st, mesh = extremal.statement, extremal.mesh
     size = len(st.augmented)
     statistics = truth if truth is not None else design_statistics(extremal)
-    n, m = mesh.intervals, 2 * max(1, mesh.substeps // 2)
+    n, m = mesh.intervals, _substeps(extremal)
     fine = fine_trajectory(extremal, m)
     common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
@@ -122,6 +125,31 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
         other_cost=other,
         conservation=_conservation(extremal, fine, values, statistics),
     )
+
+
+def _substeps(extremal: Extremal) -> int:
+    """Even number of steps an interval that resolves filter and feedback: S falls fast before a heavily weighted end."""
+    st, count = extremal.statement, extremal.mesh.intervals + 1
+    x, u, e, t, duration, p = extremal.columns()
+    size = len(st.augmented)
+
+    def each(value: Any) -> Array:
+        numbers = np.asarray(value.full())
+        return numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
+
+    F, G = (each(v) for v in _loop(st).expansion.map(count)(x, u, t, duration, p)[:2])
+    C = each(_loop(st).gain.map(count)(x, u, e, t, duration, p))
+    block = next(b for b in st.matrices if b.estimation)
+    loops = [F - G @ C]
+    if st.measurement is not None:
+        _, M, U = (each(v) for v in st.measurement.map(count)(x, u, t, duration, p))
+        E = unpack(extremal.trajectory.e[:, block.span], size)
+        loops.append(F - E @ M.transpose(0, 2, 1) @ np.linalg.solve(U, M))
+    rates = [np.abs(np.linalg.eigvals(matrix)).max(axis=1, initial=0.0) for matrix in loops]
+    h = np.diff(extremal.time)
+    stiff = max(float((np.maximum(rate[1:], rate[:-1]) * h).max(initial=0.0)) for rate in rates)
+    pairs = int(np.clip(np.ceil(STEPS_PER_RATE * stiff), max(1, extremal.mesh.substeps // 2), LARGEST_PAIRS))
+    return 2 * pairs
 
 
 def design_statistics(extremal: Extremal) -> Statistics:
@@ -218,7 +246,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
     F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
     slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
-    vectors, values, _ = np.linalg.svd(slopes, full_matrices=True)
+    vectors, values, _ = np.linalg.svd(np.linalg.qr(slopes.T, mode="r").T)  # a few rows, thousands of columns
     values = np.append(values, np.zeros(units.size - values.size))
     kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
     if not kept.shape[1]:

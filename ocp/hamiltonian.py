@@ -62,6 +62,14 @@ def hamiltonian(
     return make
 
 
+def duration_slope(statement: Statement) -> ca.Function:
+    """(x, u, e, t, T, p, costate of x, costate of e) -> H_T, where rates or cost contain the duration itself."""
+    inner = hamiltonian(statement)("value", lambda h, x, u, e, t: [h])
+    symbolic: Any = statement.symbolic
+    symbols = [symbolic.sym(inner.name_in(i), inner.size1_in(i)) for i in range(inner.n_in())]
+    return ca.Function("duration_slope", symbols, [ca.densify(ca.gradient(inner(*symbols), symbols[4]))])
+
+
 def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list[Array]:
     """A function made by `hamiltonian` at all nodes; each output with the node first."""
     count = extremal.mesh.intervals + 1

@@ -176,7 +176,7 @@ class Solver:
             closed,
             converged=outcome.converged and closed.converged,
             message=f"{outcome.message}: nominal of the deterministic cost, filter and feedback around it",
-            violations={**closed.violations, **outcome.violations},
+            violations=outcome.violations,
             stats={**outcome.stats, "nominal": "deterministic"},
         )
 
@@ -210,7 +210,7 @@ class Solver:
         with Progress("", show=False) as reporter:
             start = make_guess(self._solved, self._prepared.mesh, values, None)
             outcome = self._closed(self._prepared.solve(values, start, reporter))
-        return float(sum(outcome.cost_terms.values())) if outcome.converged and not outcome.violations else None
+        return float(sum(outcome.cost_terms.values())) if outcome.converged else None
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
         """The best of the problem's own start and several random ones."""

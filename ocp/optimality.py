@@ -18,6 +18,7 @@ from covocp.hamiltonian import (
     Costates,
     along,
     discrete_costates,
+    duration_slope,
     fine_trajectory,
     hamiltonian,
     integrated_costates,
@@ -277,7 +278,7 @@ def _variation(values: Array) -> float:
 
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
-    """k_T + end conditions' slope + H(T), relative to the largest terms of H."""
+    """k_T + slope of the end conditions + int H_T dt + H(T), relative to the largest terms of H."""
     st, trajectory = extremal.statement, extremal.trajectory
     duration = ca.MX.sym("T")
     value = st.terminal(trajectory.x[-1], trajectory.e[-1], duration, extremal.parameters)
@@ -287,6 +288,8 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array) -> fl
     slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
     behind = st.entries(st.behind)
     slope += passage_end(extremal, costates.matrices[-1, behind])[1]
+    (explicit,) = along(duration_slope(st), extremal, costates)
+    slope += float(np.trapezoid(explicit[:, 0], extremal.time))
     residual = slope + float(values[-1, 0])
     at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
     at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
