@@ -337,7 +337,7 @@ def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> An
             rows.append(ca.horzcat(*blocks))
         weights = ca.vertcat(*rows)
     names = [e.name if e.size == 1 else f"{e.name}[{i}]" for e in problem.controls for i in range(e.size)]
-    constant = weights.is_constant()
+    constant = not ca.symvar(weights)  # constants that CasADi has not folded among them
     numbers = ca.evalf(weights).full() if constant else None
     for i, name in enumerate(names):
         if not weights.sparsity().has_nz(i, i) or (numbers is not None and numbers[i, i] == 0):
