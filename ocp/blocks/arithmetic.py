@@ -75,6 +75,11 @@ def unit(like: Any, size: int) -> Any:
     return np.eye(size, dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX.eye(size)
 
 
+def zeros(like: Any, rows: int, columns: int) -> Any:
+    """Zeros of the kind of another matrix."""
+    return np.zeros((rows, columns), dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX(rows, columns)
+
+
 def symmetric(value: Any) -> Any:
     """The symmetric part, in the precision of the value."""
     return (value + value.T) / 2

@@ -94,16 +94,28 @@ def discretise(A: Any, Q: Any, step: Any) -> tuple[Any, Any]:
         ProblemError: shapes that do not fit, Q not positive semidefinite, a step that is not positive.
     """
     a = square("A", A)
-    q, h = weight("Q", Q, a.shape[0]), matrix("step", step, (1, 1))
-    if not is_symbolic(h) and not float(h) > 0.0:
-        raise ProblemError(
-            describe("The step is not positive.", expected="a time [s]", received=f"{float(h):g}", remedy="correct it")
-        )
+    q, h = weight("Q", Q, a.shape[0]), time_step(step)
     if is_symbolic(a, q, h):
         transition, noise = apply(_series, a, q, h)
     else:
         transition, noise = _van_loan(a.full(), q.full(), float(h))
     return restored(transition, A), restored(noise, Q)
+
+
+def time_step(value: Any) -> Any:
+    """A step as a CasADi scalar.
+
+    Raises:
+        ProblemError: a number that is not positive.
+    """
+    step = matrix("step", value, (1, 1))
+    if not is_symbolic(step) and not float(step) > 0.0:
+        raise ProblemError(
+            describe(
+                "The step is not positive.", expected="a time [s]", received=f"{float(step):g}", remedy="correct it"
+            )
+        )
+    return step
 
 
 def _van_loan(A: NDArray[np.float64], Q: NDArray[np.float64], h: float) -> tuple[Any, Any]:
