@@ -25,8 +25,9 @@ LANES = 64
 
 def _choose(condition: Array, value: Array, out: Array) -> None:
     """CasADi's if_else_zero: the value where the condition holds, else zero (also where the value is NaN)."""
-    out[...] = 0.0
-    np.copyto(out, value, where=condition != 0)
+    absent = condition == 0  # first: the result may be written over either operand
+    np.copyto(out, value)
+    np.copyto(out, 0.0, where=absent)
 
 
 def _twice(value: Array, out: Array) -> None:
@@ -118,11 +119,10 @@ def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Col
     Returns:
         Buffers and what evaluates them; every call overwrites the outputs.
     """
-    if function.is_a("SXFunction") and all(
-        function.instruction_id(k) in OPERATIONS or function.instruction_id(k) in (ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT)
-        for k in range(function.n_instructions())
-    ):
-        return _elementwise(function, width, shared)
+    if function.is_a("SXFunction"):
+        known = {*OPERATIONS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+        if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
+            return _elementwise(function, width, shared)
     return _mapped(function, width, shared)
 
 
@@ -168,11 +168,12 @@ def _mapped(function: ca.Function, width: int, shared: tuple[int, ...]) -> Colum
         for i in range(function.n_in())
     ]
     results = [np.zeros((width, function.size1_out(i))) for i in range(function.n_out())]
+    buffer: Any
     buffer, evaluate = mapped.buffer()
     for i, array in enumerate(memory):
-        buffer.set_arg(i, memoryview(array))
+        buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
     for i, array in enumerate(results):
-        buffer.set_res(i, memoryview(array))
+        buffer.set_res(i, memoryview(array))  # type: ignore[arg-type]
 
     def run(_keep: Any = (buffer, mapped)) -> None:
         evaluate()

@@ -1,0 +1,214 @@
+"""Runs of the actual system, a batch at a time: random numbers by run, moments by groups of runs.
+
+What a run does depends on its number and the seed only. Sums over runs are kept for groups of `LANES` consecutive runs,
+so that they too have the same bits however the runs were divided among batches and workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from covocp.matrices import Array
+from covocp.plan import Plan
+from covocp.vectorised import LANES, padded, vectorise
+
+# Steps whose random numbers are drawn together: they are most of the memory of a batch.
+DRAWN = 64
+
+
+class StoppedError(Exception):
+    """The simulation was interrupted; nothing of this batch is kept."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """Some runs, from number `first`. n: augmented states, m: controls fed back, K: stored times, y = (d, d', du).
+
+    deviation: of the actual system from the nominal at the end, (runs, n); where the run left the domain, just before.
+    estimate: the filter's estimate of it, (runs, n).
+    cost: (runs,); NaN without an expected cost, and where the run left the domain.
+    left: time at which the run left the domain [s], inf where it did not, (runs,).
+    asked, outside: flags by run, (runs, m), (runs, bounded states and controls).
+    asking: number of runs that ask for more control than there is at a stored time, (K, m).
+    count, mean, product, cube, fourth: sums over the runs inside the domain, by group: (groups, K), then of y
+        (groups, K, 2n + m), of y y' and of the third and fourth powers of y.
+    paths: y of the first runs of the simulation, (those in this batch, K, 2n + m), NaN after leaving the domain.
+    """
+
+    first: int
+    deviation: Array
+    estimate: Array
+    cost: Array
+    left: Array
+    asked: Any
+    outside: Any
+    asking: Array
+    count: Array
+    mean: Array
+    product: Array
+    cube: Array
+    fourth: Array
+    paths: Array
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.cost.size)
+
+
+def run_batch(plan: Plan, first: int, last: int, stop: Callable[[], bool] | None = None) -> Batch:
+    """Simulate the runs first, ..., last - 1.
+
+    Args:
+        plan: what is simulated.
+        first: number of the first run, a multiple of `LANES`.
+        last: number after the last one.
+        stop: asked now and then; true to give up.
+
+    Returns:
+        What is kept of them.
+
+    Raises:
+        StoppedError: when `stop` said so.
+    """
+    with np.errstate(all="ignore"):  # runs that leave the domain overflow, and are found
+        return _Simulation(plan, first, last).run(stop or (lambda: False))
+
+
+class _Simulation:
+    """The buffers of one batch."""
+
+    def __init__(self, plan: Plan, first: int, last: int) -> None:
+        """Draw the starts of the runs."""
+        self.plan, self.first, self.runs = plan, first, last - first
+        width = self.width = padded(self.runs)
+        self.step = vectorise(plan.step, width, (3,))
+        self.observe = vectorise(plan.observe, width, (2,))
+        kind = (1,) if plan.pilot else ()
+        self.streams = [
+            np.random.Generator(np.random.PCG64(np.random.SeedSequence(plan.seed, spawn_key=(i, *kind))))
+            for i in range(first, last)
+        ]
+        n, states = plan.size, plan.states
+        drawn = np.zeros((n, width))
+        for i, stream in enumerate(self.streams):
+            drawn[:, i] = stream.standard_normal(n)
+        start = np.zeros((n, width))
+        for i in range(n):
+            for j in range(i + 1):  # elementwise: a product of matrices may depend on the number of runs
+                if plan.spread[i, j] != 0:
+                    start[i] += plan.spread[i, j] * drawn[j]
+        z = self.step.inputs[0]
+        z[:] = plan.start[:, None]
+        z[:states] += start[:states]
+        self.own = plan.unknowns[:, None] + start[states:]
+        self.step.inputs[2][:] = self.own
+        self.observe.inputs[1][:] = self.own
+        self.left = np.full(width, np.inf)
+        self.last = np.zeros((2 * n, width))
+        rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
+        self.asking = np.zeros((times, plan.fed_back))
+        self.count = np.zeros((groups, times))
+        self.sums = [np.zeros((groups, times, rows)) for _ in range(3)]
+        self.products = np.zeros((groups, times, rows, rows))
+        self.paths = np.full((min(max(plan.paths - first, 0), self.runs), times, rows), np.nan)
+
+    def run(self, stop: Callable[[], bool]) -> Batch:
+        """All steps."""
+        plan, step = self.plan, self.step
+        z, w, _, coefficients = step.inputs
+        after, inside, before = step.outputs
+        where = {int(k): i for i, k in enumerate(plan.stored)}
+        self._store(where[0])
+        last = plan.steps.shape[0]
+        for k, noise in self._noises(last, stop):
+            w[:] = noise
+            coefficients[:] = plan.steps[k]
+            step.evaluate()
+            z[:] = after
+            if not inside.all():
+                gone = inside[0] == 0
+                now = gone & np.isinf(self.left)
+                self.left[now], self.last[:, now] = plan.times[k], before[:, now]
+                z[:, gone] = plan.start[:, None]  # anywhere finite: what follows of these runs is not looked at
+            if k + 1 in where:
+                self._store(where[k + 1])
+        return self._batch()
+
+    def _noises(self, steps: int, stop: Callable[[], bool]) -> Iterator[tuple[int, Array]]:
+        """Index and normal numbers (noises, width) of each step, from the stream of each run."""
+        rows, each = self.plan.noises, 2 if self.plan.pairs else 1
+        drawn = np.zeros((self.width, DRAWN * each * rows))
+        for begin in range(0, steps, DRAWN):
+            if stop():
+                raise StoppedError
+            length = min(DRAWN, steps - begin)
+            for i, stream in enumerate(self.streams):
+                drawn[i, : length * each * rows] = stream.standard_normal(length * each * rows)
+            noise = np.ascontiguousarray(drawn.T).reshape(DRAWN, each, rows, self.width)
+            # Two halves of a step have the sum of their noises, of twice the variance.
+            whole = (noise[:, 0] + noise[:, 1]) / np.sqrt(2.0) if self.plan.pairs else noise[:, 0]
+            for j in range(length):
+                yield begin + j, whole[j]
+
+    def _store(self, place: int) -> None:
+        """Add the moments of the runs that are inside."""
+        observe = self.observe
+        observe.inputs[0][:] = self.step.inputs[0]
+        observe.inputs[2][:] = self.plan.stored_coefficients[place]
+        observe.evaluate()
+        rows = self.products.shape[2]
+        y, flags = observe.outputs[0][:rows], observe.outputs[0][rows:]
+        counted = np.isinf(self.left)
+        counted[self.runs :] = False
+        kept = self.paths.shape[0]
+        self.paths[:, place] = np.where(counted[:kept], y[:, :kept], np.nan).T
+        self.asking[place] = np.count_nonzero(np.where(counted, flags, 0.0), axis=1)
+        grouped = np.where(counted, y, 0.0).reshape(rows, -1, LANES)
+        square = grouped * grouped
+        self.count[:, place] = counted.reshape(-1, LANES).sum(axis=1)
+        for total, values in zip(self.sums, (grouped, square * grouped, square * square), strict=True):
+            total[:, place] = values.sum(axis=2).T
+        for i in range(rows):
+            for j in range(i + 1):
+                self.products[:, place, i, j] = (grouped[i] * grouped[j]).sum(axis=1)
+                self.products[:, place, j, i] = self.products[:, place, i, j]
+
+    def _batch(self) -> Batch:
+        """What is kept."""
+        plan, runs, z = self.plan, self.runs, self.step.inputs[0]
+        stayed = np.isinf(self.left[:runs])
+        n = plan.size
+        y = np.where(stayed, self.observe.outputs[0][: 2 * n, :runs], self.last[:, :runs]).T
+        flags: list[Any] = [z[plan.spans[name], :runs].T > 0 for name in ("asked", "outside")]
+        return Batch(
+            first=self.first,
+            deviation=np.ascontiguousarray(y[:, :n]),
+            estimate=np.ascontiguousarray(y[:, n:]),
+            cost=np.where(stayed, self._cost(), np.nan),
+            left=self.left[:runs],
+            asked=flags[0],
+            outside=flags[1],
+            asking=self.asking,
+            count=self.count,
+            mean=self.sums[0],
+            product=self.products,
+            cube=self.sums[1],
+            fourth=self.sums[2],
+            paths=self.paths,
+        )
+
+    def _cost(self) -> Any:
+        """Cost of each run."""
+        plan = self.plan
+        if plan.finish is None:
+            return np.full(self.runs, np.nan)
+        finish = vectorise(plan.finish, self.width, ())
+        finish.inputs[0][:] = self.step.inputs[0]
+        finish.inputs[1][:] = self.own
+        finish.evaluate()
+        return (finish.outputs[0][0] + self.step.inputs[0][plan.spans["cost"]][0])[: self.runs]

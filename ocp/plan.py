@@ -1,0 +1,117 @@
+"""What simulating some runs takes, ready to be sent to another process: CasADi functions and tables of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.matrices import Array
+from covocp.run_step import (
+    Setting,
+    factor,
+    finish_function,
+    observe_function,
+    run_symbols,
+    start_of,
+    step_function,
+)
+from covocp.schedule import Grid, coefficients, stored_indices, table
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """All that a worker needs for any range of runs; the functions are those of `run_step`.
+
+    step: (state of a run, noise, own unknowns, coefficients of the step) -> state after it, whether that is inside the
+        domain, deviation and estimate before it.
+    observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
+    finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
+    steps: coefficients, a row for each step; times: at which they start [s].
+    stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
+    start: state of a run that starts at its mean; unknowns: their mean.
+    spread: factor of the covariance of the start, (n, n).
+    spans: where the parts of a run's state lie.
+    noises: normal numbers that a step takes; states: rows of x; fed_back: controls m.
+    seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
+    pairs: whether each noise is the sum of those of two half steps.
+    paths: number of runs whose histories are kept.
+    """
+
+    step: ca.Function
+    observe: ca.Function
+    finish: ca.Function | None
+    steps: Array
+    times: Array
+    stored: Any
+    stored_coefficients: Array
+    start: Array
+    unknowns: Array
+    spread: Array
+    spans: Mapping[str, slice]
+    noises: int
+    states: int
+    fed_back: int
+    seed: int
+    pilot: bool
+    pairs: bool
+    paths: int
+
+    @property
+    def size(self) -> int:
+        """Rows n of the augmented state."""
+        return int(self.spread.shape[0])
+
+
+def make_plan(
+    setting: Setting,
+    grid: Grid,
+    base: Grid,
+    *,
+    store: int,
+    seed: int,
+    paths: int = 0,
+    pilot: bool = False,
+    pairs: bool = False,
+) -> Plan:
+    """The plan of a simulation.
+
+    Args:
+        setting: what is simulated.
+        grid: the steps; they divide those of `base`.
+        base: the grid among whose times the stored ones are chosen.
+        store: number of stored times.
+        seed: of the random numbers.
+        paths: number of runs whose histories are kept.
+        pilot: whether the runs are for choosing the step.
+        pairs: whether noises are sums of those of two half steps.
+    """
+    design = setting.design
+    chosen = coefficients(design, setting.filter)
+    before, after = table(setting.solution, grid, chosen)
+    varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
+    stored = np.searchsorted(grid.t, base.t[stored_indices(base, store)])
+    run = run_symbols(setting, chosen)
+    return Plan(
+        step=step_function(run, before[0], varying),
+        observe=observe_function(run),
+        finish=finish_function(run),
+        steps=np.hstack([before[:, varying], after[:, varying], grid.h[:, None]]),
+        times=grid.t[:-1],
+        stored=stored,
+        stored_coefficients=np.vstack([before, after[-1:]])[stored],
+        start=start_of(run),
+        unknowns=setting.actual.start[design.states :],
+        spread=np.asarray(ca.DM(factor(setting.actual.variance)).full()),
+        spans=run.spans,
+        noises=run.noises,
+        states=design.states,
+        fed_back=design.fed_back,
+        seed=seed,
+        pilot=pilot,
+        pairs=pairs,
+        paths=paths,
+    )

@@ -1,0 +1,172 @@
+"""The times of a simulation, and what filter and feedback use at each of them: the same for all runs.
+
+The steps divide the intervals of the mesh, so that no step contains a kink or a jump of the nominal control. The
+nominal and its covariances between the nodes are those of `Solution.at`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.actual import System
+from covocp.matrices import Array, pack, unpack_symbolic
+from covocp.riccati import inverse
+from covocp.solution import Solution
+
+Filter = Literal["perturbation", "extended"]
+
+# A division is rounded up unless it is whole to this accuracy: 5 s into steps of 0.25 s are 20, not 21.
+WHOLE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grid:
+    """Steps within the intervals of a mesh.
+
+    t: times, (N + 1,); interval: of the mesh, for each step, (N,).
+    """
+
+    t: Array
+    interval: Any
+
+    @property
+    def steps(self) -> int:
+        """Number of steps N."""
+        return self.t.size - 1
+
+    @property
+    def h(self) -> Array:
+        """Lengths of the steps [s], (N,)."""
+        return np.asarray(np.diff(self.t))
+
+    def divided(self, parts: Any) -> Grid:
+        """Each step divided into equal parts, a number or one for each step."""
+        counts = np.broadcast_to(np.asarray(parts, dtype=int), (self.steps,))
+        step = np.repeat(np.arange(self.steps), counts)
+        inside = np.arange(step.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        starts = self.t[step] + self.h[step] * (inside / counts[step])
+        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step])
+
+    def parts(self, length: Any) -> Any:
+        """Into how many parts each step must be divided so that none is longer than `length`."""
+        return np.maximum(1, np.ceil(self.h / length - WHOLE)).astype(int)
+
+
+def base_grid(solution: Solution, points: int) -> Grid:
+    """The intervals of the mesh, divided so that some points are about equally spread over the time."""
+    mesh = Grid(t=solution.t, interval=np.arange(solution.mesh.intervals))
+    return mesh.divided(mesh.parts(solution.duration / max(1, points - 1)))
+
+
+def stored_indices(grid: Grid, points: int) -> Any:
+    """The grid's nearest times to `points` equally spread ones; the first and the last among them."""
+    wanted = np.linspace(grid.t[0], grid.t[-1], points)
+    after = np.clip(np.searchsorted(grid.t, wanted), 1, grid.steps)
+    nearer = wanted - grid.t[after - 1] < grid.t[after] - wanted
+    return np.unique(after - nearer)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nominal:
+    """What the functions of a statement need at some times: x (K, nx), u (K, nu), e (K, ne), t (K,)."""
+
+    x: Array
+    u: Array
+    e: Array
+    t: Array
+
+    def columns(self, duration: float, parameters: Array) -> tuple[Any, ...]:
+        """Arguments (state, control, matrices, time, duration, parameters), a column for each time."""
+        count = self.t.size
+        fixed = np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
+        return (self.x.T, self.u.T, self.e.T, self.t[None, :], *fixed)
+
+
+def nominal_at(solution: Solution, t: Array, interval: Any) -> Nominal:
+    """The nominal at some times, its control that of the given interval, which matters where it jumps."""
+    sample = solution.at(t)
+    blocks = {kind: [b for b in solution.blocks if b.kind == kind] for kind in ("state", "matrix")}
+    x = np.hstack([sample[b.name].reshape(t.size, b.size) for b in blocks["state"]])
+    e = np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+    nodes, u = solution.t, solution.controls
+    if solution.mesh.control == "constant":
+        return Nominal(x=x, u=u[interval], e=e, t=t)
+    c = ((t - nodes[interval]) / np.diff(nodes)[interval])[:, None]
+    return Nominal(x=x, u=u[interval] + c * (u[interval + 1] - u[interval]), e=e, t=t)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Coefficients:
+    """What filter and feedback use at one time, stacked in a column of `rows` entries.
+
+    function: (state, control, matrices, time, duration, parameters) -> the column.
+    shapes: of the parts by name, in their order: "t", the nominal "x", "u", the gain "C", "extra", the weights B - L_uu
+        of the feedback; for the perturbation filter its gain "K", "drift" F - K M, "input" G - K h_u, and "h", the
+        measurement that is expected along the nominal.
+    """
+
+    function: ca.Function
+    shapes: dict[str, tuple[int, int]]
+
+    @property
+    def rows(self) -> int:
+        """Entries of the column."""
+        return int(self.function.size1_out(0))
+
+    def split(self, column: Any) -> dict[str, Any]:
+        """The parts of a symbolic column by name."""
+        sizes = [rows * columns for rows, columns in self.shapes.values()]
+        pieces = ca.vertsplit(column, np.cumsum([0, *sizes]).tolist())
+        return {
+            name: ca.reshape(piece, *shape) for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)
+        }
+
+
+def coefficients(design: System, kind: Filter) -> Coefficients:
+    """What filter and feedback of a design use, for a kind of filter."""
+    st, n, m = design.statement, design.size, design.fed_back
+    symbolic: Any = st.symbolic
+    sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
+    x, u, e, t, T, p = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    loop = st.loop
+    parts = {
+        "t": t,
+        "x": x,
+        "u": u,
+        "C": symbolic.zeros(0, n) if loop is None else loop.gain(*a),
+        "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
+    }
+    if kind == "perturbation":
+        _, F, G, _, h, M, Hu, U = design.linear(x, u, t, T, p)
+        K = filter_gain(estimation_half(st, e), n, M, U)
+        parts |= {"K": K, "drift": F - K @ M, "input": G - K @ Hu, "h": h}
+    shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
+    assert shapes["C"] == (m, n)
+    return Coefficients(
+        function=ca.Function("coefficients", a, [ca.veccat(*map(ca.densify, parts.values()))]), shapes=shapes
+    )
+
+
+def estimation_half(statement: Any, e: Any) -> Any:
+    """Half-vector of the estimation covariance out of all of them."""
+    return e[next(b for b in statement.matrices if b.estimation).span]
+
+
+def filter_gain(half: Any, size: int, M: Any, U: Any) -> Any:
+    """Kalman gain K = E M' U^-1, (n, r), of the half-vector of E [Schmidt 2.5-3]; no columns without measurements."""
+    E = unpack_symbolic(half, size)
+    return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)
+
+
+def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:
+    """The columns at the starts and at the ends of all steps, (N, rows) each."""
+    sides = []
+    for t in (grid.t[:-1], grid.t[1:]):
+        at = nominal_at(solution, t, grid.interval)
+        values = chosen.function.map(grid.steps)(*at.columns(solution.duration, solution.parameters))
+        sides.append(np.ascontiguousarray(values.full().T))
+    return sides[0], sides[1]

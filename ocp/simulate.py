@@ -1,0 +1,374 @@
+"""Monte Carlo simulation of the actual nonlinear system with its noises, its filter and its feedback."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from covocp.actual import System, actual_system, design_system
+from covocp.batches import Batch, StoppedError
+from covocp.checks import check_bounds, column
+from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
+from covocp.evaluate import evaluate
+from covocp.lookup import name_of
+from covocp.matrices import Array
+from covocp.monte_carlo import MonteCarlo
+from covocp.plan import make_plan
+from covocp.prediction import Prediction, predict
+from covocp.progress import Progress
+from covocp.run_step import Limits, Setting, bounded_rows
+from covocp.sampling import THREE_SIGMA, moments_of
+from covocp.schedule import Filter, Grid, base_grid, nominal_at, stored_indices
+from covocp.solution import Solution
+from covocp.statement import Block, entry_names
+from covocp.step_choice import StepChoice, choose_step, given_step
+from covocp.vectorised import LANES
+from covocp.workers import Harvest, simulate_batches
+
+# Multiple of the largest predicted deviation of a component beyond which a run has left the domain.
+DOMAIN = 100.0
+# What stands for no such limit; a number, so that a comparison finds inf and NaN.
+UNLIMITED = 1e300
+FILTERS = ("perturbation", "extended")
+# How the message of a solution begins that `evaluate` made for a truth.
+UNDER_TRUTH = "evaluated under other statistics"
+
+
+def simulate(
+    solution: Solution,
+    runs: int,
+    seed: int,
+    *,
+    truth: Any = None,
+    executor: Any = None,
+    filter: Filter = "perturbation",
+    step: float | None = None,
+    limits: Any = None,
+    store: int = 101,
+    paths: int = 20,
+    batch: int = 1024,
+    level: float = THREE_SIGMA,
+    progress: bool = True,
+) -> MonteCarlo:
+    """Simulate the actual system of a solution many times [Schmidt 6.2-1, 6.2-2, 6.2-12, 6.2-33].
+
+    Initial deviation and unknowns, process and measurement noise are normal; the filter starts at the mean. The control
+    is u - C dx', with the gain C of the solution. Where the cost is deterministic nothing is fed back: plant and filter
+    run along the open-loop control, which validates the estimation covariance. Run k has the same numbers whatever the
+    number of runs, batches and workers. Memory: `batch` runs at a time, some 4 kB each, in every process.
+
+    Args:
+        solution: of a problem with an expected cost or an estimation covariance.
+        runs: number of runs.
+        seed: of the random numbers, a whole number.
+        truth: what is simulated instead of the design's system: a problem with the same states, unknowns, controls and
+            measurements and any dynamics, noises and variances; or a dict of parameter or unknown to the value that it
+            has in every run. Filter and feedback stay those of the design.
+        executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
+            None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
+        filter: "perturbation" (gains of the design, about the nominal) or "extended" (relinearised at the estimate).
+        step: longest integration step [s]; None: halved until the terminal second moments change by less than a fifth
+            of their sampling error.
+        limits: what the actual control can do: None (no limits: the bounds of the problem are those of the nominal),
+            "bounds" (those of the problem), or a dict of control to (lower, upper). The share of runs that ask for more
+            is reported in each case.
+        store: number of times at which moments are kept.
+        paths: number of runs whose histories are kept at these times.
+        batch: number of runs that are simulated together; rounded up to a multiple of 64.
+        level: probability of the confidence bands.
+        progress: whether to show the progress on a terminal.
+
+    Returns:
+        Moments, terminal scatter, costs, shares of runs, and a verdict on the linear prediction. After Ctrl-C those of
+        the finished runs, with a warning.
+
+    Raises:
+        ProblemError: an argument is wrong, the truth does not fit, or there is nothing to simulate.
+        SolveError: no run could be simulated.
+    """
+    request = Request(
+        runs=runs, seed=seed, store=store, paths=paths, batch=batch, level=level, filter=filter, step=step
+    )
+    design = _design(solution)
+    actual = actual_system(design, truth)
+    base = base_grid(solution, store)
+    expected = predict(solution, design, design, base)
+    true = expected if truth is None else predict(solution, design, actual, base)
+    setting = Setting(
+        solution=solution,
+        design=design,
+        actual=actual,
+        filter=filter,
+        limits=_limits(design, limits),
+        domain=_domain(expected),
+    )
+    with Progress(f"simulating {solution.name}", progress) as reporter:
+        chosen = _step(setting, base, true, request, reporter)
+        plan = make_plan(setting, chosen.grid, base, store=store, seed=seed, paths=paths)
+        harvest = simulate_batches(plan, request.ranges, executor, lambda: reporter.stop, _reporting(reporter))
+    _tell(harvest, runs)
+    return _result(setting, request, chosen, base, (expected, true), harvest, truth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What the user asked for; checked on construction. See `simulate`."""
+
+    runs: int
+    seed: int
+    store: int
+    paths: int
+    batch: int
+    level: float
+    filter: Filter
+    step: float | None
+
+    def __post_init__(self) -> None:
+        """Refuse what means nothing."""
+        for name, least in (("runs", 2), ("seed", 0), ("store", 2), ("paths", 0), ("batch", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+                raise _wrong(name, f"a whole number, {least} or more", value)
+        if self.filter not in FILTERS:
+            raise _wrong("filter", " or ".join(map(repr, FILTERS)), self.filter)
+        for name, value, most in (("step", self.step, np.inf), ("level", self.level, 1.0)):
+            number = 0.5 if value is None and name == "step" else value
+            if isinstance(number, bool) or not isinstance(number, (int, float, np.number)) or not 0 < number < most:
+                raise _wrong(
+                    name, "a number between 0 and 1" if name == "level" else "a number > 0 [s], or None", value
+                )
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """First run of each batch, and the one after its last."""
+        width = -(-self.batch // LANES) * LANES
+        return [(first, min(first + width, int(self.runs))) for first in range(0, int(self.runs), width)]
+
+
+def _wrong(name: str, expected: str, received: Any) -> ProblemError:
+    return ProblemError(
+        describe(
+            f"The argument '{name}' of simulate() is wrong.",
+            expected=expected,
+            received=repr(received)[:100],
+            remedy=f"correct {name}=",
+        )
+    )
+
+
+def _design(solution: Solution) -> System:
+    """The system of a solution, which should have converged."""
+    if not isinstance(solution, Solution):
+        raise ProblemError(
+            describe(
+                "This cannot be simulated.",
+                expected="a Solution",
+                received=type(solution).__name__,
+                remedy="solve or evaluate the problem first: simulate(solve(problem), runs, seed)",
+            )
+        )
+    if solution.message.startswith(UNDER_TRUTH):
+        raise ProblemError(
+            describe(
+                "This solution was evaluated under other statistics, which simulate() does not see in it.",
+                expected="the solution of the design",
+                received=f"'{solution.name}', {solution.message}",
+                remedy="simulate(design, runs, seed, truth=...) with the same truth",
+            )
+        )
+    design = design_system(solution)
+    if not solution.converged:
+        warnings.warn(
+            f"The solution that is simulated did not converge ({solution.message}): its nominal, filter and feedback "
+            "may mean nothing.",
+            CovocpWarning,
+            stacklevel=3,
+        )
+    return design
+
+
+def _limits(design: System, limits: Any) -> Limits:
+    """What the actual control can do, and what counts as all that there is."""
+    m = design.fed_back
+    least, most = (bound[:m].copy() for bound in design.statement.control_bounds)
+    if limits is None:
+        free = np.full(m, np.inf)
+        return Limits(lower=-free, upper=free, least=least, most=most)
+    if isinstance(limits, Mapping):
+        blocks = {b.name: b for b in design.statement.controls if b.offset < m}
+        for key, value in limits.items():
+            block = blocks[name_of(key, design.statement.symbols, tuple(blocks))]
+            least[block.span], most[block.span] = _pair(block, value)
+    elif not isinstance(limits, str) or limits != "bounds":
+        raise _wrong("limits", "None, 'bounds', or a dict of control to (lower, upper)", limits)
+    return Limits(lower=least, upper=most, least=least, most=most)
+
+
+def _pair(block: Block, value: Any) -> tuple[Array, Array]:
+    """Lower and upper limits of a control."""
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise _wrong(f"limits of '{block.name}", "a pair (lower, upper)", value)
+    low, high = (
+        column(block.name, what, v, block.size, inf=True)
+        for what, v in zip(("lower limit", "upper limit"), value, strict=True)
+    )
+    check_bounds(block.name, low, high)
+    return low, high
+
+
+def _domain(expected: Prediction) -> Array:
+    """Largest deviations that count as inside."""
+    largest = np.sqrt(np.diagonal(expected.deviation, axis1=1, axis2=2).clip(0.0)).max(axis=0)
+    return np.asarray(np.where(largest > 0, DOMAIN * largest, UNLIMITED))
+
+
+def _step(setting: Setting, base: Grid, true: Prediction, request: Request, reporter: Progress) -> StepChoice:
+    """The given step, or the one at which the statistics settle."""
+    if request.step is not None:
+        return given_step(base, float(request.step))
+    try:
+        chosen = choose_step(
+            setting, base, true.rates, runs=request.runs, seed=request.seed, stop=lambda: reporter.stop
+        )
+    except StoppedError:
+        raise KeyboardInterrupt from None  # nothing is simulated yet
+    if not chosen.settled:
+        warnings.warn(
+            f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. Give step=, smaller.",
+            CovocpWarning,
+            stacklevel=3,
+        )
+    return chosen
+
+
+def _reporting(reporter: Progress) -> Callable[[Batch], None]:
+    """What tells the progress after each batch: runs, mean cost, share of the runs that left the domain."""
+    counts = {"runs": 0, "left": 0, "costs": 0}
+    total = [0.0]
+
+    def report(batch: Batch) -> None:
+        costs = batch.cost[np.isfinite(batch.cost)]
+        counts["runs"] += batch.runs
+        counts["left"] += int(np.isfinite(batch.left).sum())
+        counts["costs"] += costs.size
+        total[0] += float(costs.sum())
+        reporter.update(counts["runs"], total[0] / max(1, counts["costs"]), counts["left"] / counts["runs"])
+
+    return report
+
+
+def _tell(harvest: Harvest, runs: int) -> None:
+    """Warn of runs that are missing.
+
+    Raises:
+        SolveError: where all are.
+    """
+    done = sum(batch.runs for batch in harvest.batches)
+    if harvest.interrupted:
+        if not done:
+            raise KeyboardInterrupt
+        message = f"Interrupted: {done} of {runs} runs were simulated."
+        warnings.warn(message, CovocpWarning, stacklevel=3)
+    if not harvest.failures:
+        return
+    listed = "".join(f"\n  {failure}" for failure in harvest.failures[:10])
+    if not done:
+        raise SolveError(f"No run was simulated: every task failed.{listed}")
+    warnings.warn(f"{done} of {runs} runs were simulated; the others failed:{listed}", CovocpWarning, stacklevel=3)
+
+
+def _result(
+    setting: Setting,
+    request: Request,
+    chosen: StepChoice,
+    base: Grid,
+    predictions: tuple[Prediction, Prediction],
+    harvest: Harvest,
+    truth: Any,
+) -> MonteCarlo:
+    """The batches put together."""
+    design, solution, batches = setting.design, setting.solution, harvest.batches
+    expected, true = predictions
+    at = stored_indices(base, request.store)
+    intervals = base.interval[np.minimum(at, base.steps - 1)]
+    nominal = nominal_at(solution, base.t[at], intervals)
+    unknowns = np.tile(design.start[design.states :], (at.size, 1))
+    limits, m = setting.limits, design.fed_back
+    runs = sum(batch.runs for batch in batches)
+    costs = _predicted_costs(solution, truth) if setting.costs else (np.nan, np.nan)
+
+    def joined(name: str) -> Array:
+        values = np.concatenate([getattr(batch, name) for batch in batches])
+        values.setflags(write=False)
+        return values
+
+    return MonteCarlo(
+        name=solution.name,
+        requested=int(request.runs),
+        numbers=np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches]),
+        seed=int(request.seed),
+        filter=request.filter,
+        fed_back=m > 0,
+        truth=_in_words(truth),
+        level=float(request.level),
+        step=chosen,
+        t=base.t[at],
+        nominal=np.hstack([nominal.x[:, : design.states], unknowns]),
+        nominal_control=nominal.u[:, :m],
+        moments=moments_of(batches),
+        predicted=true.deviation[at],
+        predicted_error=true.error[at],
+        predicted_mean=true.mean[at, : design.size],
+        design=expected.deviation[at],
+        design_error=expected.error[at],
+        deviations=joined("deviation"),
+        estimates=joined("estimate"),
+        costs=joined("cost"),
+        design_cost=costs[0],
+        predicted_cost=costs[1],
+        left=joined("left"),
+        domain=setting.domain,
+        asked=joined("asked"),
+        asking=np.sum([batch.asking for batch in batches], axis=0) / runs,
+        limits=(limits.least, limits.most),
+        limited=bool(np.isfinite(limits.lower).any() or np.isfinite(limits.upper).any()),
+        outside=joined("outside"),
+        bounded=_bounded(design),
+        paths=joined("paths"),
+        failed=harvest.failures,
+        interrupted=harvest.interrupted,
+        blocks=design.statement.blocks,
+        augmented=design.statement.augmented,
+        symbols=design.statement.symbols,
+    )
+
+
+def _bounded(design: System) -> tuple[str, ...]:
+    """Names of the states and fed-back controls with bounds, in the order of the flags."""
+    st = design.statement
+    rows = bounded_rows(design)
+    names = entry_names(st.states), entry_names(st.controls)
+    return tuple(name[i] for name, chosen in zip(names, rows, strict=True) for i in chosen)
+
+
+def _predicted_costs(solution: Solution, truth: Any) -> tuple[float, float]:
+    """Expected cost by the design, and by linear theory for the truth; NaN where that knows other dynamics."""
+    if truth is None:
+        return solution.cost, solution.cost
+    try:
+        return solution.cost, evaluate(solution, truth=truth).cost
+    except (ProblemError, RuntimeError):  # `evaluate` takes other statistics only, of what has second derivatives
+        return solution.cost, np.nan
+
+
+def _in_words(truth: Any) -> str:
+    """The truth in a few words; "" where it is the design's system."""
+    if truth is None:
+        return ""
+    if isinstance(truth, Mapping):
+        return ", ".join(f"{key} = {value}" for key, value in truth.items())
+    return str(truth.name) or "another system"

@@ -1,0 +1,114 @@
+"""What print shows of a simulation: a table at the end and sentences."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from covocp.matrices import Array
+from covocp.report import number, render_table, wrapped
+from covocp.verdict import Entry
+
+if TYPE_CHECKING:
+    from covocp.monte_carlo import MonteCarlo
+
+# Failures that are listed one by one.
+LISTED = 5
+
+
+def summary(sample: MonteCarlo) -> str:
+    """A simulation in words and tables of plain text, at most 100 columns wide."""
+    parts = [
+        _head(sample),
+        _entries(sample, "deviation at T", sample.verdict.deviations, sample.design),
+        _entries(sample, "error of the filter at T", sample.verdict.errors, sample.design_error),
+        _cost(sample),
+        _shares(sample),
+        wrapped(str(sample.verdict), ""),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _head(sample: MonteCarlo) -> str:
+    name = sample.name or "problem without a name"
+    what = f"{sample.filter} filter" + (" and feedback" if sample.fed_back else ", no feedback (open-loop control)")
+    lines = [f"{name}: {sample.runs} runs of the actual system, seed {sample.seed}, {what}"]
+    if sample.truth:
+        lines.append(f"truth: {sample.truth}")
+    step = sample.step
+    length = (
+        f"{step.longest:.6g} s"
+        if np.isclose(step.shortest, step.longest)
+        else (f"{step.shortest:.3g} to {step.longest:.3g} s")
+    )
+    lines.append(f"step: {length}, {step.reason}")
+    if sample.interrupted:
+        lines.append(f"INTERRUPTED: {sample.runs} of {sample.requested} runs were simulated")
+    lines += [f"FAILED: {failure}" for failure in sample.failed[:LISTED]]
+    if len(sample.failed) > LISTED:
+        lines.append(f"FAILED: {len(sample.failed) - LISTED} other tasks")
+    return "\n".join(wrapped(line) for line in lines)
+
+
+def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design: Array) -> str:
+    """One row for each component; the design's own expectation where the truth is another system."""
+    columns = [title, "predicted", "sample", "band", "ratio", "mean", "robust", ""]
+    rows = []
+    for i, entry in enumerate(entries):
+        rows.append(
+            [
+                entry.name,
+                *(number(value, 4) for value in (entry.predicted, entry.sample)),
+                f"{number(entry.low, 4)} .. {number(entry.high, 4)}",
+                number(entry.ratio, 4),
+                number(entry.bias, 3),
+                number(entry.robust, 4),
+                "" if entry.inside else "OUTSIDE",
+            ]
+        )
+        if sample.truth:
+            expected = float(np.sqrt(design[-1, i, i]))
+            rows[-1].insert(1, number(expected, 4))
+    if sample.truth:
+        columns.insert(1, "design")
+    return render_table(columns, rows, words=(0, len(columns) - 1))
+
+
+def _cost(sample: MonteCarlo) -> str:
+    if not np.isfinite(sample.cost):
+        return ""
+    text = f"mean cost {number(sample.cost, 6)} (standard error {number(sample.cost_error, 2)})"
+    if np.isfinite(sample.predicted_cost):
+        text += f", predicted {number(sample.predicted_cost, 6)}"
+    if sample.truth and np.isfinite(sample.design_cost):
+        text += f", by the design {number(sample.design_cost, 6)}"
+    gone = int(np.count_nonzero(~sample.stayed))
+    return wrapped(text + (f"; without the {gone} runs that left the domain" if gone else ""))
+
+
+def _shares(sample: MonteCarlo) -> str:
+    """Who left what, and what the columns mean."""
+    factor = "inside the domain" if sample.left_share == 0 else "that stayed inside the domain"
+    lines = [
+        f"Predicted, sample and robust are standard deviations about the nominal, of the runs {factor} (robust: from "
+        f"the median of all runs); the band has a probability of {100 * sample.level:.4g} %."
+    ]
+    if sample.left_share:
+        first = float(sample.left.min())
+        lines.append(
+            f"{100 * sample.left_share:.3g} % of the runs left the domain (100 predicted deviations), the first at "
+            f"{first:.4g} s."
+        )
+    if sample.asked_share:
+        most = 100 * float(sample.asking.max(initial=0.0))
+        kept = "it was limited to that" if sample.limited else "they were given it: limits= changes that"
+        lines.append(
+            f"{100 * sample.asked_share:.3g} % of the runs asked for more control than there is ({most:.3g} % at one "
+            f"instant); {kept}."
+        )
+    outside = {name: share for name, share in sample.outside_share.items() if share}
+    if outside:
+        listed = ", ".join(f"{name} {100 * share:.3g} %" for name, share in outside.items())
+        lines.append(f"Runs outside the bounds at some instant: {listed}.")
+    return "\n".join(wrapped(line) for line in lines)

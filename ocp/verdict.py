@@ -1,0 +1,165 @@
+"""Whether the linear prediction holds for a simulation, and if not, why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from covocp.matrices import Array
+from covocp.sampling import degrees_of_freedom, mean_square_band, robust_deviation
+
+if TYPE_CHECKING:
+    from covocp.monte_carlo import MonteCarlo
+
+# A run that ends this many predicted deviations away counts as unstable: no normal one does.
+UNSTABLE = 10.0
+# A share of runs below this explains nothing.
+NOTICEABLE = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One component at the end: predicted standard deviation, that of the sample with its band, the bias."""
+
+    name: str
+    predicted: float
+    sample: float
+    low: float
+    high: float
+    bias: float
+    robust: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the prediction is inside the band of the sample."""
+        if self.sample == 0.0:
+            return self.predicted == 0.0
+        return self.low <= self.predicted <= self.high
+
+    @property
+    def ratio(self) -> float:
+        """Sample over prediction; NaN where nothing is predicted."""
+        return self.sample / self.predicted if self.predicted > 0 else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether the linear prediction holds at the end.
+
+    deviations: of the states of the actual system from the nominal. errors: of the estimates of states and unknowns.
+    left: share of the runs that left the domain. unstable: share that did, or ended more than `UNSTABLE` predicted
+    deviations away. asked: share that asked for more control than there is. holds: whether the prediction is inside the
+    band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain.
+    """
+
+    deviations: tuple[Entry, ...]
+    errors: tuple[Entry, ...]
+    left: float
+    unstable: float
+    asked: float
+    most_asking: float
+    fed_back: bool
+    limited: bool
+
+    @property
+    def decisive(self) -> tuple[Entry, ...]:
+        """The components that decide."""
+        return self.deviations if self.fed_back else self.errors
+
+    @property
+    def holds(self) -> bool:
+        """Whether the linear prediction holds."""
+        return self.left == 0.0 and all(entry.inside for entry in self.decisive)
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Names of the components whose prediction lies outside the band."""
+        return tuple(entry.name for entry in self.decisive if not entry.inside)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it does not hold: of "unstable", "saturated"; "nonlinear" where it is neither; () where it holds."""
+        if self.holds:
+            return ()
+        found = []
+        if self.unstable >= NOTICEABLE or self.left > 0.0:
+            found.append("unstable")
+        if self.asked >= NOTICEABLE:
+            found.append("saturated")
+        return tuple(found) or ("nonlinear",)
+
+    def __str__(self) -> str:
+        """The verdict in words."""
+        what = "spread" if self.fed_back else "errors of the filter"
+        if self.holds:
+            text = f"The linear prediction of the {what} holds: it is inside the confidence band of every component."
+        else:
+            listed = ", ".join(self.outside)
+            text = f"The linear prediction of the {what} FAILS" + (f" for {listed}" if listed else "") + ": "
+            text += "; ".join(self._because(reason) for reason in self.reasons) + "."
+        missed = [entry for entry in self.errors if not entry.inside]
+        if self.fed_back and missed:
+            ratios = ", ".join(f"{entry.name} {entry.ratio:.3g}" for entry in missed)
+            text += f" The errors of the filter are not the predicted ones (sample over prediction: {ratios})."
+        return text
+
+    def _because(self, reason: str) -> str:
+        if reason == "unstable":
+            words = f"{_percent(self.unstable)} of the runs are unstable"
+            gone = f" ({_percent(self.left)} left the domain)" if self.left else ""
+            return words + gone + ", linear gains do not hold them"
+        if reason == "saturated":
+            most = f", {_percent(self.most_asking)} at one instant" if self.most_asking else ""
+            cut = "" if self.limited else " (which they were given)"
+            return f"{_percent(self.asked)} of the runs ask for more control than there is{most}{cut}"
+        return "no run is unstable or short of control, so the system is too nonlinear for this spread"
+
+
+def judge(sample: MonteCarlo) -> Verdict:
+    """The verdict on a simulation."""
+    stayed, states = sample.stayed, sum(b.size for b in sample.blocks if b.kind == "state")
+    names, n = sample.augmented, sample.size
+    states = min(states, n - sum(b.size for b in sample.blocks if b.kind == "unknown"))
+    predicted, errors = (np.sqrt(np.diagonal(v[-1]).clip(0.0)) for v in (sample.predicted, sample.predicted_error))
+    distance = np.abs(sample.deviations[:, :states]) > UNSTABLE * predicted[:states]
+    unstable = (distance & (predicted[:states] > 0)).any(axis=1) | ~stayed
+    return Verdict(
+        deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
+        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level),
+        left=sample.left_share,
+        unstable=float(unstable.mean()),
+        asked=sample.asked_share,
+        most_asking=float(sample.asking.max(initial=0.0)),
+        fed_back=sample.fed_back,
+        limited=sample.limited,
+    )
+
+
+def _entries(names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float) -> tuple[Entry, ...]:
+    """The components of some terminal values, (R, rows)."""
+    inside = values[stayed]
+    result = []
+    for i, name in enumerate(names):
+        column = inside[:, i]
+        square = float(np.mean(column**2)) if column.size else np.nan
+        fourth = float(np.mean(column**4)) if column.size else np.nan
+        low, high = mean_square_band(square, degrees_of_freedom(column.size, square, fourth), level)
+        result.append(
+            Entry(
+                name=name,
+                predicted=float(predicted[i]),
+                sample=float(np.sqrt(square)),
+                low=float(np.sqrt(low)),
+                high=float(np.sqrt(high)),
+                bias=float(column.mean()) if column.size else np.nan,
+                robust=float(robust_deviation(values[:, i : i + 1])[0]),
+            )
+        )
+    return tuple(result)
+
+
+def _percent(share: float) -> str:
+    """A share in words."""
+    return f"{100 * share:.3g} %"
