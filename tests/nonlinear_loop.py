@@ -20,20 +20,25 @@ MEASUREMENT_NOISE = np.array([[0.5, 0.2], [0.2, 0.8]])
 STEP = 1e-30  # of complex-step derivatives
 
 
-def problem(*, noise=1.0, gain=None, **weights):
-    """Parameter "noise" multiplies the density of the process noise; `weights` go to minimize_expected."""
+def problem(*, noise=1.0, variance=VARIANCE, measurement_noise=MEASUREMENT_NOISE, curved=True, gain=None, **weights):
+    """Parameter "noise" multiplies the density of the process noise; without `curved` the terminal cost is quadratic.
+
+    Weights go to minimize_expected.
+    """
     ocp = co.Problem(duration=DURATION, name="nonlinear loop")
     factor = ocp.parameter("noise", noise)
-    r = ocp.state("r", 2, initial=START[:2], variance=VARIANCE[:2, :2])
-    c = ocp.unknown("c", mean=START[2], variance=VARIANCE[2, 2])
+    r = ocp.state("r", 2, initial=START[:2], variance=variance[:2, :2])
+    c = ocp.unknown("c", mean=START[2], variance=variance[2, 2])
     u, w = ocp.control("u"), ocp.control("w")
     density = ca.blockcat([[0.2 + 0.1 * r[0] ** 2, 0.05], [0.05, 0.3 + 0.1 * u**2]])
     rate = ca.vertcat(r[1] + 0.3 * ca.sin(r[0]) + 0.2 * w, -c * r[0] - 0.1 * r[1] ** 3 + u * (1 + 0.2 * r[0]))
     ocp.dynamics(r, rate, noise=factor * density)
-    ocp.measurement("m", ca.vertcat(r[0] ** 3 / 3 + r[0] + 0.1 * u**2, c * r[1] + 0.2 * w * r[0]), MEASUREMENT_NOISE)
+    ocp.measurement("m", ca.vertcat(r[0] ** 3 / 3 + r[0] + 0.1 * u**2, c * r[1] + 0.2 * w * r[0]), measurement_noise)
     running = 0.5 * (r[0] - 1) ** 2 + 0.25 * r[1] ** 4 + 0.4 * r[0] * u + 0.1 * c * r[1] * w + 0.6 * u**2
     running += 0.1 * u**2 * r[0] ** 2 + 0.5 * w**2 + 0.2 * c**2 * r[0] + 0.15 * u * w
     terminal = ca.cosh(r[0] - 1) + 0.15 * (1 + r[0] ** 2) * r[1] ** 2 + 0.2 * c * r[1]
+    if not curved:
+        terminal = ca.dot(r, r)
     ocp.minimize_expected(running=running, terminal=terminal, gain=gain, **weights)
     return ocp
 
@@ -128,18 +133,21 @@ def system(end, factor=1.0):
 
 NODES = np.linspace(0.0, DURATION, 5)
 CONTROLS = np.array([[0.5, -0.2], [-0.3, 0.4], [0.8, 0.1], [-0.6, -0.5], [0.2, 0.3]])  # at the nodes, any
+NOMINAL = {"u": CONTROLS[:, 0], "w": CONTROLS[:, 1]}
 
 
-def reference(truth=None, factor=1.0):
-    """The loop along CONTROLS, linear between NODES, by scipy."""
+def control(t):
+    """CONTROLS, linear between NODES."""
+    return np.array([np.interp(t, NODES, column) for column in CONTROLS.T])
+
+
+def reference(truth=None, feedback=None):
+    """The loop along CONTROLS, by scipy."""
     breaks = tuple(NODES[1:-1].tolist())
-
-    def control(t):
-        return np.array([np.interp(t, NODES, column) for column in CONTROLS.T])
-
     last = closed_loops.nominal(system(np.eye(3)), control, DURATION, breaks=breaks)(DURATION)
+    design = system(terminal_curvature(last))
     return closed_loops.closed_loop(
-        system(terminal_curvature(last), factor), control, DURATION, breaks=breaks, times=NODES, truth=truth
+        design, control, DURATION, breaks=breaks, times=NODES, truth=truth, feedback=feedback
     )
 
 
