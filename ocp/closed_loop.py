@@ -81,7 +81,7 @@ class ClosedLoop:
         return float(sum(self.cost.values()))
 
 
-def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoop:
+def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoop | None:
     """Propagate the covariances of the loop along a solution.
 
     Args:
@@ -89,8 +89,19 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
         truth: the true statistics; None: the design's.
 
     Returns:
-        Covariances, gains and costs at the nodes.
+        Covariances, gains and costs at the nodes; None where they leave the range of numbers, as along the last iterate
+        of a run whose gains ran away.
     """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            loop = _propagated(extremal, truth)
+    except (RuntimeError, np.linalg.LinAlgError):  # a step that cannot be solved: CasADi's error, or numpy's
+        return None
+    return loop if np.isfinite(loop.expected_cost) else None
+
+
+def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
+    """What `close_loop` returns."""
     st, mesh = extremal.statement, extremal.mesh
     size = len(st.augmented)
     statistics = truth if truth is not None else design_statistics(extremal)
@@ -128,7 +139,7 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
 
 
 def _substeps(extremal: Extremal) -> int:
-    """Even number of steps an interval that resolves filter and feedback: S falls fast before a heavily weighted end."""
+    """Even number of steps an interval that resolves filter and feedback: S falls fast before a weighted end."""
     st, count = extremal.statement, extremal.mesh.intervals + 1
     x, u, e, t, duration, p = extremal.columns()
     size = len(st.augmented)
@@ -246,7 +257,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
     F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
     slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
-    vectors, values, _ = np.linalg.svd(np.linalg.qr(slopes.T, mode="r").T)  # a few rows, thousands of columns
+    vectors, values, _ = np.linalg.svd(np.asarray(np.linalg.qr(slopes.T, mode="r")).T)  # a few rows, thousands of columns
     values = np.append(values, np.zeros(units.size - values.size))
     kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
     if not kept.shape[1]:

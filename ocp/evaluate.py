@@ -168,13 +168,13 @@ def evaluate_controls(
         parameters=parameters,
         multipliers=Multipliers.zero(statement, mesh),
     )
-    finite = bool(np.isfinite(at_nodes).all() and np.isfinite(halves).all())
+    finite = bool(np.isfinite(at_nodes).all() and np.isfinite(halves).all() and np.isfinite(running).all())
     return Outcome(
         extremal=extremal,
         cost_terms={"terminal": terminal, "running": float(running.item())},
         converged=finite,
         message="evaluated along a given nominal" if finite else "the model becomes NaN or inf along this nominal",
-        violations=_missed(extremal),
+        violations=_missed(extremal) if finite else {},
         stats={},
     )
 
@@ -265,6 +265,15 @@ def _under(solution: Solution, truth: Any) -> Solution:
             )
         )
     loop = close_loop(solution.extremal, true_statistics(solution.extremal, truth))
+    if loop is None:
+        raise ProblemError(
+            describe(
+                "The covariances under this truth are no numbers.",
+                expected="finite covariances with the gains of the design",
+                received="inf or NaN on the way",
+                remedy="check the variances and densities of truth=, and that the solution converged",
+            )
+        )
     return replace(
         solution,
         method=METHOD,
