@@ -257,7 +257,8 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
     F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
     slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
-    vectors, values, _ = np.linalg.svd(np.asarray(np.linalg.qr(slopes.T, mode="r")).T)  # a few rows, thousands of columns
+    triangle = np.asarray(np.linalg.qr(slopes.T, mode="r"))  # of a few rows with thousands of columns
+    vectors, values, _ = np.linalg.svd(triangle.T)
     values = np.append(values, np.zeros(units.size - values.size))
     kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
     if not kept.shape[1]:
