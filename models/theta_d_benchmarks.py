@@ -120,7 +120,7 @@ def exact(name: str, states: npt.ArrayLike) -> Exact:
     )
 
 
-def problem(name: str = "two_inputs", start: npt.ArrayLike | None = None, duration: float = 15.0) -> co.Problem:
+def problem(name: str = "two_inputs", start: npt.ArrayLike | None = None, duration: float = 8.0) -> co.Problem:
     """A system as an optimal control problem with the linear regulator's cost at the end.
 
     Args:

@@ -109,6 +109,8 @@ def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, 
     sides: Any = [factor @ state, in_state("f", x, given, state), ca.fabs(factor) @ ca.fabs(state)]
     inputs: Any = [state]
     tried = random_states(size, 64, seed) if states is None else as_states(states, size)
+    if not len(tried):
+        raise _wrong("a state where both sides are finite", "no states")
     found = ca.Function("sides", inputs, sides).map(len(tried))(tried.T)
     left, right, terms = (np.asarray(value.full()).T for value in found)
     finite = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)

@@ -113,20 +113,43 @@ def _solution(rest: tuple[Any, Any], A0: Array, B: Array, Q: Array, R: Array) ->
     """P(x) of the matrices of a regulator, or of the dual of a filter."""
     inputs: Any = ([rest[0]], [rest[1]])
     evaluate = ca.Function("A", *inputs)
+    weight = B @ np.linalg.solve(R, B.T)
 
     def riccati(state: ArrayLike) -> Array:
+        from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
+
         given = np.asarray(state, dtype=float).ravel()
+        factor = A0 + evaluate(given).full()
         try:
-            return np.asarray(continuous(A0 + evaluate(given).full(), B, Q, R))
-        except ProblemError as error:
-            at = "(" + ", ".join(f"{value:.6g}" for value in given) + ")"
-            raise ProblemError(
-                describe(
-                    f"The state-dependent Riccati equation has no solution at x = {at}.",
-                    expected="A0 + A(x) that the input can stabilise and the weights see",
-                    received=str(error).splitlines()[0],
-                    remedy="keep away from this state, change the factorisation, or use covocp.blocks.theta_d",
-                )
-            ) from error
+            first = np.asarray(solve_continuous_are(factor, B, Q, R))
+            closed = factor - weight @ first
+            if np.linalg.eigvals(closed).real.max() >= 0.0:
+                return np.asarray(continuous(factor, B, Q, R))
+            # One step of Newton's method, to rounding.
+            found = solve_continuous_lyapunov(closed.T, -(Q + first @ weight @ first))
+            return np.asarray(values.symmetrised(found))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise _unsolved(given, _reason(factor, B, Q, R) or str(error)) from error
 
     return riccati
+
+
+def _reason(A: Array, B: Array, Q: Array, R: Array) -> str:
+    """What the checked solver says of these matrices."""
+    try:
+        continuous(A, B, Q, R)
+    except ValueError as error:
+        return str(error).splitlines()[0]
+    return ""
+
+
+def _unsolved(state: Array, received: str) -> ProblemError:
+    at = "(" + ", ".join(f"{value:.6g}" for value in state) + ")"
+    return ProblemError(
+        describe(
+            f"The state-dependent Riccati equation has no solution at x = {at}.",
+            expected="A0 + A(x) that the input can stabilise and the weights see",
+            received=received,
+            remedy="keep away from this state, change the factorisation, or use covocp.blocks.theta_d",
+        )
+    )

@@ -238,7 +238,8 @@ def polynomials(
             for (one, left), (two, other) in product(terms[j].items(), terms[n - j].items()):
                 _add(right, _plus(one, two), left @ weight @ other)
         scale, unit = (1.0, units[len(matrices) + factor]) if isinstance(factor, int) else (factor, (0,) * count)
-        terms.append({_plus(key, unit): scale * begin.corrected(value) for key, value in right.items()})
+        term = {_plus(key, unit): scale * begin.corrected(value) for key, value in right.items()}
+        terms.append(term or {(0,) * count: np.zeros_like(begin.riccati)})
     return terms
 
 
@@ -263,15 +264,13 @@ def monomials(functions: int, factors: Sequence[int | float], limit: int) -> int
 
 def evaluated(polynomial: Polynomial, variables: Sequence[Any], factor: Array | None = None) -> Any:
     """A polynomial with matrix coefficients in expressions; `factor` multiplies each coefficient from the left."""
-    total: Any = None
+    total: Any = 0.0
     for exponents, coefficient in polynomial.items():
         monomial = ca.SX(1)
         for variable, exponent in zip(variables, exponents, strict=True):
             for _ in range(exponent):
                 monomial = monomial * variable
-        term = monomial * ca.DM(coefficient if factor is None else factor @ coefficient)
-        total = term if total is None else total + term
-    assert total is not None
+        total = total + monomial * ca.DM(coefficient if factor is None else factor @ coefficient)
     return total
 
 
