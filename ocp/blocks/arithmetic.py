@@ -183,6 +183,6 @@ def _indefinite(what: str, matrix: Array) -> ProblemError:
             f"The {what} is singular.",
             expected="a positive definite matrix",
             received=f"a smallest eigenvalue of {smallest:.3g}",
-            remedy="give every measurement some noise, and no measurement twice without noise",
+            remedy="give every measurement some noise; where rounding hides it, take the square-root form",
         )
     )

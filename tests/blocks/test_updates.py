@@ -1,0 +1,227 @@
+"""The discrete filter: every form against a least-squares problem, missing readings, definiteness, symbols and C."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from compiled import compile_function
+from hypothesis import given
+from hypothesis import strategies as st
+from linear_systems import (
+    FIXED,
+    GAMMA,
+    M_INF,
+    NOISE,
+    P_INF,
+    PHI,
+    PRINTED,
+    R_V,
+    H,
+    definite,
+    least_squares,
+    random_filter,
+)
+
+from covocp import ProblemError
+from covocp.blocks import kalman
+
+FORMS = ("joseph", "standard", "sequential", "information")
+SEEDS = st.integers(0, 10**6)
+
+
+def symbols(kind, size, count):
+    """Symbols of the arguments of an update."""
+    shapes = {"x": (size, 1), "P": (size, size), "y": (count, 1), "H": (count, size), "R": (count, count)}
+    return [kind.sym(name, *shape) for name, shape in shapes.items()]
+
+
+def close(first, second, tolerance=1e-11):
+    for one, two in zip(first, second, strict=True):
+        np.testing.assert_allclose(np.asarray(one).squeeze(), np.asarray(two).squeeze(), rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("size", "count"), [(1, 1), (3, 1), (3, 2), (2, 4)])
+def test_update_solves_the_least_squares_problem(form, size, count):
+    arguments = random_filter(size + 10 * count, size, count)
+    close(kalman.update(*arguments, form=form), least_squares(*arguments))
+
+
+@FIXED
+@given(seed=SEEDS, size=st.integers(1, 4), count=st.integers(1, 4))
+def test_all_forms_are_equal(seed, size, count):
+    arguments = random_filter(seed, size, count)
+    reference = kalman.update(*arguments)
+    for form in FORMS[1:]:
+        close(kalman.update(*arguments, form=form), reference, 1e-9)
+
+
+def test_cycle_of_the_table():
+    posterior = kalman.update([0.0, 0.0], M_INF, 0.0, H, R_V)[1]
+    np.testing.assert_allclose(posterior, P_INF, **PRINTED)
+    np.testing.assert_allclose(kalman.predict([0.0, 0.0], P_INF, PHI, NOISE)[1], M_INF, rtol=0, atol=2e-8)
+
+
+def test_predict():
+    estimate, covariance = kalman.predict([1.0, 2.0], np.diag([1.0, 4.0]), PHI, NOISE, drift=3.0 * GAMMA.ravel())
+    np.testing.assert_allclose(estimate, [1.0 + 1.0 + 0.375, 2.0 + 1.5])
+    np.testing.assert_allclose(covariance, np.array([[2.0, 2.0], [2.0, 4.0]]) + NOISE, rtol=1e-14)
+
+
+def test_scalars_in_scalars_out():
+    estimate, covariance = kalman.update(1.0, 4.0, 3.0, 1.0, 4.0)
+    assert (type(estimate), type(covariance)) == (float, float)
+    assert (estimate, covariance) == pytest.approx((2.0, 2.0))
+    assert kalman.predict(1.0, 4.0, 0.5, 1.0) == (0.5, 2.0)
+
+
+def test_shapes_of_the_arguments_come_back():
+    x, P, y, rows, R = random_filter(0, 3, 2)
+    flat, covariance = kalman.update(x, P, y, rows, R)
+    column, _ = kalman.update(x[:, None], P, ca.DM(y), ca.DM(rows), R)
+    assert (flat.shape, column.shape, covariance.shape) == ((3,), (3, 1), (3, 3))
+    np.testing.assert_array_equal(flat, column.ravel())
+    close(kalman.update(x, P, y[:1], rows[0], R[:1, :1]), kalman.update(x, P, y[0], rows[:1], R[0, 0]), 1e-15)
+
+
+def test_a_row_without_noise_is_met_exactly():
+    x, P, y, rows, _ = random_filter(5, 3, 2)
+    for form in ("joseph", "standard", "sequential"):
+        estimate, covariance = kalman.update(x, P, y, rows, np.zeros((2, 2)), form=form)
+        np.testing.assert_allclose(rows @ estimate, y, atol=1e-12)
+        np.testing.assert_allclose(rows @ covariance, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_missing_rows_are_left_out(form):
+    x, P, y, rows, R = random_filter(7, 3, 3)
+    gap = y.copy()
+    gap[1] = np.nan
+    left = np.array([0, 2])
+    expected = least_squares(x, P, y[left], rows[left], R[np.ix_(left, left)])
+    close(kalman.update(x, P, gap, rows, R, form=form, missing="skip"), expected)
+    nothing = kalman.update(x, P, np.full(3, np.nan), rows, R, form=form, missing="skip")
+    close(nothing, (x, P), 1e-12)
+    for kind in (ca.SX, ca.MX):
+        arguments = symbols(kind, 3, 3)
+        update = ca.Function("update", arguments, list(kalman.update(*arguments, form=form, missing="skip")))
+        close(update(x, P, gap, rows, R), expected)
+        close(update(x, P, y, rows, R), least_squares(x, P, y, rows, R))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+def test_symbols_expand(form, kind):
+    arguments = symbols(kind, 3, 2)
+    update = ca.Function("update", arguments, list(kalman.update(*arguments, form=form))).expand()
+    numbers = random_filter(11, 3, 2)
+    close(update(*numbers), least_squares(*numbers))
+
+
+def test_symbols_mixed_with_numbers():
+    x, P, y, rows, R = random_filter(13, 3, 2)
+    symbol = ca.MX.sym("P", 3, 3)
+    update = ca.Function("update", [symbol], list(kalman.update(x, symbol, y, rows, R, form="sequential"))).expand()
+    close(update(P), least_squares(x, P, y, rows, R))
+    assert isinstance(kalman.predict(x, ca.MX(ca.DM(P)), np.eye(3), np.eye(3))[1], np.ndarray)
+
+
+@pytest.mark.needs_cc
+@pytest.mark.parametrize("form", FORMS)
+def test_c_code(form, tmp_path):
+    arguments = symbols(ca.MX, 3, 2)
+    function = ca.Function("update", arguments, list(kalman.update(*arguments, form=form, missing="skip")))
+    code = compile_function(function, tmp_path)
+    numbers = random_filter(17, 3, 2)
+    close(code(*numbers), least_squares(*numbers))
+    x, P, y, rows, R = numbers
+    close(code(x, P, [y[0], np.nan], rows, R), least_squares(x, P, y[:1], rows[:1], R[:1, :1]))
+
+
+@FIXED
+@given(seed=SEEDS, size=st.integers(1, 5), count=st.integers(1, 3), spread=st.integers(-6, 6))
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_joseph_form_is_semidefinite_for_any_gain(kind, seed, size, count, spread):
+    _, P, _, rows, R = random_filter(seed, size, count)
+    gain = 10.0**spread * np.random.default_rng(seed).standard_normal((size, count))
+    result = kalman.joseph(P.astype(kind), gain.astype(kind), rows.astype(kind), R.astype(kind))
+    assert result.dtype == kind
+    values = np.linalg.eigvalsh(result.astype(float))
+    assert values[0] >= -10 * size * np.finfo(kind).eps * values[-1]
+    exact = (np.eye(size) - gain @ rows) @ P @ (np.eye(size) - gain @ rows).T + gain @ R @ gain.T
+    np.testing.assert_allclose(result, exact, rtol=0, atol=1e3 * np.finfo(kind).eps * np.abs(exact).max())
+
+
+@FIXED
+@given(seed=SEEDS, form=st.sampled_from(FORMS[:3]), accuracy=st.integers(0, 12))
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_no_update_leaves_the_semidefinite_cone(kind, seed, form, accuracy):
+    """Precise readings of a badly known state, one after the other, with the rounding of either precision."""
+    generator = np.random.default_rng(seed)
+    accuracy = accuracy if kind == np.float64 else accuracy / 3.0  # beyond, H P H' + R is singular to rounding
+    P = (10.0**accuracy * definite(generator, 3)).astype(kind)
+    x = np.zeros(3, dtype=kind)
+    for _ in range(4):
+        rows = generator.standard_normal((2, 3)).astype(kind)
+        x, P = kalman.update(x, P, np.ones(2, dtype=kind), rows, np.eye(2, dtype=kind), form=form)
+        values = np.linalg.eigvalsh(P.astype(float))
+        assert P.dtype == kind
+        assert values[0] >= -10 * np.finfo(kind).eps * values[-1]
+
+
+@FIXED
+@given(seed=SEEDS, size=st.integers(1, 4), count=st.integers(1, 3))
+def test_steps_do_not_depend_on_the_coordinates(seed, size, count):
+    x, P, y, rows, R = random_filter(seed, size, count)
+    generator = np.random.default_rng(seed + 1)
+    change = np.linalg.cholesky(definite(generator, size)) + np.triu(generator.standard_normal((size, size)), 1)
+    if np.linalg.cond(change) > 1e4:
+        return
+    back = np.linalg.inv(change)
+    transition, noise = generator.standard_normal((size, size)), definite(generator, size)
+    here = kalman.update(*kalman.predict(x, P, transition, noise), y, rows, R)
+    moved = (change @ x, change @ P @ change.T, change @ transition @ back, change @ noise @ change.T)
+    there = kalman.update(*kalman.predict(*moved), y, rows @ back, R)
+    scale = np.linalg.cond(change) ** 2
+    for one, two in zip(here, (back @ there[0], back @ there[1] @ back.T), strict=True):
+        np.testing.assert_allclose(one, two, rtol=0, atol=1e-12 * scale * np.abs(one).max())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"covariance": np.diag([1.0, -1.0])}, "covariance.*(?s:.)*positive semidefinite"),
+        ({"covariance": [[1.0, 0.5], [0.0, 1.0]]}, "asymmetry"),
+        ({"covariance": np.eye(3)}, "'covariance'"),
+        ({"measurement": np.nan}, "missing='skip'"),
+        ({"measurement": [1.0, 2.0]}, "'measurement'"),
+        ({"H": np.ones((1, 3))}, "'H'"),
+        ({"R": -1.0}, "'R'"),
+        ({"R": np.inf}, "'R'"),
+        ({"form": "jacobi"}, "'joseph', 'standard', 'sequential', 'information'"),
+        ({"missing": "ignore"}, "'raise', 'skip'"),
+        ({"covariance": np.zeros((2, 2)), "R": 0.0}, "innovation(?s:.)*singular"),
+        ({"covariance": np.zeros((2, 2)), "R": 0.0, "form": "sequential"}, "innovation(?s:.)*singular"),
+        ({"R": 0.0, "form": "information"}, "R is singular"),
+        ({"covariance": np.zeros((2, 2)), "form": "information"}, "covariance is singular"),
+        ({"estimate": "x"}, "numbers or a CasADi expression"),
+        ({"covariance": ca.SX.sym("P", 2, 2), "H": ca.MX.sym("H", 1, 2)}, "mix SX and MX"),
+    ],
+)
+def test_bad_arguments(change, message):
+    arguments = {"estimate": [0.0, 0.0], "covariance": np.eye(2), "measurement": 1.0, "H": [1.0, 0.0], "R": 1.0}
+    with pytest.raises(ProblemError, match=message):
+        kalman.update(**(arguments | change))
+
+
+def test_bad_arguments_of_predict():
+    for arguments, name in (
+        (([0.0], np.eye(2), PHI, NOISE), "estimate"),
+        (([0.0, 0.0], np.eye(2), PHI, -NOISE), "noise"),
+        (([0.0, 0.0], np.eye(2), np.ones((2, 3)), NOISE), "transition"),
+    ):
+        with pytest.raises(ProblemError, match=f"'{name}'"):
+            kalman.predict(*arguments)
+    with pytest.raises(ProblemError, match="'drift'"):
+        kalman.predict([0.0, 0.0], np.eye(2), PHI, NOISE, drift=1.0)

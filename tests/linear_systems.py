@@ -1,0 +1,56 @@
+"""Linear systems for tests of the blocks: the notes' double integrator, and random ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import settings
+
+# Property tests repeat.
+FIXED = settings(derandomize=True, deadline=None, database=None, max_examples=40)
+
+# Specification 3, part 2: double integrator, T = 0.5 s.
+T = 0.5
+PHI = np.array([[1.0, T], [0.0, 1.0]])
+GAMMA = np.array([[T**2 / 2], [T]])
+H = np.array([[1.0, 0.0]])
+NOISE = 0.2 * GAMMA @ GAMMA.T
+R_V = np.array([[0.05]])
+Q_1 = np.diag([1.0, 0.1])
+Q_2 = np.array([[0.4]])
+M_INF = [[0.08454367, 0.08201941], [0.08201941, 0.12807764]]
+L_INF = [[0.62837346], [0.60961180]]
+P_INF = [[0.03141867, 0.03048059], [0.03048059, 0.07807764]]
+S_INF = [[2.89771131, 1.27475488], [1.27475488, 1.57824709]]
+K = [[1.00040881, 1.44944797]]
+AVERAGE_COST = 0.40347843
+PRINTED = {"rtol": 0, "atol": 1e-8}  # the table has eight decimals
+
+
+def definite(generator, size, condition=100.0):
+    """A random covariance with a given condition number."""
+    vectors = np.linalg.qr(generator.standard_normal((size, size)))[0]
+    values = np.exp(generator.uniform(0.0, np.log(condition), size))
+    product = (vectors * values) @ vectors.T
+    return 0.5 * (product + product.T)
+
+
+def random_filter(seed, size, count):
+    """Estimate, covariance, reading, H and correlated R."""
+    generator = np.random.default_rng(seed)
+    return (
+        generator.standard_normal(size),
+        definite(generator, size),
+        generator.standard_normal(count),
+        generator.standard_normal((count, size)),
+        definite(generator, count),
+    )
+
+
+def least_squares(estimate, covariance, reading, rows, noise):
+    """The update as one least-squares problem: prior and readings as equations of weight one, by QR."""
+    prior, white = (np.linalg.inv(np.linalg.cholesky(matrix)) for matrix in (covariance, noise))
+    equations = np.vstack([prior, white @ rows])
+    right = np.concatenate([prior @ estimate, white @ reading])
+    triangle = np.linalg.qr(equations, mode="r")
+    inverse = np.linalg.inv(triangle)
+    return np.linalg.lstsq(equations, right, rcond=None)[0], inverse @ inverse.T
