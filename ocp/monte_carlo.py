@@ -121,18 +121,18 @@ class MonteCarlo:
 
     def mean(self, key: Any) -> Array:
         """Sample mean of the actual values of a state, an unknown or a control, (K,) or (K, size)."""
-        rows, block = self._rows(key)
+        rows, block = self.rows(key)
         nominal = self.nominal_control if block.kind == "control" else self.nominal
         return self._shaped(nominal[:, block_rows(rows, block, self.size)] + self.moments.mean[:, rows], block)
 
     def bias(self, key: Any) -> Array:
         """Sample mean of the deviation from the nominal, (K,) or (K, size)."""
-        rows, block = self._rows(key)
+        rows, block = self.rows(key)
         return self._shaped(self.moments.mean[:, rows], block)
 
     def mean_band(self, key: Any) -> tuple[Array, Array]:
         """Confidence band of the mean, (low, high)."""
-        rows, block = self._rows(key)
+        rows, block = self.rows(key)
         variance = np.diagonal(self.moments.product, axis1=1, axis2=2)[:, rows] - self.moments.mean[:, rows] ** 2
         values = self.mean(key).reshape(self.t.size, -1)
         low, high = mean_band(values, variance, self.moments.count[:, None], self.level)
@@ -146,7 +146,7 @@ class MonteCarlo:
             b: another one; None: a itself.
             about: "nominal", as the linear prediction has it, or "mean", the sample's own.
         """
-        one, two = self._rows(a)[0], self._rows(a if b is None else b)[0]
+        one, two = self.rows(a)[0], self.rows(a if b is None else b)[0]
         product = self.moments.product[:, one, two]
         if about == "nominal":
             return product
@@ -164,13 +164,13 @@ class MonteCarlo:
 
     def deviation(self, key: Any, *, about: str = "nominal") -> Array:
         """Sample standard deviation, (K,) or (K, size), in the unit of the symbol; see `covariance`."""
-        _, block = self._rows(key)
+        _, block = self.rows(key)
         variance = np.diagonal(self.covariance(key, about=about), axis1=1, axis2=2)
         return self._shaped(np.sqrt(np.maximum(variance, 0.0)), block)
 
     def deviation_band(self, key: Any) -> tuple[Array, Array]:
         """Confidence band of the standard deviation about the nominal, (low, high)."""
-        rows, block = self._rows(key)
+        rows, block = self.rows(key)
         square = np.diagonal(self.moments.product, axis1=1, axis2=2)[:, rows]
         freedom = degrees_of_freedom(self.moments.count[:, None], square, self.moments.fourth[:, rows])
         low, high = mean_square_band(square, freedom, self.level)
@@ -178,12 +178,12 @@ class MonteCarlo:
 
     def predicted_deviation(self, key: Any) -> Array:
         """Standard deviation about the nominal that linear theory predicts, (K,) or (K, size)."""
-        rows, block = self._rows(key, controls=False)
+        rows, block = self.rows(key, controls=False)
         return self._shaped(np.sqrt(np.diagonal(self.predicted, axis1=1, axis2=2)[:, rows]), block)
 
     def error_covariance(self, a: Any, b: Any = None) -> Array:
         """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b)."""
-        one, two = self._rows(a, controls=False)[0], self._rows(a if b is None else b, controls=False)[0]
+        one, two = self.rows(a, controls=False)[0], self.rows(a if b is None else b, controls=False)[0]
         n, product = self.size, self.moments.product
         actual, estimate = product[:, :n, :n], product[:, n : 2 * n, n : 2 * n]
         cross = product[:, n : 2 * n, :n]
@@ -191,12 +191,12 @@ class MonteCarlo:
 
     def terminal(self, key: Any) -> Array:
         """Deviations of all runs at the end, (R,) or (R, size)."""
-        rows, block = self._rows(key, controls=False)
+        rows, block = self.rows(key, controls=False)
         return self._shaped(self.deviations[:, rows], block)
 
     def robust_deviation(self, key: Any) -> Array:
         """Deviation at the end from the median of all runs, those that left the domain too; () or (size,)."""
-        rows, block = self._rows(key, controls=False)
+        rows, block = self.rows(key, controls=False)
         values = robust_deviation(self.deviations[:, rows])
         return np.asarray(values[0] if block.size == 1 else values)
 
@@ -205,7 +205,7 @@ class MonteCarlo:
 
         A run that left the domain counts as beyond.
         """
-        rows, block = self._rows(key, controls=False)
+        rows, block = self.rows(key, controls=False)
         limit = as_number(block.name, "largest deviation", value)
         if limit.size not in (1, block.size) or not (limit >= 0).all():
             raise ProblemError(
@@ -268,8 +268,12 @@ class MonteCarlo:
         """The summary that print shows."""
         return str(importlib.import_module("covocp.simulation_report").summary(self))
 
-    def _rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:
-        """Where a symbol lies among deviation, estimate and control."""
+    def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:
+        """Where a symbol lies among the rows of deviation, estimate and control (2n + m), and its block.
+
+        Raises:
+            ProblemError: where it is not among them.
+        """
         kinds = ("state", "unknown", "control") if controls else ("state", "unknown")
         found: dict[str, tuple[slice, Block]] = {}
         first = 0

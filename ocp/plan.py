@@ -105,7 +105,7 @@ def make_plan(
         stored_coefficients=np.vstack([before, after[-1:]])[stored],
         start=start_of(run),
         unknowns=setting.actual.start[design.states :],
-        spread=np.asarray(ca.DM(factor(setting.actual.variance)).full()),
+        spread=np.asarray(factor(ca.DM(setting.actual.variance)).full()),
         spans=run.spans,
         noises=run.noises,
         states=design.states,

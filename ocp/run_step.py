@@ -212,7 +212,7 @@ def finish_function(run: Run) -> ca.Function | None:
 
 
 def factor(covariance: Any) -> Any:
-    """Lower triangular L with L L' = covariance, numbers or an expression; the columns of zero pivots are zero."""
+    """Lower triangular L with L L' = covariance, DM, SX or MX; the columns of zero pivots are zero."""
     size = covariance.shape[0]
     L: list[list[Any]] = [[0.0] * size for _ in range(size)]
     for j in range(size):

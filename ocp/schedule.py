@@ -56,10 +56,11 @@ class Grid:
         return np.maximum(1, np.ceil(self.h / length - WHOLE)).astype(int)
 
 
-def base_grid(solution: Solution, points: int) -> Grid:
-    """The intervals of the mesh, divided so that some points are about equally spread over the time."""
+def base_grid(solution: Solution, points: int, step: float | None = None) -> Grid:
+    """The intervals of the mesh, divided so that some points are about equally spread; no finer than a given step."""
     mesh = Grid(t=solution.t, interval=np.arange(solution.mesh.intervals))
-    return mesh.divided(mesh.parts(solution.duration / max(1, points - 1)))
+    parts = mesh.parts(solution.duration / max(1, points - 1))
+    return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 
 
 def stored_indices(grid: Grid, points: int) -> Any:
@@ -88,15 +89,25 @@ class Nominal:
 
 def nominal_at(solution: Solution, t: Array, interval: Any) -> Nominal:
     """The nominal at some times, its control that of the given interval, which matters where it jumps."""
+    x, e = _states_at(solution, t)
+    return Nominal(x=x, u=_controls_at(solution, t, interval), e=e, t=t)
+
+
+def _states_at(solution: Solution, t: Array) -> tuple[Array, Array]:
+    """States (K, nx) and half-vectors (K, ne)."""
     sample = solution.at(t)
     blocks = {kind: [b for b in solution.blocks if b.kind == kind] for kind in ("state", "matrix")}
     x = np.hstack([sample[b.name].reshape(t.size, b.size) for b in blocks["state"]])
-    e = np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+    return x, np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+
+
+def _controls_at(solution: Solution, t: Array, interval: Any) -> Array:
+    """Controls (K, nu) of the given intervals."""
     nodes, u = solution.t, solution.controls
     if solution.mesh.control == "constant":
-        return Nominal(x=x, u=u[interval], e=e, t=t)
+        return np.asarray(u[interval])
     c = ((t - nodes[interval]) / np.diff(nodes)[interval])[:, None]
-    return Nominal(x=x, u=u[interval] + c * (u[interval + 1] - u[interval]), e=e, t=t)
+    return np.asarray(u[interval] + c * (u[interval + 1] - u[interval]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -164,9 +175,11 @@ def filter_gain(half: Any, size: int, M: Any, U: Any) -> Any:
 
 def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:
     """The columns at the starts and at the ends of all steps, (N, rows) each."""
+    x, e = _states_at(solution, grid.t)
     sides = []
-    for t in (grid.t[:-1], grid.t[1:]):
-        at = nominal_at(solution, t, grid.interval)
+    for part in (slice(0, -1), slice(1, None)):
+        t = grid.t[part]
+        at = Nominal(x=x[part], u=_controls_at(solution, t, grid.interval), e=e[part], t=t)
         values = chosen.function.map(grid.steps)(*at.columns(solution.duration, solution.parameters))
         sides.append(np.ascontiguousarray(values.full().T))
     return sides[0], sides[1]

@@ -59,7 +59,8 @@ def simulate(
     Initial deviation and unknowns, process and measurement noise are normal; the filter starts at the mean. The control
     is u - C dx', with the gain C of the solution. Where the cost is deterministic nothing is fed back: plant and filter
     run along the open-loop control, which validates the estimation covariance. Run k has the same numbers whatever the
-    number of runs, batches and workers. Memory: `batch` runs at a time, some 4 kB each, in every process.
+    number of batches and workers, and for a given step whatever the number of runs. Memory: `batch` runs at a time,
+    some 5 kB each, in every process, and for all runs the terminal values; histories of the first `paths` runs only.
 
     Args:
         solution: of a problem with an expected cost or an estimation covariance.
@@ -95,7 +96,7 @@ def simulate(
     )
     design = _design(solution)
     actual = actual_system(design, truth)
-    base = base_grid(solution, store)
+    base = base_grid(solution, store, step)
     expected = predict(solution, design, design, base)
     true = expected if truth is None else predict(solution, design, actual, base)
     setting = Setting(
@@ -108,7 +109,7 @@ def simulate(
     )
     with Progress(f"simulating {solution.name}", progress) as reporter:
         chosen = _step(setting, base, true, request, reporter)
-        plan = make_plan(setting, chosen.grid, base, store=store, seed=seed, paths=paths)
+        plan = make_plan(setting, chosen.grid, base, store=store, seed=int(seed), paths=paths)
         harvest = simulate_batches(plan, request.ranges, executor, lambda: reporter.stop, _reporting(reporter))
     _tell(harvest, runs)
     return _result(setting, request, chosen, base, (expected, true), harvest, truth)

@@ -90,15 +90,21 @@ class Verdict:
             found.append("saturated")
         return tuple(found) or ("nonlinear",)
 
-    def __str__(self) -> str:
-        """The verdict in words."""
+    @property
+    def headline(self) -> str:
+        """Whether it holds, and for what it does not."""
         what = "spread" if self.fed_back else "errors of the filter"
         if self.holds:
-            text = f"The linear prediction of the {what} holds: it is inside the confidence band of every component."
+            return f"The linear prediction of the {what} holds"
+        listed = ", ".join(self.outside)
+        return f"The linear prediction of the {what} FAILS" + (f" for {listed}" if listed else "")
+
+    def __str__(self) -> str:
+        """The verdict in words."""
+        if self.holds:
+            text = f"{self.headline}: it is inside the confidence band of every component."
         else:
-            listed = ", ".join(self.outside)
-            text = f"The linear prediction of the {what} FAILS" + (f" for {listed}" if listed else "") + ": "
-            text += "; ".join(self._because(reason) for reason in self.reasons) + "."
+            text = f"{self.headline}: " + "; ".join(self._because(reason) for reason in self.reasons) + "."
         missed = [entry for entry in self.errors if not entry.inside]
         if self.fed_back and missed:
             ratios = ", ".join(f"{entry.name} {entry.ratio:.3g}" for entry in missed)

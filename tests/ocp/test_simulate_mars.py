@@ -1,0 +1,68 @@
+"""Mars entry: sample over prediction as in section 9.3 of the specification (3,000 runs of another program)."""
+
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.models import mars_entry
+from covocp.simulate import simulate
+
+RUNS = 3000
+# Standard error of a ratio of 3,000 normal runs; two programs were compared.
+ERROR = 3 * np.sqrt(2) * 0.013
+COMPONENTS = ("h", "theta", "v", "gamma")
+# The optimum that section 9.3 simulated has J = 3.503e-4; from this history of the control it is found.
+BANG_BANG = (0.8, 0.8, 0.5, 0.3, 0.1, 0.4, 0.4, 0.0)
+
+
+def ratios(sample):
+    return np.array([sample.deviation(key)[-1] / sample.predicted_deviation(key)[-1] for key in COMPONENTS])
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("constant", (0.993, 1.025, 0.991, 0.994)), ("regularised", (0.993, 1.022, 0.997, 1.007))],
+)
+def test_linear_theory_holds_for_the_smooth_designs(kind, expected):
+    problem = mars_entry.problem()
+    if kind == "constant":
+        solution = co.evaluate(problem, nominal=mars_entry.reference(), intervals=183)
+    else:
+        solution = co.solve(problem, intervals=183, progress=False)
+    sample = simulate(solution, RUNS, 1, step=0.5, store=11, progress=False)
+    np.testing.assert_allclose(ratios(sample), expected, atol=ERROR)
+    assert sample.verdict.holds
+    assert sample.asked_share == 0.0
+    assert sample.left_share == 0.0
+    assert abs(sample.cost - solution.cost) < 3 * sample.cost_error
+
+
+def test_linear_theory_fails_for_the_bang_bang_design_and_says_why():
+    problem = mars_entry.problem(regularization=None)
+    u = np.interp(np.linspace(0, 1, 184), np.linspace(0, 1, len(BANG_BANG)), BANG_BANG)
+    solution = co.solve(problem, intervals=183, guess={"lift_to_drag": u}, progress=False)
+    assert solution.cost == pytest.approx(3.503e-4, rel=1e-3)
+    sample = simulate(solution, RUNS, 1, step=0.5, store=62, progress=False)
+    found = ratios(sample)
+    # Of heavier tails: the errors are larger than those of normal runs.
+    np.testing.assert_allclose(found, (1.010, 1.648, 0.954, 1.137), atol=1.5 * ERROR)
+    assert not sample.verdict.holds
+    assert "theta" in sample.verdict.outside
+    assert sample.verdict.reasons == ("saturated",)
+    assert "more control than there is" in str(sample)
+    assert sample.asked_share > 0.9
+    assert sample.asking.max() > 0.6
+    # What it asks for is not there: within the bounds of the problem the spread is another one.
+    limited = simulate(solution, 500, 1, step=1.0, store=11, limits="bounds", progress=False)
+    assert limited.outside_share["lift_to_drag"] == 0.0
+    assert not limited.verdict.holds
+
+
+def test_another_atmosphere_is_another_truth():
+    solution = co.evaluate(mars_entry.problem(), nominal=mars_entry.reference(), intervals=61)
+    sample = simulate(solution, 200, 1, step=2.0, store=11, truth=mars_entry.truth("high"), progress=False)
+    assert "high atmosphere" in sample.truth
+    # The density starts many of the design's standard deviations away, and the filter finds that out.
+    assert abs(sample.bias("log_density")[0]) > 3 * np.sqrt(sample.design[0, 4, 4])
+    assert not sample.verdict.holds
+    assert np.isfinite(sample.deviations).all()
