@@ -250,6 +250,8 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     X = joint[:, :size, :size] + joint[:, size:, size:] - joint[:, :size, size:] - joint[:, size:, :size]
     units = np.sqrt(np.diagonal(X, axis1=1, axis2=2).max(axis=0).clip(0.0))
     uncertain = np.flatnonzero(units)  # what is known exactly never deviates
+    if not uncertain.size:
+        return None
     units, X = units[uncertain], X[:, uncertain[:, None], uncertain]
     count = n * (m + 1)
     arguments = [column.reshape(count, -1).T for column in _points(extremal, fine)]

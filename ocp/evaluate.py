@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_kind
+from covocp.checks import check_density, check_kind
 from covocp.closed_loop import Statistics, close_loop, densities
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Outcome
@@ -318,11 +318,28 @@ def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
                 remedy="build it by the same function with other numbers",
             )
         )
-    return Statistics(
+    statistics = Statistics(
         initial=unpack(other.boundary_values(values)[2][block.span], block.size),
         density=densities(other),
         parameters=values,
     )
+    _check_densities(extremal, statistics)
+    return statistics
+
+
+def _check_densities(extremal: Extremal, truth: Statistics) -> None:
+    """What is truly uncertain must be a covariance or a density, at every node; no noise at all is one too."""
+    x, u, _, t, duration, _ = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    values = truth.density.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
+    check_density("truth", "initial covariance", truth.initial, definite=False)
+    for what, value in zip(("process noise density", "measurement noise density"), values, strict=True):
+        numbers = np.asarray(value.full())
+        matrices = numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
+        if matrices.size:
+            smallest = np.linalg.eigvalsh(np.nan_to_num(matrices))[:, 0]
+            worst = int(np.argmin(np.where(np.isfinite(matrices).all(axis=(1, 2)), smallest, -np.inf)))
+            check_density("truth", what, matrices[worst], definite=False)
 
 
 def _check_same(design: Statement, truth: Statement) -> None:
