@@ -18,6 +18,7 @@ from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
 from covocp.errors import ProblemError, describe
 from covocp.matrices import pack, pack_symbolic, unpack_symbolic
+from covocp.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
 # A casadi.Function, or a Python function of arrays that returns an array.
@@ -107,12 +108,18 @@ def simulate_law(
         The histories.
 
     Raises:
-        ProblemError: a Python function in runs with noise, a noise that is not positive semidefinite, or sizes that do
-            not fit.
+        ProblemError: an argument does not fit, or a Python function in runs with noise.
     """
     start = np.asarray(initial, dtype=float).ravel()
     if start.size != plant.size1_in(0):
         raise _wrong("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
+    counts = {"samples": (samples, 2), "runs": (1 if runs is None else runs, 1)}
+    for name, (count, least) in counts.items():
+        if isinstance(count, bool) or int(count) != count or count < least:
+            raise _wrong(name, f"a whole number, {least} or more", repr(count))
+    for name, seconds in (("duration", duration), ("step", step)):
+        if not 0.0 < seconds < np.inf:
+            raise _wrong(name, "a positive time [s]", repr(seconds))
     times = np.linspace(0.0, float(duration), int(samples))
     loop = _Loop(plant=plant, law=law, observer=observer, running=running, size=start.size)
     if runs is None:
@@ -296,20 +303,32 @@ def _noisy(
     if not isinstance(rate, ca.Function) or not isinstance(control, ca.Function):
         raise _wrong("law", "casadi.Functions, also in the filter, for runs with noise", "a Python function")
     runs = state.shape[1]
-    steps = max(1, int(np.ceil((times[1] - times[0]) / step))) if times.size > 1 else 1
-    h = float(times[1] - times[0]) / steps if times.size > 1 else 0.0
-    advance = _function(_runge_kutta(rate, h), [rate.size1_in(i) for i in range(4)]).map(runs)
-    controls = control.map(runs)
+    steps = int(np.ceil(times[1] / step))
+    h = float(times[1]) / steps
+    sizes = [rate.size1_in(i) for i in range(4)]
+    advance = vectorise(_function(_runge_kutta(rate, h), sizes), padded(runs), (1,))
+    controls = vectorise(control, padded(runs), (1,))
     generator = np.random.default_rng(seed)
-    states, given = [state], [controls(state, times[0]).full()]
+    states, given = [state], [_columns(controls, state, times[0])]
     for start in times[:-1]:
         for i in range(steps):
             shocks = [root @ generator.standard_normal((len(root), runs)) / np.sqrt(h) for root in noises]
-            state = advance(state, start + i * h, *shocks).full()
+            state = _columns(advance, state, start + i * h, *shocks)
         state[:, ~(np.abs(state).max(axis=0) < LARGEST)] = np.nan
         states.append(state)
-        given.append(controls(state, start + steps * h).full())
+        given.append(_columns(controls, state, start + steps * h))
     return loop.simulation(times, np.array(states).transpose(2, 0, 1), np.array(given).transpose(2, 0, 1))
+
+
+def _columns(function: Columns, state: Array, t: float, *shocks: Array) -> Array:
+    """Values of a vectorised function of columns, with the time in common."""
+    count = state.shape[1]
+    function.inputs[1][:] = t
+    for memory, given in zip((function.inputs[0], *function.inputs[2:]), (state, *shocks), strict=True):
+        memory[:, :count] = given
+    with np.errstate(all="ignore"):  # runs that diverge
+        function.evaluate()
+    return np.array(function.outputs[0][:, :count])
 
 
 def _runge_kutta(rate: ca.Function, h: float) -> Law:
@@ -328,7 +347,7 @@ def _runge_kutta(rate: ca.Function, h: float) -> Law:
 def _function(expression: Law, sizes: Sequence[int]) -> ca.Function:
     """A function of columns of the sizes, expanded to SX."""
     symbols: Any = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(sizes)]
-    return ca.Function("part", symbols, [expression(*symbols)])
+    return ca.Function("part", symbols, [ca.densify(expression(*symbols))])
 
 
 def _value(function: Law, *arguments: Any) -> Any:
