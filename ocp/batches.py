@@ -109,7 +109,7 @@ class _Simulation:
         self.step.inputs[2][:] = self.own
         self.observe.inputs[1][:] = self.own
         self.left = np.full(width, np.inf)
-        self.last = np.zeros((2 * n, width))
+        self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
         rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
         self.asking = np.zeros((times, plan.fed_back))
         self.count = np.zeros((groups, times))
@@ -121,23 +121,33 @@ class _Simulation:
         """All steps."""
         plan, step = self.plan, self.step
         z, w, _, coefficients = step.inputs
-        after, inside, before = step.outputs
+        after, moved = step.outputs
+        size, inside = np.empty_like(moved), np.empty(moved.shape, dtype=bool)
+        domain = plan.domain[:, None]
         where = {int(k): i for i, k in enumerate(plan.stored)}
         self._store(where[0])
+        before = self.before
+        before[:] = self.observe.outputs[0][: 2 * plan.size]
         last = plan.steps.shape[0]
         for k, noise in self._noises(last, stop):
             w[:] = noise
             coefficients[:] = plan.steps[k]
             step.evaluate()
             z[:] = after
+            np.less_equal(np.abs(moved, size), domain, inside)  # false for NaN
             if not inside.all():
-                gone = inside[0] == 0
-                now = gone & np.isinf(self.left)
-                self.left[now], self.last[:, now] = plan.times[k], before[:, now]
-                z[:, gone] = plan.start[:, None]  # anywhere finite: what follows of these runs is not looked at
+                self._leave(~inside.all(axis=0), plan.times[k])
+            before[:] = moved
             if k + 1 in where:
                 self._store(where[k + 1])
         return self._batch()
+
+    def _leave(self, gone: Any, time: float) -> None:
+        """Note when runs leave the domain, and where they were before."""
+        now = gone & np.isinf(self.left)
+        self.left[now], self.last[:, now] = time, self.before[:, now]
+        # Anywhere finite: what follows of these runs is not looked at.
+        self.step.inputs[0][:, gone] = self.plan.start[:, None]
 
     def _noises(self, steps: int, stop: Callable[[], bool]) -> Iterator[tuple[int, Array]]:
         """Index and normal numbers (noises, width) of each step, from the stream of each run."""

@@ -26,14 +26,14 @@ from covocp.schedule import Grid, coefficients, stored_indices, table
 class Plan:
     """All that a worker needs for any range of runs; the functions are those of `run_step`.
 
-    step: (state of a run, noise, own unknowns, coefficients of the step) -> state after it, whether that is inside the
-        domain, deviation and estimate before it.
+    step: (state of a run, noise, own unknowns, coefficients of the step) -> state after it, deviation and estimate.
     observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
     finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
     steps: coefficients, a row for each step; times: at which they start [s].
     stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
     start: state of a run that starts at its mean; unknowns: their mean.
     spread: factor of the covariance of the start, (n, n).
+    domain: largest deviations and estimates that count as inside, (2n,).
     spans: where the parts of a run's state lie.
     noises: normal numbers that a step takes; states: rows of x; fed_back: controls m.
     seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
@@ -51,6 +51,7 @@ class Plan:
     start: Array
     unknowns: Array
     spread: Array
+    domain: Array
     spans: Mapping[str, slice]
     noises: int
     states: int
@@ -106,6 +107,8 @@ def make_plan(
         start=start_of(run),
         unknowns=setting.actual.start[design.states :],
         spread=np.asarray(factor(ca.DM(setting.actual.variance)).full()),
+        # An unknown is what it is: only its estimate can run away.
+        domain=np.concatenate([setting.domain[: design.states], np.full(design.unknowns, np.inf), setting.domain]),
         spans=run.spans,
         noises=run.noises,
         states=design.states,

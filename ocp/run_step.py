@@ -155,8 +155,8 @@ def step_function(run: Run, constant: Array, varying: Any) -> ca.Function:
         varying: which of them are inputs instead.
 
     Returns:
-        (state, noise, own unknowns, varying coefficients at both ends and h) -> state after the step, whether that is
-        inside the domain (1 or 0), deviation and estimate before the step (2n).
+        (state, noise, own unknowns, varying coefficients at both ends and h) -> state after the step; deviation from
+        the nominal and estimate of it there (2n).
     """
     w, h = run.symbolic.sym("w", run.noises), run.symbolic.sym("h")
     symbols = [run.symbolic.sym(name, varying.size) for name in ("before", "after")]
@@ -174,7 +174,7 @@ def step_function(run: Run, constant: Array, varying: Any) -> ca.Function:
     second, _, _ = _drift(run, z[moving] + h * first + g, sides[1])
     after = z[moving] + h / 2 * (first + second) + g
     flags = ca.fmax(_rows(z, moving.stop), _flags(run, after, asked, applied))
-    outputs = [ca.densify(ca.vertcat(after, flags)), _inside(run, after, sides[1]), _moved(run, z, sides[0])]
+    outputs = [ca.densify(ca.vertcat(after, flags)), _moved(run, after, sides[1])]
     options = {"cse": True} if run.symbolic is ca.SX else {}
     return ca.Function("step", [z, w, run.own, ca.vertcat(*symbols, h)], outputs, options)
 
@@ -344,13 +344,3 @@ def _beyond(value: Any, low: float, high: float) -> Any:
     if np.isfinite(high):
         result = ca.logic_or(result, value > high + BOUND_MARGIN * max(1.0, abs(high)))
     return result
-
-
-def _inside(run: Run, z: Any, c: dict[str, Any]) -> Any:
-    """One where deviation and estimate are finite and within the domain."""
-    setting, states = run.setting, run.setting.design.states
-    values = ca.vertcat(z[run.spans["x"]] - _rows(c["x"], 0, states), _own_deviation(run, z, c))
-    inside: Any = 1.0
-    for i, limit in enumerate([*setting.domain[:states].tolist(), *setting.domain.tolist()]):
-        inside = inside * (ca.fabs(values[i]) <= limit)
-    return inside

@@ -26,7 +26,7 @@ from covocp.schedule import Filter, Grid, base_grid, nominal_at, stored_indices
 from covocp.solution import Solution
 from covocp.statement import Block, entry_names
 from covocp.step_choice import StepChoice, choose_step, given_step
-from covocp.vectorised import LANES
+from covocp.vectorised import padded
 from covocp.workers import Harvest, simulate_batches
 
 # Multiple of the largest predicted deviation of a component beyond which a run has left the domain.
@@ -34,6 +34,8 @@ DOMAIN = 100.0
 # What stands for no such limit; a number, so that a comparison finds inf and NaN.
 UNLIMITED = 1e300
 FILTERS = ("perturbation", "extended")
+# Runs in a batch: wide enough that numpy's operations outweigh their calls, and tasks enough for some workers.
+LARGEST_BATCH, LARGEST_TASK = 2048, 512
 # How the message of a solution begins that `evaluate` made for a truth.
 UNDER_TRUTH = "evaluated under other statistics"
 
@@ -50,7 +52,7 @@ def simulate(
     limits: Any = None,
     store: int = 101,
     paths: int = 20,
-    batch: int = 1024,
+    batch: int | None = None,
     level: float = THREE_SIGMA,
     progress: bool = True,
 ) -> MonteCarlo:
@@ -79,7 +81,8 @@ def simulate(
             is reported in each case.
         store: number of times at which moments are kept.
         paths: number of runs whose histories are kept at these times.
-        batch: number of runs that are simulated together; rounded up to a multiple of 64.
+        batch: number of runs that are simulated together, rounded up to a multiple of 64; None: up to 2048 here, 512 in
+            a task of an executor.
         level: probability of the confidence bands.
         progress: whether to show the progress on a terminal.
 
@@ -91,9 +94,8 @@ def simulate(
         ProblemError: an argument is wrong, the truth does not fit, or there is nothing to simulate.
         SolveError: no run could be simulated.
     """
-    request = Request(
-        runs=runs, seed=seed, store=store, paths=paths, batch=batch, level=level, filter=filter, step=step
-    )
+    size = (LARGEST_BATCH if executor is None else LARGEST_TASK) if batch is None else batch
+    request = Request(runs=runs, seed=seed, store=store, paths=paths, batch=size, level=level, filter=filter, step=step)
     design = _design(solution)
     actual = actual_system(design, truth)
     base = base_grid(solution, store, step)
@@ -146,7 +148,8 @@ class Request:
     @property
     def ranges(self) -> list[tuple[int, int]]:
         """First run of each batch, and the one after its last."""
-        width = -(-self.batch // LANES) * LANES
+        count = max(1, -(-self.runs // self.batch))
+        width = padded(-(-self.runs // count))  # all about equally large
         return [(first, min(first + width, int(self.runs))) for first in range(0, int(self.runs), width)]
 
 
