@@ -1,9 +1,10 @@
-"""What is measured: the cases, and how one of them is run in a process of its own."""
+"""A case to be measured, and how cases are run: each in a process of its own, in random order."""
 
 from __future__ import annotations
 
 import json
 import os
+import random
 import statistics
 import subprocess
 import sys
@@ -18,10 +19,7 @@ LONG_RUN = 30.0  # seconds; a case that takes longer runs once
 TIMEOUT = 900.0  # seconds
 # Threads of a linear algebra library that wait for a busy core made the same run take ten times as long.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-SIZES = {4: 1, 8: 3, 12: 5, 20: 9, 30: 14}  # size n of the covariance: masses
-LARGEST_STATED = 12  # largest n at which the covariance as states is solved to the end
-ONE_ITERATION = 20  # n at which the covariance as states is given one iteration
-CHAIN_INTERVALS, OSCILLATOR_INTERVALS = 50, 100
+SEED = 1  # of the order of the runs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,37 +72,13 @@ class Case:
         return result
 
 
-def oscillator_cases() -> list[Case]:
-    """Part a: damped oscillator, unknown damping and stiffness."""
-    options = {"system": "oscillator", "intervals": OSCILLATOR_INTERVALS}
-    codes = ("covocp", "packed", "naive", "eliminated")
-    return [Case(part="a", code=code, size=4, options={"code": code, **options}) for code in codes]
-
-
-def chain_cases(sizes: Sequence[int]) -> list[Case]:
-    """Part b: chain of masses."""
-    cases = []
-    for n in sizes:
-        options = {"system": "chain", "masses": SIZES[n], "intervals": CHAIN_INTERVALS}
-        codes = ["covocp", "eliminated", *(["packed", "rockit"] if n <= LARGEST_STATED else [])]
-        cases += [Case(part="b", code=code, size=n, options={"code": code, **options}) for code in codes]
-        if n == LARGEST_STATED:
-            one_function = {"code": "rockit", **options, "wrapped": True}
-            cases.append(Case(part="b", code="rockit, one function", size=n, options=one_function))
-        if n == ONE_ITERATION:
-            one = {"code": "packed", **options, "max_iter": 1}
-            cases.append(Case(part="b", code="packed, one iteration", size=n, options=one))
-    return cases
-
-
-def building_cases(largest: int) -> list[Case]:
-    """Part c: from the model to its frozen statement, and the import."""
-    systems: dict[int, dict[str, Any]] = {
-        4: {"system": "oscillator"},
-        largest: {"system": "chain", "masses": SIZES[largest]},
-    }
-    return [
-        *[Case(part="c", code="statement", size=n, options={"code": "statement", **s}) for n, s in systems.items()],
-        Case(part="c", code="import covocp"),
-        Case(part="c", code="import casadi, numpy"),
-    ]
+def measure(cases: Sequence[Case], repeats: int) -> None:
+    """Run all cases in random order, each `repeats` times; a long one or one that fails once."""
+    order = [case for case in cases for _ in range(repeats)]
+    random.Random(SEED).shuffle(order)
+    for count, case in enumerate(order, start=1):
+        if not case.finished:
+            result = case.run()
+            case.results.append(result)
+            said = result.get("error") or f"{result['seconds']:.3f} s"
+            print(f"[{count}/{len(order)}] {case.name}: {said}", flush=True)

@@ -11,61 +11,28 @@ cases are left out.
 
 from __future__ import annotations
 
-import argparse
-import os
-import random
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from cases import SIZES, Case, building_cases, chain_cases, oscillator_cases
-from targets import figures_table, judge
-
-# This process imports neither CasADi nor matplotlib before the end: on Linux a child's peak counts its parent's size.
-DOCS = Path(__file__).resolve().parent.parent / "docs"
-REPEATS = 5
-SEED = 1
+from benchmark import Benchmark, Run
+from cases import Case
+from core_cases import SIZES, building_cases, chain_cases, oscillator_cases
+from core_targets import judge
 
 
-def measure(cases: Sequence[Case], repeats: int) -> None:
-    """Run all cases in random order, each `repeats` times; a long one or one that fails once."""
-    order = [case for case in cases for _ in range(repeats)]
-    random.Random(SEED).shuffle(order)
-    for count, case in enumerate(order, start=1):
-        if not case.finished:
-            result = case.run()
-            case.results.append(result)
-            said = result.get("error") or f"{result['seconds']:.3f} s"
-            print(f"[{count}/{len(order)}] {case.name}: {said}", flush=True)
+def parts(quick: bool) -> dict[str, list[Case]]:
+    """The cases by part."""
+    sizes = [4, 8] if quick else list(SIZES)
+    return {"a": oscillator_cases(), "b": chain_cases(sizes), "c": building_cases(sizes[-1])}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, judge and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one run of each case, n = 4 and 8 only")
-    parser.add_argument("--only", choices=("a", "b", "c"), help="one part")
-    parser.add_argument("--output", type=Path, help="folder of the report (default: docs, for a run of everything)")
-    options = parser.parse_args(arguments)
-    sizes = [4, 8] if options.quick else list(SIZES)
-    parts = {"a": oscillator_cases(), "b": chain_cases(sizes), "c": building_cases(sizes[-1])}
-    cases = [case for part, members in parts.items() if options.only in (None, part) for case in members]
-    repeats = 1 if options.quick else REPEATS
-    load = os.getloadavg()[0]
-    measure(cases, repeats)
-    figures = judge(cases)
-    print(figures_table(figures))
-    missed = [figure for figure in figures if figure.holds is False]
-    print(f"{len(missed)} of {sum(figure.holds is not None for figure in figures)} targets missed")
-    for figure in missed:
-        print(f"  MISSED  {figure.what}: {figure.measured} (target {figure.target})")
-    everything = not options.quick and options.only is None
-    folder = options.output or (DOCS if everything else None)
-    if folder is not None:
-        import report  # matplotlib
+def write(folder: Path, run: Run) -> None:
+    """Write the report."""
+    import core_report  # matplotlib
 
-        report.write(folder, cases, figures, repeats, load)
-    return 0
+    core_report.write(folder, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    benchmark = Benchmark(description=__doc__ or "", quick="n = 4 and 8 only", parts=parts, judge=judge, write=write)
+    sys.exit(benchmark.main())
