@@ -153,10 +153,11 @@ class Drawn:
             else:
                 by_state[:, self.rows(key)] = np.eye(block.size)
             return tuple(np.tile(v, (count, 1, 1)) for v in (by_state, by_control))  # type: ignore[return-value]
+        symbols = solution.extremal.statement.symbols  # not known where the solution was read from a file alone
         states = dict.fromkeys(label.split("[")[0] for label in augmented)
         results = []
         for names, size in ((states, len(augmented)), ([b.name for b in controls], width)):
-            slope = ca.densify(ca.horzcat(*(ca.jacobian(key, solution.symbols[name]) for name in names)))
+            slope = ca.densify(ca.horzcat(*(ca.jacobian(key, symbols[name]) for name in names)))
             results.append(solution[slope].reshape(count, key.shape[0] * key.shape[1], size))
         return results[0], results[1]
 

@@ -79,9 +79,10 @@ def gain(drawn: Sequence[Drawn], word: str, of: str | None, units: Mapping[str, 
     labels = drawn[0].solution.augmented
     others = _controls(drawn[0].solution) if fed else _measured(drawn[0].solution)
     panels = []
+    some = any(np.any(history) for history in histories)
     for owner in dict.fromkeys(label.split("[")[0] for label in labels) if of is None else (of,):
         rows = [i for i, label in enumerate(labels) if label.split("[")[0] == owner]
-        if of is None and not any(np.any(history[:, rows]) for history in histories):
+        if of is None and some and not any(np.any(history[:, rows]) for history in histories):
             continue
         unit = ratio_unit(others[0].split("[")[0], owner, units) if fed else ""
         for group in [rows] if len(rows) > SEPARATE_ENTRIES else [[i] for i in rows]:

@@ -125,6 +125,8 @@ def _of_key(drawn: list[Drawn], key: Any, blocks: Mapping[str, Block], units: Ma
 
 def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Root mean squares, gains or covariances, of the solutions that have them."""
+    if isinstance(key.of, str):
+        drawn = [d for d in drawn if key.of in d.names]
     if key.word in (GAIN, FILTER):
         return gain(drawn, key.word, key.of, units)
     if key.word == RMS:
@@ -145,7 +147,7 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
     if isinstance(key, tuple):
         word = key[0] if len(key) == 2 and isinstance(key[0], str) and key[0] in (RMS, GAIN, FILTER) else ""
         if word and any(knows(solution, word) for solution in solutions) and not _declared(solutions, word):
-            return Quantity(word=word, of=_resolved(solutions, key[1]))
+            return Quantity(word=word, of=_uncertain(solutions, word, key[1]))
         return tuple(_resolved(solutions, part) for part in key)
     error: ProblemError | None = None
     if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
@@ -160,6 +162,31 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
     if error is None or isinstance(key, ca.MX):
         return key
     raise error
+
+
+def _uncertain(solutions: list[Solution], word: str, key: Any) -> Any:
+    """What a root mean square or a gain may be of.
+
+    Raises:
+        ProblemError: it is something else.
+    """
+    of = _resolved(solutions, key)
+    if word == RMS and isinstance(of, ca.MX):
+        return of
+    names = {label.split("[")[0] for solution in solutions for label in solution.augmented}
+    if word == RMS:
+        loops = [solution for solution in solutions if solution.loop is not None]
+        names |= {b.name for solution in loops for b in solution.blocks if b.kind == "control" and b.name != GAIN}
+    if not isinstance(of, str) or of not in names:
+        raise ProblemError(
+            describe(
+                f"There is no ('{word}', {shortened(key)}).",
+                expected="a state or an unknown with a covariance: " + ", ".join(sorted(names)),
+                received=shortened(key),
+                remedy="choose one of them" + (", or an expression of them" if word == RMS else ""),
+            )
+        )
+    return of
 
 
 def _declared(solutions: list[Solution], word: str) -> bool:

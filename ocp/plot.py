@@ -122,18 +122,24 @@ def plot_solutions(
         axes = figure.subplots(rows, columns, squeeze=False)
         for place, panel in zip(axes.ravel(), panels, strict=False):
             _draw(place, panel, len(given), tuple(sigmas))
-        for place in axes.ravel()[len(panels) :]:
-            place.set_visible(False)
-        for column in range(columns):
-            last = max(row for row in range(rows) if row * columns + column < len(panels))
-            axes[last, column].set_xlabel(_plain(abscissa))
-        figure.align_ylabels(list(axes.ravel()[: len(panels)]))
+        _arrange(figure, axes, len(panels), abscissa)
         _title(figure, given, legend, title)
         _legend(figure, given, legend, panels, tuple(sigmas))
         if path is not None:
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
     return figure
+
+
+def _arrange(figure: Figure, axes: Any, count: int, abscissa: str) -> None:
+    """Hide the places without panels, and label the lowest panel of each column."""
+    rows, columns = axes.shape
+    for place in axes.ravel()[count:]:
+        place.set_visible(False)
+    for column in range(columns):
+        last = max(row for row in range(rows) if row * columns + column < count)
+        axes[last, column].set_xlabel(_plain(abscissa))
+    figure.align_ylabels(list(axes.ravel()[:count]))
 
 
 def _labels(solutions: list[Solution], labels: Sequence[str] | None) -> list[str]:

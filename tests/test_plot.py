@@ -488,3 +488,23 @@ def test_entries_are_explained_once_and_units_stand_below_long_names(entry):
 def test_what_only_closed_loops_have_is_refused_elsewhere(lag, name):
     with pytest.raises(co.ProblemError, match=r"'[CX]' is not in this solution"):
         lag.plot(name)
+
+
+@pytest.mark.parametrize("name", [("rms", "E"), ("C", "u"), ("K", ("x", "b")), ("rms", "terminal_weight")])
+def test_what_has_no_spread_and_no_gain_is_refused(combined, name):
+    with pytest.raises(co.ProblemError, match="There is no"):
+        combined.plot(name)
+
+
+def test_an_expression_of_a_loaded_solution_asks_for_the_problem(combined, tmp_path):
+    loaded = co.load(combined.save(tmp_path / "solution.npz"))
+    with pytest.raises(co.CovocpError, match="read from a file"):
+        loaded.plot(("rms", combined.symbols["x"] ** 2))
+
+
+def test_wide_legends_have_several_rows(combined, classical):
+    figure = plot_solutions([combined, classical], "x", labels=["a rather long label " * 2, "another long label " * 2])
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
