@@ -25,7 +25,7 @@ def summary(sample: MonteCarlo) -> str:
         _entries(sample, "error of the filter at T", sample.verdict.errors, sample.design_error),
         _cost(sample),
         _shares(sample),
-        wrapped(str(sample.verdict), ""),
+        wrapped(f"{sample.verdict}{_expectations(sample)}", ""),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -75,6 +75,19 @@ def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design:
     return render_table(columns, rows, words=(0, len(columns) - 1))
 
 
+def _expectations(sample: MonteCarlo) -> str:
+    """What the design expected where the truth is another system, and the sample says otherwise."""
+    if not sample.truth:
+        return ""
+    expected = np.sqrt(np.diagonal(sample.design[-1]))
+    missed = [
+        f"{entry.name} {number(value, 4)}, sample {number(entry.sample, 4)}"
+        for entry, value in zip(sample.verdict.deviations, expected, strict=False)
+        if not entry.low <= value <= entry.high
+    ]
+    return f" The design expects another spread: {'; '.join(missed)}." if missed else ""
+
+
 def _cost(sample: MonteCarlo) -> str:
     if not np.isfinite(sample.cost):
         return ""
@@ -111,4 +124,4 @@ def _shares(sample: MonteCarlo) -> str:
     if outside:
         listed = ", ".join(f"{name} {100 * share:.3g} %" for name, share in outside.items())
         lines.append(f"Runs outside the bounds at some instant: {listed}.")
-    return "\n".join(wrapped(line) for line in lines)
+    return "\n".join(wrapped(line, "") for line in lines)

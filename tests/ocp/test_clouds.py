@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from covocp.clouds import PREDICTED, SAMPLE, plot_monte_carlo
 from covocp.errors import ProblemError
-from covocp.simulate import simulate
+from covocp.simulation import simulate
 
 
 @pytest.fixture(scope="module")

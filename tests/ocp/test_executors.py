@@ -11,7 +11,7 @@ from distributed import Client, LocalCluster
 from loops import steered
 
 from covocp.errors import CovocpWarning, ProblemError, SolveError
-from covocp.simulate import simulate
+from covocp.simulation import simulate
 
 RUNS, BATCH = 300, 64
 ARRAYS = ("deviations", "estimates", "costs", "left", "asked", "outside", "asking", "paths", "numbers")
@@ -79,6 +79,11 @@ def test_processes_give_the_same_numbers(lag, here):
         sample = sample_of(lag, executor=executor)
     assert_same(here, sample)
     assert str(sample) == str(here)
+
+
+def test_threads_give_the_same_numbers(lag, here):
+    with concurrent.futures.ThreadPoolExecutor(2) as executor:
+        assert_same(here, sample_of(lag, executor=executor))
 
 
 def test_a_cluster_gives_the_same_numbers(lag, here, tmp_path):

@@ -14,7 +14,7 @@ from covocp.prediction import predict
 from covocp.run_step import Limits, Setting
 from covocp.sampling import THREE_SIGMA
 from covocp.schedule import base_grid
-from covocp.simulate import simulate
+from covocp.simulation import simulate
 from covocp.step_choice import choose_step
 
 OPTIONS = {"progress": False}
@@ -162,6 +162,17 @@ def test_linear_gains_do_not_hold_unstable_plants(variance, predicted, beyond):
     assert np.isfinite(sample.cost)
 
 
+def test_nothing_is_said_where_every_run_leaves(lag, monkeypatch):
+    monkeypatch.setattr("covocp.simulation.DOMAIN", 1e-6)
+    sample = simulate(lag, 64, 1, step=0.5, store=5, **OPTIONS)
+    assert sample.left_share == 1.0
+    assert sample.share_beyond("x", 1e9) == 1.0
+    assert np.isnan(sample.cost)
+    assert not sample.verdict.holds
+    assert "100 % left the domain" in words(sample)
+    assert np.isfinite(sample.deviations).all()
+
+
 def test_incorrect_statistics():
     # Section 9.2: designed with Q = 1, U = 1, truth Q = 2, U = 0.5.
     from covocp.models import unknown_lag
@@ -180,6 +191,7 @@ def test_incorrect_statistics():
     assert sample.verdict.holds
     assert abs(sample.cost - sample.predicted_cost) < 3 * sample.cost_error
     assert sample.verdict.deviations[0].low > np.sqrt(sample.design[-1, 0, 0])
+    assert "The design expects another spread: x 0.6776" in words(sample)
 
 
 # --- without a feedback ---------------------------------------------------------------------------------------------
@@ -327,103 +339,6 @@ def test_a_truth_with_tables_goes_another_way(oscillator):
     one = simulate(oscillator, 70, 1, step=0.1, truth=linear_quadratic(restoring=table), **OPTIONS)
     two = simulate(oscillator, 70, 1, step=0.1, **OPTIONS)
     np.testing.assert_allclose(one.deviations, two.deviations, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("truth", "words"),
-    [
-        (linear_quadratic(size=3), "other states"),
-        (open_loop(), "other measurements"),
-        ({"nothing": 1.0}, "no parameter 'nothing'"),
-        ({"w": [1.0, 2.0]}, "wrong size"),
-        (3.0, "unknown kind"),
-    ],
-)
-def test_a_truth_that_does_not_fit(oscillator, truth, words):
-    with pytest.raises(ProblemError, match=words) as caught:
-        simulate(oscillator, 64, 1, truth=truth, **OPTIONS)
-    for part in ("expected:", "received:", "remedy:"):
-        assert part in str(caught.value)
-
-
-def test_a_truth_with_other_names(lag):
-    problem = co.Problem(duration=10.0)
-    x = problem.state("x", initial=0.0, variance=1.0)
-    u = problem.control("u")
-    problem.dynamics(x, -x + u, noise=1.0)
-    problem.measurement("position", x, noise=1.0)
-    with pytest.raises(ProblemError, match="other unknowns"):
-        simulate(lag, 64, 1, truth=problem, **OPTIONS)
-
-
-# --- input ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ({"runs": 0}, "runs"),
-        ({"runs": 1}, "runs"),
-        ({"runs": 10.0}, "runs"),
-        ({"runs": True}, "runs"),
-        ({"seed": -1}, "seed"),
-        ({"seed": None}, "seed"),
-        ({"step": 0.0}, "step"),
-        ({"step": -1.0}, "step"),
-        ({"step": "small"}, "step"),
-        ({"step": np.nan}, "step"),
-        ({"store": 1}, "store"),
-        ({"paths": -1}, "paths"),
-        ({"batch": 0}, "batch"),
-        ({"level": 1.0}, "level"),
-        ({"filter": "kalman"}, "filter"),
-        ({"limits": 3.0}, "limits"),
-        ({"limits": {"u": 1.0}}, "limits"),
-        ({"limits": {"v": (0.0, 1.0)}}, "'v'"),
-        ({"limits": {"u": (1.0, 0.0)}}, "cross"),
-    ],
-)
-def test_bad_arguments_are_named(oscillator, arguments, word):
-    given = {"runs": 64, "seed": 1, **OPTIONS, **arguments}
-    with pytest.raises(ProblemError, match=word) as caught:
-        simulate(oscillator, given.pop("runs"), given.pop("seed"), **given)
-    assert "expected:" in str(caught.value)
-
-
-def test_what_cannot_be_simulated(lag, tmp_path):
-    from covocp.models import free_time_integrator, unknown_lag
-
-    with pytest.raises(ProblemError, match="a Solution"):
-        simulate(unknown_lag.steering(), 64, 1, **OPTIONS)
-    with pytest.raises(ProblemError, match="knows no problem"):
-        simulate(co.load(lag.save(tmp_path / "lag.npz")), 64, 1, **OPTIONS)
-    with pytest.raises(ProblemError, match="Nothing is estimated"):
-        simulate(co.solve(free_time_integrator.problem(), intervals=20, progress=False), 64, 1, **OPTIONS)
-    under = co.evaluate(lag, truth=unknown_lag.steering(process_noise=2.0, parameter_variance=0.1))
-    with pytest.raises(ProblemError, match="truth="):
-        simulate(under, 64, 1, **OPTIONS)
-
-
-def test_dynamics_with_a_matrix_are_not_those_of_an_actual_system():
-    problem = co.Problem(duration=1.0)
-    x = problem.state("x", initial=0.0, variance=1.0)
-    u = problem.control("u")
-    P = problem.symmetric("P", 1, initial=1.0)
-    problem.dynamics(x, -x + u * P, noise=1.0)
-    problem.dynamics(P, -P)
-    problem.measurement("m", x, noise=1.0)
-    problem.estimation_covariance()
-    problem.minimize(running=u**2, terminal=P)
-    solution = co.solve(problem, intervals=10, progress=False)
-    with pytest.raises(ProblemError, match="depend on a matrix"):
-        simulate(solution, 64, 1, **OPTIONS)
-
-
-def test_a_solution_that_did_not_converge_is_a_warning():
-    solution = steered(0.1, max_iterations=1, allow_failure=True)
-    assert not solution.converged
-    with pytest.warns(CovocpWarning, match="did not converge"):
-        simulate(solution, 64, 1, step=0.1, **OPTIONS)
 
 
 # --- the result -----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -295,25 +295,18 @@ def _result(
     truth: Any,
 ) -> MonteCarlo:
     """The batches put together."""
-    design, solution, batches = setting.design, setting.solution, harvest.batches
-    expected, true = predictions
+    design, solution, (expected, true) = setting.design, setting.solution, predictions
     at = stored_indices(base, request.store)
     intervals = base.interval[np.minimum(at, base.steps - 1)]
     nominal = nominal_at(solution, base.t[at], intervals)
     unknowns = np.tile(design.start[design.states :], (at.size, 1))
     limits, m = setting.limits, design.fed_back
-    runs = sum(batch.runs for batch in batches)
     costs = _predicted_costs(solution, truth) if setting.costs else (np.nan, np.nan)
 
-    def joined(name: str) -> Array:
-        values = np.concatenate([getattr(batch, name) for batch in batches])
-        values.setflags(write=False)
-        return values
-
     return MonteCarlo(
+        **_of_runs(harvest.batches),
         name=solution.name,
         requested=int(request.runs),
-        numbers=np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches]),
         seed=int(request.seed),
         filter=request.filter,
         fed_back=m > 0,
@@ -323,32 +316,35 @@ def _result(
         t=base.t[at],
         nominal=np.hstack([nominal.x[:, : design.states], unknowns]),
         nominal_control=nominal.u[:, :m],
-        moments=moments_of(batches),
         predicted=true.deviation[at],
         predicted_error=true.error[at],
         predicted_mean=true.mean[at, : design.size],
         design=expected.deviation[at],
         design_error=expected.error[at],
-        deviations=joined("deviation"),
-        estimates=joined("estimate"),
-        costs=joined("cost"),
         design_cost=costs[0],
         predicted_cost=costs[1],
-        left=joined("left"),
         domain=setting.domain,
-        asked=joined("asked"),
-        asking=np.sum([batch.asking for batch in batches], axis=0) / runs,
         limits=(limits.least, limits.most),
         limited=bool(np.isfinite(limits.lower).any() or np.isfinite(limits.upper).any()),
-        outside=joined("outside"),
         bounded=_bounded(design),
-        paths=joined("paths"),
         failed=harvest.failures,
         interrupted=harvest.interrupted,
         blocks=design.statement.blocks,
         augmented=design.statement.augmented,
         symbols=design.statement.symbols,
     )
+
+
+def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
+    """What the result has for each run, and the sums over them."""
+    names = {"deviations": "deviation", "estimates": "estimate", "costs": "cost"}
+    names |= {name: name for name in ("left", "asked", "outside", "paths")}
+    values = {name: np.concatenate([getattr(batch, own) for batch in batches]) for name, own in names.items()}
+    values["numbers"] = np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches])
+    values["asking"] = np.sum([batch.asking for batch in batches], axis=0) / values["numbers"].size
+    for array in values.values():
+        array.setflags(write=False)
+    return {**values, "moments": moments_of(batches)}
 
 
 def _bounded(design: System) -> tuple[str, ...]:
