@@ -113,13 +113,7 @@ def simulate_law(
     start = np.asarray(initial, dtype=float).ravel()
     if start.size != plant.size1_in(0):
         raise _wrong("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
-    counts = {"samples": (samples, 2), "runs": (1 if runs is None else runs, 1)}
-    for name, (count, least) in counts.items():
-        if isinstance(count, bool) or int(count) != count or count < least:
-            raise _wrong(name, f"a whole number, {least} or more", repr(count))
-    for name, seconds in (("duration", duration), ("step", step)):
-        if not 0.0 < seconds < np.inf:
-            raise _wrong(name, "a positive time [s]", repr(seconds))
+    _check_numbers({"samples": (samples, 2), "runs": (1 if runs is None else runs, 1)}, duration=duration, step=step)
     times = np.linspace(0.0, float(duration), int(samples))
     loop = _Loop(plant=plant, law=law, observer=observer, running=running, size=start.size)
     if runs is None:
@@ -367,6 +361,16 @@ def _stack(*parts: Any) -> Any:
     if any(isinstance(part, ca.SX) for part in parts):
         return ca.vertcat(*parts)
     return np.concatenate([np.ravel(part) for part in parts])
+
+
+def _check_numbers(counts: dict[str, tuple[int, int]], **times: float) -> None:
+    """Counts that are whole and not below their least value, times that are positive."""
+    for name, (count, least) in counts.items():
+        if isinstance(count, bool) or int(count) != count or count < least:
+            raise _wrong(name, f"a whole number, {least} or more", repr(count))
+    for name, seconds in times.items():
+        if not 0.0 < seconds < np.inf:
+            raise _wrong(name, "a positive time [s]", repr(seconds))
 
 
 def _root(name: str, density: ArrayLike, size: int) -> Array:

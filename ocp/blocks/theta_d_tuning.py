@@ -6,6 +6,7 @@ Everything here is about a regulator (A0, A, B, Q, R); for a filter give the dua
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -184,8 +185,6 @@ def choose(
         ProblemError: an argument does not fit, no Riccati solution at a state, or a pair is not stabilisable or not
             detectable (names the mode).
     """
-    from scipy.optimize import least_squares
-
     begin = series.start(A0, B, Q, R)
     size, count = begin.riccati.shape[0], _count(terms, starts)
     samples = as_states(states, size)
@@ -205,14 +204,19 @@ def choose(
         found = sums(samples.T, factors).full().T.reshape(len(samples), size, size)
         return np.asarray(_largest(found) / wanted - 1.0)
 
+    best, misfit = _fitted(misfits, count, _guesses(count, starts, float(np.ptp(instants)), seed))
+    k = np.where(best[:count] < NEGLIGIBLE, 0.0, best[:count])
+    return Choice(k=k, l=np.where(k == 0.0, 0.0, best[count:]), misfit=misfit)
+
+
+def _fitted(misfits: Callable[[Array], Array], count: int, guesses: Array) -> tuple[Array, float]:
+    """The best k and l of all the starts, and their misfit (root mean square)."""
+    from scipy.optimize import least_squares
+
     bounds = (np.zeros(2 * count), np.repeat([1.0, np.inf], count))
-    guesses = _guesses(count, starts, float(np.ptp(instants)), seed)
     fits = [least_squares(misfits, guess, bounds=bounds, xtol=1e-12, ftol=1e-12, gtol=1e-12) for guess in guesses]
     best = min(fits, key=lambda fit: float(fit.cost))
-    k, rates = np.asarray(best.x[:count]), np.asarray(best.x[count:])
-    k = np.where(k < NEGLIGIBLE, 0.0, k)
-    misfit = float(np.sqrt(np.mean(np.square(best.fun))))
-    return Choice(k=k, l=np.where(k == 0.0, 0.0, rates), misfit=misfit)
+    return np.asarray(best.x), float(np.sqrt(np.mean(np.square(best.fun))))
 
 
 def _guesses(count: int, starts: int, span: float, seed: int) -> Array:

@@ -1,0 +1,157 @@
+"""How far the θ-D series converges, and k, l by least squares, section 8."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.blocks import sdre, theta_d
+from covocp.law_simulation import simulate_law
+from covocp.models import agile_aircraft, theta_d_benchmarks
+
+X = ca.SX.sym("x", 3)
+A0 = np.array([[0.2, 1.0, 0.0], [-0.5, 0.1, 0.4], [0.3, 0.0, -0.6]])
+FIRST = np.array([[0.0, 0.3, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.2]])
+B, Q, R = np.array([[1.0, 0.0], [0.0, 0.0], [0.2, 1.0]]), np.diag([1.0, 2.0, 0.5]), np.array([[1.0, 0.2], [0.2, 0.7]])
+
+
+def test_radius_of_known_singularities():
+    assert theta_d.radius(1.0, -1.0, 1.0, 1.0, 1.0) == pytest.approx(np.sqrt(2.0), rel=1e-3)
+    linear, bilinear, column, _ = agile_aircraft.matrices()
+    for units in ("rad", "deg"):
+        scenario = agile_aircraft.regulation(units)
+        found = theta_d.radius(linear, bilinear, column, scenario.Q, scenario.R)
+        S = column @ column.T / scenario.R
+        constant = np.block([[linear, -S], [-scenario.Q, -linear.T]])
+        direction = np.block([[bilinear, np.zeros((5, 5))], [np.zeros((5, 5)), -bilinear.T]])
+        # Here the nearest singularity is where two eigenvalues of the Hamiltonian matrix meet in zero.
+        inverse_roots = np.linalg.eigvals(np.linalg.solve(constant, -direction))
+        assert found == pytest.approx(1.0 / np.abs(inverse_roots).max(), rel=1e-3)
+
+
+def test_radius_of_a_series_that_ends_is_infinite():
+    system = theta_d_benchmarks.system("arctangent")
+    found = theta_d.convergence(
+        system.x, system.A0, system.A, system.B, system.Q, system.R, [[0.5, 1.0], [-3.0, 0.2], [0.0, 0.0]]
+    )
+    assert np.all(np.isinf(found.radius))
+    assert found.converges
+
+
+def test_published_radii_of_the_aircraft():
+    """Section 7 for filter and servo; what it says of the regulator, 73 and 48 deg, are estimates of low order."""
+    linear, bilinear, column, measured = agile_aircraft.matrices()
+    for units, regulator, observer in (("rad", 68.7226, 28.71), ("deg", 42.7035, 26.33)):
+        first, second = agile_aircraft.regulation(units), agile_aircraft.tracking(units)
+        found = theta_d.radius(linear, bilinear, column, first.Q, first.R)
+        assert np.rad2deg(found) == pytest.approx(regulator, rel=1e-3)
+        found = theta_d.radius(linear.T, bilinear.T, measured.T, first.W, first.V)
+        assert np.rad2deg(found) == pytest.approx(observer, rel=2e-3)
+        x = ca.SX.sym("x", 5)
+        _, constant, rest, extended = theta_d.integral_states(x, linear, ca.DM(bilinear), column, [0, 0, 0, 1.0, 0])
+        found = theta_d.radius(constant, ca.DM(rest).full(), extended, second.Q, second.R)
+        assert np.rad2deg(found) == pytest.approx(1.5356, rel=1e-3)
+
+
+def test_inside_the_radius_more_terms_help_and_outside_they_do_not():
+    system = theta_d_benchmarks.system("cubic")
+    arguments = (system.x, system.A0, system.A, system.B, system.Q, system.R)
+    inside, outside = theta_d.convergence(*arguments, [1.0, 1.5], warn=False).radius
+    assert inside > 1.0 > outside
+    for x, grows in ((1.0, False), (1.5, True)):
+        exact = theta_d_benchmarks.exact("cubic", x).control[0, 0]
+        errors = [abs(float(theta_d.regulator(*arguments, terms=n)(x, 0.0)) - exact) for n in (10, 20, 40)]
+        assert (errors[-1] > errors[0]) == grows
+
+
+def test_outside_the_radius_a_warning_names_the_state():
+    system = theta_d_benchmarks.system("cubic")
+    arguments = (system.x, system.A0, system.A, system.B, system.Q, system.R)
+    assert theta_d.convergence(*arguments, [0.5, -1.1]).converges
+    with pytest.warns(co.CovocpWarning, match=r"1 of 2 states; at x = \(2\)"):
+        found = theta_d.convergence(*arguments, [0.5, 2.0])
+    assert not found.converges
+
+
+def test_conditions_of_theorem_3_1():
+    """(iv) fails for the aircraft in its own coordinates and holds after a change of them; the bound is a lower one."""
+    linear, bilinear, column, measured = agile_aircraft.matrices()
+    x = ca.SX.sym("x", 5)
+    A = x[1] * ca.DM(bilinear)
+    state = [[0.0, np.deg2rad(20.0), 0.0, 0.0, 0.0]]
+    printed = {"rad": (2.2e3, 8.4), "deg": (3.0e3, 13.4)}
+    for units, (regulator, observer) in printed.items():
+        scenario = agile_aircraft.regulation(units)
+        both = (
+            theta_d.convergence(x, linear, A, column, scenario.Q, scenario.R, state),
+            theta_d.convergence(x, linear.T, A.T, measured.T, scenario.W, scenario.V, state),
+        )
+        assert both[0].largest == pytest.approx(regulator, rel=0.05)
+        assert both[1].largest == pytest.approx(observer, rel=0.05)
+        for found in both:
+            assert found.decay < 0.0
+            assert found.largest_transformed < 0.0
+            assert np.all(found.guaranteed > 0.0)
+            assert np.all(found.guaranteed <= found.radius)
+
+
+def test_guaranteed_radius_bounds_the_terms():
+    """Within it the series converges for every choice of epsilon in [0, 1]."""
+    found = theta_d.convergence(X, A0, X[0] * ca.DM(FIRST), B, Q, R, [1.0, 0.0, 0.0], warn=False)
+    state = [float(found.guaranteed[0]), 0.0, 0.0]
+    built = theta_d.expansion(X, A0, X[0] * ca.DM(FIRST), B, Q, R, terms=30, form="operator")
+    norms = [np.linalg.norm(term.full()) for term in built.terms(state, 0.0)]
+    assert norms[-1] < 1e-3 * norms[1]
+    assert found.guaranteed[0] <= found.radius[0]
+
+
+def sdre_trajectory(system, start, duration, samples):
+    u = ca.SX.sym("u", system.B.shape[1])
+    rate = (ca.DM(system.A0) + system.A) @ system.x + ca.DM(system.B) @ u
+    law = sdre.regulator(system.x, system.A0, system.A, system.B, system.Q, system.R)
+    return simulate_law(ca.Function("f", [system.x, u], [rate]), law, initial=start, duration=duration, samples=samples)
+
+
+@pytest.mark.parametrize("start", [1.5, 3.0])
+def test_choice_where_the_series_diverges(start):
+    """Section 8: l_1 is the decay rate of A(x(t)), 2 sqrt(2), and the second correction stays away."""
+    system = theta_d_benchmarks.system("cubic")
+    run = sdre_trajectory(system, [start], 5.0, 51)
+    found = theta_d.choose(system.x, system.A0, system.A, system.B, system.Q, system.R, run.x, run.t, starts=4)
+    assert found.misfit < 1e-7
+    assert found.l[0] == pytest.approx(2 * np.sqrt(2.0), rel=2e-3)
+    assert found.k[1] == pytest.approx(1.0, abs=1e-3)
+    assert found.l[1] == pytest.approx(0.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("units", ["rad", "deg"])
+def test_choice_where_the_series_converges(units):
+    """Section 8: from 30 deg the fit takes the whole series, k = 0."""
+    linear, bilinear, column, _ = agile_aircraft.matrices()
+    scenario = agile_aircraft.regulation(units)
+    x = ca.SX.sym("x", 5)
+    system = theta_d_benchmarks.System(
+        x=x, A0=linear, A=x[1] * ca.DM(bilinear), B=column, Q=scenario.Q, R=np.array([[scenario.R]])
+    )
+    run = sdre_trajectory(system, scenario.start, 10.0, 41)
+    found = theta_d.choose(x, linear, system.A, column, scenario.Q, scenario.R, run.x, run.t, starts=4)
+    np.testing.assert_array_equal(found.k, 0.0)
+    np.testing.assert_array_equal(found.l, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"terms": 1}, "'terms'"),
+        ({"starts": 0}, "'starts'"),
+        ({"times": [0.0]}, "'times'"),
+        ({"states": [[1.0, 2.0]]}, "'states'"),
+    ],
+)
+def test_bad_samples_are_named(change, message):
+    system = theta_d_benchmarks.system("cubic")
+    arguments = {"states": [[1.0], [0.5]], "times": [0.0, 1.0], **change}
+    with pytest.raises(co.ProblemError, match=message):
+        theta_d.choose(system.x, system.A0, system.A, system.B, system.Q, system.R, **arguments)
