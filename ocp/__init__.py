@@ -25,13 +25,18 @@ from covocp.problem import Problem as Problem
 from covocp.solution import Solution as Solution
 
 if TYPE_CHECKING:
+    __version__: str
     from covocp.certificate import Certificate as Certificate
     from covocp.certificate import certify as certify
+    from covocp.law_simulation import LawSimulation as LawSimulation
+    from covocp.law_simulation import simulate_law as simulate_law
+    from covocp.merit import Worth as Worth
+    from covocp.merit import worth as worth
+    from covocp.simulation import MonteCarlo as MonteCarlo
+    from covocp.simulation import simulate as simulate
     from covocp.solvers.compare import Comparison as Comparison
     from covocp.solvers.compare import compare as compare
     from covocp.storage import load as load
-    from covocp.merit import Worth as Worth
-    from covocp.merit import worth as worth
 else:
     # What is done with a solution is imported when it is first asked for: so the import stays as light as CasADi's,
     # and nothing here imports a method.
@@ -41,11 +46,19 @@ else:
         "Comparison": "covocp.solvers.compare",
         "compare": "covocp.solvers.compare",
         "load": "covocp.storage",
+        "LawSimulation": "covocp.law_simulation",
+        "simulate_law": "covocp.law_simulation",
+        "MonteCarlo": "covocp.simulation",
+        "simulate": "covocp.simulation",
         "Worth": "covocp.merit",
         "worth": "covocp.merit",
     }
 
     def __getattr__(name):
+        if name == "blocks":
+            return importlib.import_module("covocp.blocks")
+        if name == "__version__":
+            return importlib.import_module("importlib.metadata").version("covocp")
         if name in _LATER:
             return getattr(importlib.import_module(_LATER[name]), name)
         raise AttributeError(f"module 'covocp' has no attribute '{name}'")

@@ -18,7 +18,7 @@ from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
 from covocp.errors import ProblemError, describe
 from covocp.matrices import pack, pack_symbolic, unpack_symbolic
-from covocp.vectorised import Columns, padded, vectorise
+from covocp.simulation.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
 # A casadi.Function, or a Python function of arrays that returns an array.

@@ -3,3 +3,9 @@
 Arguments may be numbers, numpy arrays or CasADi expressions; what comes back is numeric when all of them are. Blocks
 know nothing of problems, grids or solvers.
 """
+
+from __future__ import annotations
+
+from covocp.blocks import kalman as kalman
+from covocp.blocks import riccati as riccati
+from covocp.blocks import theta_d as theta_d

@@ -5,9 +5,9 @@ import pytest
 from loops import steered
 from matplotlib.figure import Figure
 
-from covocp.clouds import PREDICTED, SAMPLE, plot_monte_carlo
 from covocp.errors import ProblemError
-from covocp.simulation import simulate
+from covocp.simulation.clouds import PREDICTED, SAMPLE, plot_monte_carlo
+from covocp.simulation.runs import simulate
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from distributed import Client, LocalCluster
 from loops import steered
 
 from covocp.errors import CovocpWarning, ProblemError, SolveError
-from covocp.simulation import simulate
+from covocp.simulation.runs import simulate
 
 RUNS, BATCH = 300, 64
 ARRAYS = ("deviations", "estimates", "costs", "left", "asked", "outside", "asking", "paths", "numbers")

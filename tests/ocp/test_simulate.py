@@ -6,16 +6,16 @@ from loops import GRADED, linear_quadratic, open_loop, steered
 from scipy import special, stats
 
 import covocp as co
-from covocp.actual import design_system
-from covocp.batches import run_batch
 from covocp.errors import CovocpWarning, ProblemError
-from covocp.plan import make_plan
-from covocp.prediction import predict
-from covocp.run_step import Limits, Setting
-from covocp.sampling import THREE_SIGMA
-from covocp.schedule import base_grid
-from covocp.simulation import simulate
-from covocp.step_choice import choose_step
+from covocp.simulation.actual import design_system
+from covocp.simulation.batches import run_batch
+from covocp.simulation.plan import make_plan
+from covocp.simulation.prediction import predict
+from covocp.simulation.run_step import Limits, Setting
+from covocp.simulation.runs import simulate
+from covocp.simulation.sampling import THREE_SIGMA
+from covocp.simulation.schedule import base_grid
+from covocp.simulation.step_choice import choose_step
 
 OPTIONS = {"progress": False}
 
@@ -163,7 +163,7 @@ def test_linear_gains_do_not_hold_unstable_plants(variance, predicted, beyond):
 
 
 def test_nothing_is_said_where_every_run_leaves(lag, monkeypatch):
-    monkeypatch.setattr("covocp.simulation.DOMAIN", 1e-6)
+    monkeypatch.setattr("covocp.simulation.runs.DOMAIN", 1e-6)
     sample = simulate(lag, 64, 1, step=0.5, store=5, **OPTIONS)
     assert sample.left_share == 1.0
     assert sample.share_beyond("x", 1e9) == 1.0
@@ -252,8 +252,8 @@ def test_a_given_step_is_the_longest(lag, oscillator):
 
 
 def test_a_step_that_does_not_settle_is_a_warning(lag, monkeypatch):
-    monkeypatch.setattr("covocp.step_choice.SHARE", 1e-9)
-    monkeypatch.setattr("covocp.step_choice.PAIRS", 1)
+    monkeypatch.setattr("covocp.simulation.step_choice.SHARE", 1e-9)
+    monkeypatch.setattr("covocp.simulation.step_choice.PAIRS", 1)
     with pytest.warns(CovocpWarning, match="did not settle"):
         sample = simulate(lag, 64, 1, **OPTIONS)
     assert not sample.step.settled

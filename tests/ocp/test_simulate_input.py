@@ -7,7 +7,7 @@ from loops import linear_quadratic, open_loop, steered
 import covocp as co
 from covocp.errors import CovocpWarning, ProblemError
 from covocp.models import free_time_integrator, unknown_lag
-from covocp.simulation import simulate
+from covocp.simulation.runs import simulate
 
 OPTIONS = {"progress": False}
 

@@ -5,7 +5,7 @@ import pytest
 
 import covocp as co
 from covocp.models import mars_entry
-from covocp.simulation import simulate
+from covocp.simulation.runs import simulate
 
 RUNS = 3000
 # Standard error of a ratio of 3,000 normal runs; two programs were compared.

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from covocp.vectorised import LANES, OPERATIONS, padded, vectorise
+from covocp.simulation.vectorised import LANES, OPERATIONS, padded, vectorise
 
 
 def columns(function, inputs, shared=()):

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from covocp.batches import Batch, StoppedError, run_batch
 from covocp.errors import ProblemError, describe
-from covocp.plan import Plan
+from covocp.simulation.batches import Batch, StoppedError, run_batch
+from covocp.simulation.plan import Plan
 
 # Seconds between two looks at the interrupt while an executor works.
 PATIENCE = 0.2

@@ -9,25 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from covocp.actual import System, actual_system, design_system
-from covocp.batches import Batch, StoppedError
 from covocp.checks import check_bounds, column
 from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
 from covocp.evaluate import evaluate
 from covocp.lookup import name_of
 from covocp.matrices import Array
-from covocp.monte_carlo import MonteCarlo
-from covocp.plan import make_plan
-from covocp.prediction import Prediction, predict
 from covocp.progress import Progress
-from covocp.run_step import Limits, Setting, bounded_rows
-from covocp.sampling import THREE_SIGMA, moments_of
-from covocp.schedule import Filter, Grid, base_grid, nominal_at, stored_indices
+from covocp.simulation.actual import System, actual_system, design_system
+from covocp.simulation.batches import Batch, StoppedError
+from covocp.simulation.monte_carlo import MonteCarlo
+from covocp.simulation.plan import make_plan
+from covocp.simulation.prediction import Prediction, predict
+from covocp.simulation.run_step import Limits, Setting, bounded_rows
+from covocp.simulation.sampling import THREE_SIGMA, moments_of
+from covocp.simulation.schedule import Filter, Grid, base_grid, nominal_at, stored_indices
+from covocp.simulation.step_choice import StepChoice, choose_step, given_step
+from covocp.simulation.vectorised import padded
+from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution import Solution
 from covocp.statement import Block, entry_names
-from covocp.step_choice import StepChoice, choose_step, given_step
-from covocp.vectorised import padded
-from covocp.workers import Harvest, simulate_batches
 
 # Multiple of the largest predicted deviation of a component beyond which a run has left the domain.
 DOMAIN = 100.0

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from covocp.matrices import Array
-from covocp.plan import Plan
-from covocp.vectorised import LANES, padded, vectorise
+from covocp.simulation.plan import Plan
+from covocp.simulation.vectorised import LANES, padded, vectorise
 
 # Steps whose random numbers are drawn together: they are most of the memory of a batch.
 DRAWN = 64

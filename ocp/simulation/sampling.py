@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from covocp.batches import Batch
 from covocp.matrices import Array
+from covocp.simulation.batches import Batch
 
 # Probability within 3 standard deviations of a normal law.
 THREE_SIGMA = float(special.erf(3.0 / np.sqrt(2.0)))

@@ -8,10 +8,10 @@ import numpy as np
 
 from covocp.matrices import Array
 from covocp.report import number, render_table, wrapped
-from covocp.verdict import Entry
+from covocp.simulation.verdict import Entry
 
 if TYPE_CHECKING:
-    from covocp.monte_carlo import MonteCarlo
+    from covocp.simulation.monte_carlo import MonteCarlo
 
 # Failures that are listed one by one.
 LISTED = 5

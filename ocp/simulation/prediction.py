@@ -18,10 +18,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.actual import System
 from covocp.errors import ProblemError, describe
 from covocp.matrices import Array
-from covocp.schedule import Grid, coefficients, nominal_at
+from covocp.simulation.actual import System
+from covocp.simulation.schedule import Grid, coefficients, nominal_at
 from covocp.solution import Solution
 
 # Length of a step times the fastest rate: classical Runge-Kutta then errs by less than 1e-6.

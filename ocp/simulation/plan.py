@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.matrices import Array
-from covocp.run_step import (
+from covocp.simulation.run_step import (
     Setting,
     factor,
     finish_function,
@@ -19,7 +19,7 @@ from covocp.run_step import (
     start_of,
     step_function,
 )
-from covocp.schedule import Grid, coefficients, stored_indices, table
+from covocp.simulation.schedule import Grid, coefficients, stored_indices, table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

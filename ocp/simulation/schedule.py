@@ -12,9 +12,9 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.actual import System
 from covocp.matrices import Array, pack, unpack_symbolic
 from covocp.riccati import inverse
+from covocp.simulation.actual import System
 from covocp.solution import Solution
 
 Filter = Literal["perturbation", "extended"]

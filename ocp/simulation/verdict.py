@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from covocp.matrices import Array
-from covocp.sampling import degrees_of_freedom, mean_square_band, robust_deviation
+from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation
 
 if TYPE_CHECKING:
-    from covocp.monte_carlo import MonteCarlo
+    from covocp.simulation.monte_carlo import MonteCarlo
 
 # A run that ends this many predicted deviations away counts as unstable: no normal one does.
 UNSTABLE = 10.0

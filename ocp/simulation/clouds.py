@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from covocp.monte_carlo import MonteCarlo
+    from covocp.simulation.monte_carlo import MonteCarlo
 
 PREDICTED, SAMPLE = COLOURS[0], COLOURS[1]
 GREY = "#777777"

@@ -14,11 +14,11 @@ from covocp.checks import as_number
 from covocp.errors import ProblemError, describe
 from covocp.lookup import name_of
 from covocp.matrices import Array
-from covocp.sampling import Moments, degrees_of_freedom, mean_band, mean_square_band, robust_deviation
+from covocp.simulation.sampling import Moments, degrees_of_freedom, mean_band, mean_square_band, robust_deviation
+from covocp.simulation.step_choice import StepChoice
+from covocp.simulation.verdict import Verdict, judge
+from covocp.simulation.workers import Failure
 from covocp.statement import Block
-from covocp.step_choice import StepChoice
-from covocp.verdict import Verdict, judge
-from covocp.workers import Failure
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -260,13 +260,13 @@ class MonteCarlo:
         return result | {"limits.lower": self.limits[0], "limits.upper": self.limits[1]}
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
-        """Draw the runs; see `covocp.clouds.plot_monte_carlo`."""
-        module = importlib.import_module("covocp.clouds")
+        """Draw the runs; see `covocp.simulation.clouds.plot_monte_carlo`."""
+        module = importlib.import_module("covocp.simulation.clouds")
         return module.plot_monte_carlo(self, *names, **options)  # type: ignore[no-any-return]
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(importlib.import_module("covocp.simulation_report").summary(self))
+        return str(importlib.import_module("covocp.simulation.report").summary(self))
 
     def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:
         """Where a symbol lies among the rows of deviation, estimate and control (2n + m), and its block.

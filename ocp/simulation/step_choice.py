@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from covocp.batches import Batch, run_batch
 from covocp.matrices import Array
-from covocp.plan import make_plan
-from covocp.run_step import Setting
-from covocp.schedule import Grid
+from covocp.simulation.batches import Batch, run_batch
+from covocp.simulation.plan import make_plan
+from covocp.simulation.run_step import Setting
+from covocp.simulation.schedule import Grid
 
 # First step times the fastest rate of filter, loop and plant: Heun's method then errs by 1 % of a variance.
 STEP_PER_RATE = 0.2

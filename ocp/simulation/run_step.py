@@ -23,10 +23,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.actual import System
 from covocp.matrices import Array, half_length, pack_symbolic, unpack_symbolic
 from covocp.riccati import inverse, riccati_rate
-from covocp.schedule import Coefficients, Filter, filter_gain
+from covocp.simulation.actual import System
+from covocp.simulation.schedule import Coefficients, Filter, filter_gain
 from covocp.solution import Solution
 
 # A pivot of a factorisation counts as zero below this share of its diagonal entry.
