@@ -67,11 +67,10 @@ def dependence(x: Any, A: Any, size: int) -> tuple[Any, Any]:
     return state, in_state("A", x, values.square("A", A, size), state)
 
 
-def random_states(size: int, count: int, seed: int) -> Array:
-    """Normal random states of several sizes, (count, size)."""
+def random_states(size: int, count: int, seed: int, scales: tuple[float, ...] = SCALES) -> Array:
+    """Random states, (count, size): normal numbers, each times one of the scales."""
     generator = np.random.default_rng(seed)
-    scales = np.resize(np.array(SCALES), count)
-    return np.asarray(generator.standard_normal((count, size)) * scales[:, None])
+    return np.asarray(generator.standard_normal((count, size)) * generator.choice(np.array(scales), (count, size)))
 
 
 def as_states(states: Any, size: int) -> Array:

@@ -31,8 +31,19 @@ Array = NDArray[np.float64]
 Monomial = tuple[int, ...]
 Polynomial = dict[Monomial, Array]
 
-# Relative error up to which entries of A(x) at random states count as linearly dependent.
+# Scales of the random states at which entries of A(x) are compared, and the relative error up to which they count as
+# linearly dependent: what agrees at all these scales is the same function.
+SCALES = (0.03, 0.3, 1.0, 3.0, 1e2, 1e4, 1e6)
 DEPENDENCE_TOLERANCE = 1e-11
+# Coefficients of such combinations, of entries of size 1, that are none.
+ROUNDOFF = 1e-13
+# Operations of functions that are known everywhere from their values anywhere.
+ANALYTIC = {
+    *(ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_ASSIGN, ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_NEG),
+    *(ca.OP_TWICE, ca.OP_SQ, ca.OP_INV, ca.OP_SQRT, ca.OP_POW, ca.OP_CONSTPOW, ca.OP_EXP, ca.OP_EXPM1, ca.OP_LOG),
+    *(ca.OP_LOG1P, ca.OP_SIN, ca.OP_COS, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_SINH, ca.OP_COSH),
+    *(ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ERF),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +190,8 @@ def right_side(last: Any, roots: Sequence[Any], A: Any) -> Any:
 def separated(x: Any, A: Any) -> tuple[list[Any], list[Array]]:
     """A(x) as a sum of scalar functions times constant matrices, one function for each independent entry.
 
-    Whether entries depend on each other linearly is seen from their values at random states.
+    Whether analytic entries depend on each other linearly is seen from their values at random states; entries with
+    branches are taken to be independent.
 
     Args:
         x: SX symbol, (n, 1).
@@ -188,28 +200,42 @@ def separated(x: Any, A: Any) -> tuple[list[Any], list[Array]]:
     Returns:
         Functions phi_k, each an entry of A, and their matrices A_k, (n, n).
     """
+    rows, columns = A.sparsity().get_triplet()
+    if not rows:
+        return [], []
+    entries = ca.vertcat(*A.nonzeros())
+    inputs: Any = ([x], [entries])
+    basis, coefficients = _dependences(ca.Function("entries", *inputs))
+    matrices = np.zeros((basis.size, *A.shape))
+    matrices[:, rows, columns] = coefficients
+    return [entries[int(i)] for i in basis], list(matrices)
+
+
+def _dependences(entries: Any) -> tuple[NDArray[np.intp], Array]:
+    """Indices of independent entries, and all the entries as combinations of these, (independent, entries)."""
     from scipy.linalg import qr, solve_triangular
 
-    rows, columns = A.sparsity().get_triplet()
-    entries = ca.vertcat(*A.nonzeros()) if A.nnz() else ca.SX(0, 1)
-    sampled, fresh = (_values(ca.Function("entries", [x], [entries]), seed) for seed in (1, 2))
+    count = entries.size1_out(0)
+    apart = np.arange(count), np.eye(count)
+    used_operations = {entries.instruction_id(k) for k in range(entries.n_instructions())}
+    sampled, fresh = (_values(entries, seed) for seed in (1, 2))
+    if not used_operations <= ANALYTIC or min(len(sampled), len(fresh)) < 2 * count:
+        return apart
     norms = np.linalg.norm(sampled, axis=0)
     used = np.flatnonzero(norms > 0.0)
     if used.size == 0:
-        return [], []
+        return used, np.zeros((0, count))
     _, triangle, order = qr(sampled[:, used] / norms[used], mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(triangle))
     rank = int(np.sum(diagonal > DEPENDENCE_TOLERANCE * diagonal[0]))
     scaled = np.hstack([np.eye(rank), solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])])
-    coefficients = np.zeros((rank, entries.shape[0]))
-    coefficients[:, used[order]] = scaled * norms[used[order]] / norms[used[order[:rank]], None]
+    scaled[np.abs(scaled) < ROUNDOFF] = 0.0
     basis = used[order[:rank]]
-    errors = np.abs(fresh[:, basis] @ coefficients - fresh).max(axis=0)
-    if np.any(errors > DEPENDENCE_TOLERANCE * np.abs(fresh).max(axis=0)):
-        basis, coefficients = np.arange(entries.shape[0]), np.eye(entries.shape[0])
-    matrices = np.zeros((basis.size, *A.shape))
-    matrices[:, rows, columns] = coefficients
-    return [entries[int(i)] for i in basis], list(matrices)
+    coefficients = np.zeros((rank, count))
+    coefficients[:, used[order]] = scaled * norms[used[order]] / norms[basis, None]
+    sizes = np.abs(fresh[:, basis]) @ np.abs(coefficients) + np.abs(fresh)
+    wrong = np.abs(fresh[:, basis] @ coefficients - fresh) > DEPENDENCE_TOLERANCE * sizes
+    return apart if wrong.any() else (basis, coefficients)
 
 
 def polynomials(
@@ -293,10 +319,12 @@ def _plus(one: Monomial, two: Monomial) -> Monomial:
 
 
 def _values(function: Any, seed: int) -> Array:
-    """Values of a function at random states where they are finite, (samples, entries)."""
-    states = random_states(function.size1_in(0), 16 * function.size1_out(0) + 32, seed)
-    found = function.map(len(states))(states.T).full().T
-    return np.asarray(found[np.isfinite(found).all(axis=1)])
+    """Values of a function at random states where they are finite, (samples, entries), each row divided by its size."""
+    states = random_states(function.size1_in(0), 32 * function.size1_out(0) + 64, seed, SCALES)
+    found = np.asarray(function.map(len(states))(states.T).full().T)
+    sizes = np.abs(found).max(axis=1)
+    known = np.isfinite(sizes) & (sizes > 0.0)
+    return np.asarray(found[known] / sizes[known, None])
 
 
 def _inverse(closed_loop: Array) -> Array:

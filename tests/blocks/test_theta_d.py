@@ -127,6 +127,25 @@ def test_polynomial_form_with_functions_that_are_not_defined_everywhere():
     np.testing.assert_allclose(call(forms[0], state, 0.0), call(forms[1], state, 0.0), rtol=1e-13)
 
 
+NEARLY = {
+    "far away": (X[1], X[1] + ca.fmax(X[0] - 50.0, 0.0), [60.0, 1.0, 0.0]),
+    "in a narrow range": (X[1], X[1] + ca.if_else(ca.fabs(X[0] - 0.5) < 1e-6, 1.0, 0.0), [0.5, 1.0, 0.0]),
+    "over long distances": ((1.0 + X[0] / 2e7) ** -2, 1.0 - X[0] / 1e7 + 0.0 * X[0], [1e7, 0.0, 0.0]),
+    "never seen": (ca.log(X[0] - 1e9), X[1], [2e9, 1.0, 0.0]),
+    "zero near the origin": (ca.fmax(X[0] - 1e9, 0.0), X[1], [2e9, 1.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("case", list(NEARLY))
+def test_entries_that_nearly_depend_on_each_other_are_kept_apart(case):
+    first, second, state = NEARLY[case]
+    rest = first * ca.DM(FIRST) + second * ca.DM(np.fliplr(FIRST) * (FIRST == 0))
+    value = ca.Function("A", [X], [rest])(state).full()
+    terms = theta_d.expansion(X, A0, rest, B, Q, R, terms=2, form="polynomial").terms(state, 0.0)
+    wanted = recursion(A0, value, B, Q, R, [1.0])
+    np.testing.assert_allclose(terms[1].full(), wanted[1], rtol=0, atol=1e-10 * np.abs(wanted[1]).max())
+
+
 def test_coefficients_of_the_scalar_system():
     system = theta_d_benchmarks.system("cubic")
     built = theta_d.expansion(system.x, system.A0, system.A, system.B, system.Q, system.R, terms=4)
