@@ -1,0 +1,161 @@
+"""What a controller is made from: the linear model, the gains and the limits along the nominal of a closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.checks import check_bounds, column
+from covocp.errors import ExportError, describe
+from covocp.lookup import name_of
+from covocp.matrices import Array, unpack, unpack_symbolic
+from covocp.solution import Solution
+from covocp.statement import Block, Statement
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Design:
+    """A closed loop along its nominal; n: rows of the estimate, m: controls fed back, r: measured values.
+
+    Attributes:
+        statement: of the problem.
+        duration: T [s].
+        parameters: of the statement.
+        linear: (state, control, time) -> F (n, n), G (n, m), h (r,), M (r, n), slope of h by the control (r, m),
+            noise density U (r, r).
+        noise: (state, control, time) -> Q (n, n).
+        gain: (state, control, half-vectors, time) -> C (m, n), E (n, n).
+        limits: lower and upper limits of the control, (m,) each.
+        units: largest standard deviation of each row of the estimate on the way, (n,); 1 where it is zero.
+        labels: names of the rows of the estimate.
+        sizes: n, m, r.
+    """
+
+    statement: Statement
+    duration: float
+    parameters: Array
+    linear: ca.Function
+    noise: ca.Function
+    gain: ca.Function
+    limits: tuple[Array, Array]
+    units: Array
+    labels: tuple[str, ...]
+    sizes: tuple[int, int, int]
+
+    @property
+    def symbolic(self) -> Any:
+        """SX, or MX where the model has no SX form."""
+        return self.statement.symbolic
+
+
+def design_of(solution: Solution, limits: Any) -> Design:
+    """The closed loop of a solution.
+
+    Args:
+        solution: with a loop and its problem.
+        limits: of the control that is given out: None, "bounds" (those of the problem), or a dict of control to
+            (lower, upper).
+
+    Raises:
+        ExportError: no problem, nothing measured, limits that mean nothing.
+    """
+    statement = solution.statement
+    if statement is None or statement.loop is None:
+        raise ExportError(
+            describe(
+                "The controller of this solution cannot be exported: it knows no problem.",
+                expected="a solution with its problem",
+                received=f"'{solution.name}', read from a file",
+                remedy="load(path, problem=...) with the problem that was solved",
+            )
+        )
+    if statement.measurement is None:
+        raise ExportError(
+            describe(
+                "There is no controller: the problem measures nothing, so the feedback never acts.",
+                expected="a problem with measurement()",
+                received=f"'{solution.name}' without one",
+                remedy="add what is measured, or export the histories by feedback=False",
+            )
+        )
+    n, m = int(statement.loop.gain.size2_out(0)), int(statement.loop.gain.size1_out(0))
+    symbolic: Any = statement.symbolic
+    sizes = (statement.nx, statement.nu, statement.ne, 1)
+    x, u, e, t = (symbolic.sym(k, size) for k, size in zip("xuet", sizes, strict=True))
+    rest = (t, solution.duration, ca.DM(solution.parameters))
+    F, G, _, _, _, Q = statement.loop.expansion(x, u, *rest)
+    h, M, U = statement.measurement(x, u, *rest)
+    slope = ca.jacobian(h, u)[:, :m]
+    block = next(b for b in statement.matrices if b.estimation)
+    C, E = statement.loop.gain(x, u, e, *rest), unpack_symbolic(e[block.span], n)
+    return Design(
+        statement=statement,
+        duration=solution.duration,
+        parameters=solution.parameters,
+        linear=ca.Function("linear", [x, u, t], [ca.densify(v) for v in (F, G, h, M, slope, U)]),
+        noise=ca.Function("noise", [x, u, t], [ca.densify(Q)]),
+        gain=ca.Function("gain", [x, u, e, t], [ca.densify(C), ca.densify(E)]),
+        limits=_limits(statement, m, limits),
+        units=_units(solution, block),
+        labels=statement.augmented,
+        sizes=(n, m, int(h.shape[0])),
+    )
+
+
+def _units(solution: Solution, block: Block) -> Array:
+    """Largest standard deviation of the deviation from the nominal at any node, 1 where it is zero."""
+    matrices = [unpack(solution.trajectory.e[:, block.span], block.size)]
+    matrices += [solution.loop.X] if solution.loop is not None else []
+    variances = np.max([np.diagonal(matrix, axis1=1, axis2=2).max(axis=0) for matrix in matrices], axis=0)
+    units = np.sqrt(np.maximum(variances, 0.0))
+    return np.where(np.isfinite(units) & (units > 0.0), units, 1.0)
+
+
+def _limits(statement: Statement, m: int, given: Any) -> tuple[Array, Array]:
+    """Lower and upper limits of the controls that are fed back."""
+    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
+    if given is None:
+        return lower, upper
+    if isinstance(given, str) and given == "bounds":
+        return statement.control_bounds[0][:m].copy(), statement.control_bounds[1][:m].copy()
+    if not isinstance(given, Mapping):
+        raise ExportError(
+            describe(
+                "The limits of the control are of an unknown kind.",
+                expected="None, 'bounds', or a dict of control to (lower, upper)",
+                received=repr(given)[:100],
+                remedy="correct limits=",
+            )
+        )
+    blocks = {b.name: b for b in statement.controls if b.span.stop <= m}
+    for key, pair in given.items():
+        block = blocks[name_of(key, statement.symbols, tuple(blocks))]
+        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+            raise ExportError(
+                describe(
+                    f"The limits of '{block.name}' are no pair.",
+                    expected="(lower, upper)",
+                    received=repr(pair)[:100],
+                    remedy="correct limits=",
+                )
+            )
+        low, high = (
+            column(block.name, what, value, block.size, inf=True)
+            for what, value in zip(("lower limit", "upper limit"), pair, strict=True)
+        )
+        check_bounds(block.name, low, high)
+        lower[block.span], upper[block.span] = low, high
+    return lower, upper
+
+
+def clipped(value: Any, limits: tuple[Array, Array]) -> Any:
+    """A control within its limits, an expression."""
+    rows = []
+    for i, (low, high) in enumerate(zip(*(bound.tolist() for bound in limits), strict=True)):
+        row = ca.fmax(value[i], low) if np.isfinite(low) else value[i]
+        rows.append(ca.fmin(row, high) if np.isfinite(high) else row)
+    return ca.vertcat(*rows)

@@ -1,0 +1,287 @@
+"""What can be exported, and how it becomes a folder of C sources."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import casadi as ca
+
+from covocp.errors import CovocpWarning, ExportError, describe
+from covocp.export.building import Sources
+from covocp.export.casadi_code import Generated, Sizes, generate
+from covocp.export.controller import controller_law
+from covocp.export.design import design_of
+from covocp.export.folder import check_folder, write_folder
+from covocp.export.functions import function_laws
+from covocp.export.header import header
+from covocp.export.history import history
+from covocp.export.laws import Law, stacked_size
+from covocp.export.linking import Linking
+from covocp.export.names import check_name, identifier
+from covocp.export.package import CPackage
+from covocp.export.readme import cmake_lists, readme
+from covocp.export.sampled import sampled_law
+from covocp.export.self_test import self_test
+from covocp.export.solver import solver_law
+from covocp.export.source import source
+from covocp.export.trajectory import sample_law
+from covocp.problem import Problem
+from covocp.solution import Solution
+
+PRECISIONS = {"double": "double", "single": "float"}
+# Largest relative deviation from Python that counts as agreement.
+TOLERANCES = {"double": 1e-12, "single": 1e-3}
+BYTES = {"double": 8, "single": 4}
+POINTER = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """What is written: the laws, what they are, what a plugin needs besides."""
+
+    laws: tuple[Law, ...]
+    title: str
+    linking: Linking | None = None
+
+
+def export_c(
+    what: Any,
+    directory: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    precision: Literal["double", "single"] = "double",
+    overwrite: bool = False,
+    period: float | None = None,
+    limits: Any = None,
+    feedback: bool = True,
+    ranges: Mapping[str, Any] | None = None,
+    units: Mapping[str, str] | None = None,
+    tolerance: float | None = None,
+    method: str = "sqpmethod",
+    **options: Any,
+) -> CPackage:
+    """Write C sources of a solution, of functions or of a solver.
+
+    An open-loop solution becomes `sample(time)`; one with feedback also a controller, `init` and
+    `step(measurement, time)` -> control; functions themselves; a problem a solver for re-planning,
+    `solve(initial state, parameters, ...)` -> plan.
+
+    Args:
+        what: a `Solution`, a `casadi.Function`, a list of them, or a `Problem`.
+        directory: folder to make; its parent must exist.
+        name: of the package, an identifier in C; None: from the directory.
+        precision: "double" or "single".
+        overwrite: replace a package that is there.
+        period: of a controller [s]: gains and transitions are made for samples of this period; None: any time between
+            two steps, everything computed along the nominal as it is needed.
+        limits: of the control that a controller gives out: None, "bounds" (those of the problem), or a dict of control
+            to (lower, upper).
+        feedback: whether a solution with feedback is exported as a controller; False: its histories only.
+        ranges: of inputs of functions by name, (lower, upper): where C is compared with Python; None: normal numbers.
+        units: of inputs and outputs of functions by name, for the comments.
+        tolerance: largest relative deviation of C from Python; None: 1e-12, in single precision 1e-3, of solvers 1e-8.
+        method: of a problem: "sqpmethod" (self-contained), or "ipopt" or "fatrop" (to be linked).
+        options: of a problem: those of the mesh as in `solve` (intervals, control, grid, ...), and plugin_options.
+
+    Returns:
+        The package: `.build()`, `.check()`, `.time()`, `.python()`.
+
+    Raises:
+        ExportError: something has no C code, a name, a precision or a folder is not possible.
+        ProblemError: options of the mesh that mean nothing.
+    """
+    _check_choice("precision", precision, tuple(PRECISIONS))
+    target = check_folder(directory, overwrite)
+    package = check_name(identifier(target.name, set(), "law") if name is None else name)
+    allowed = TOLERANCES[precision] if tolerance is None else _positive("tolerance", tolerance)
+    given = {"period": period, "limits": limits, "ranges": ranges, "units": units}
+    given |= {"feedback": None if feedback is True else feedback, "method": None if method == "sqpmethod" else method}
+    if isinstance(what, Solution):
+        _check_options("a solution", {**given, **options}, ("period", "limits", "feedback"))
+        content = _solution(what, precision, allowed, period, limits, feedback)
+    elif isinstance(what, Problem):
+        _check_options("a problem", given, ("method",))
+        content = _problem(what, precision, method, options, tolerance)
+    else:
+        _check_options("functions", {**given, **options}, ("ranges", "units"))
+        content = _functions(what, ranges or {}, units or {}, allowed)
+    generated = generate(package, content.laws, precision)
+    return _written(package, target, precision, content, generated, tolerance)
+
+
+def _written(
+    package: str, target: Path, precision: str, content: Content, generated: Generated, tolerance: float | None
+) -> CPackage:
+    """All files, in their folder."""
+    laws, sizes = content.laws, generated.sizes
+    version, date = _version(), _today()
+    casadi, real = ca.CasadiMeta.version(), PRECISIONS[precision]
+    written = f"Written by covocp {version} (CasADi {casadi}) on {date}; real numbers are {real}."
+    about = (content.title, written)
+    work = {law.name: _work_bytes(law, sizes[law.name], precision) for law in laws}
+    linking = content.linking
+    files = {
+        f"{package}.h": header(package, about, laws, sizes, real),
+        f"{package}.c": source(package, laws, sizes),
+        f"{package}_casadi.c": generated.source,
+        "main.c": self_test(package, laws, precision, tolerance),
+        "CMakeLists.txt": cmake_lists(package, precision, linking.cmake(package) if linking else ""),
+        "README.md": readme(package, about, laws, work, precision, linking.words if linking else ""),
+    }
+    mark = {"name": package, "covocp": version, "casadi": casadi, "date": date, "precision": precision}
+    write_folder(target, files, {**mark, "laws": [law.name for law in laws]})
+    return CPackage(
+        name=package,
+        directory=target,
+        precision=precision,
+        laws=laws,
+        work_bytes=work,
+        sources=Sources(
+            directory=target,
+            name=package,
+            linking=linking,
+            single=precision == "single",
+        ),
+        tolerance=tolerance,
+    )
+
+
+def _solution(
+    solution: Solution, precision: str, tolerance: float, period: float | None, limits: Any, feedback: bool
+) -> Content:
+    """The histories of a solution, and its controller where it has feedback."""
+    if not solution.converged:
+        warnings.warn(
+            f"The solution that is exported did not converge: {solution.message}.", CovocpWarning, stacklevel=3
+        )
+    tables = history(solution, precision)
+    laws = [sample_law(solution, tables, tolerance)]
+    if solution.loop is not None and feedback:
+        design = design_of(solution, limits)
+        if period is None:
+            laws.append(controller_law(design, tables, tolerance))
+        else:
+            laws.append(sampled_law(design, tables, _positive("period", period), tolerance))
+    elif period is not None or limits is not None:
+        raise ExportError(
+            describe(
+                "period= and limits= are those of a controller.",
+                expected="a solution of a problem with minimize_expected()",
+                received=f"'{solution.name}'"
+                + ("" if feedback else " with feedback=False")
+                + ": no controller is made",
+                remedy="leave them out",
+            )
+        )
+    return Content(laws=tuple(laws), title=f"{solution.name or 'Solution'}: {', '.join(law.name for law in laws)}.")
+
+
+def _problem(
+    problem: Problem, precision: str, method: str, options: dict[str, Any], tolerance: float | None
+) -> Content:
+    """The solver of a problem."""
+    if precision != "double":
+        raise ExportError(
+            describe(
+                "A solver is exported in double precision only.",
+                expected="precision='double'",
+                received=f"precision={precision!r}",
+                remedy="leave precision= out; what it plans may be rounded afterwards",
+            )
+        )
+    law, linking = solver_law(problem, method, options)
+    if tolerance is not None:
+        law = replace(law, tolerance=tolerance)
+    return Content(laws=(law,), title=f"{problem.name or 'Problem'}: solver ({method}).", linking=linking)
+
+
+def _functions(what: Any, ranges: Mapping[str, Any], units: Mapping[str, str], tolerance: float) -> Content:
+    """One or more functions."""
+    functions = [what] if isinstance(what, ca.Function) else what
+    listed = isinstance(functions, Sequence) and not isinstance(functions, str) and len(functions) > 0
+    if not listed or not all(isinstance(entry, ca.Function) for entry in functions):
+        raise ExportError(
+            describe(
+                "This cannot be exported.",
+                expected="a Solution, a casadi.Function, a list of them, or a Problem",
+                received=f"{type(what).__name__}: {what!r}"[:100],
+                remedy="make a casadi.Function of a law: casadi.Function('law', [x, t], [u], ['x', 't'], ['u'])",
+            )
+        )
+    laws = function_laws(functions, ranges, units, tolerance)
+    return Content(laws=tuple(laws), title="Functions: " + ", ".join(law.name for law in laws) + ".")
+
+
+def _work_bytes(law: Law, sizes: Sizes, precision: str) -> int:
+    """Arrays that a call works in."""
+    reals = sizes.reals + 1
+    if law.kind in ("function", "controller", "solver"):
+        reals += stacked_size(law.outputs)
+    return BYTES[precision] * reals + 4 * (sizes.integers + 1) + POINTER * (sizes.arguments + sizes.results)
+
+
+def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    """Refuse options that mean nothing to what is exported."""
+    for name, value in given.items():
+        if value is not None and name not in known:
+            raise ExportError(
+                describe(
+                    f"export_c has no option '{name}' for {what}.",
+                    expected="one of " + ", ".join(("name", "precision", "overwrite", "tolerance", *known)),
+                    received=f"{name}={value!r}"[:100],
+                    remedy="leave it out",
+                )
+            )
+
+
+def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        raise ExportError(
+            describe(
+                f"The option '{name}' has an unknown value.",
+                expected=" or ".join(map(repr, choices)),
+                received=repr(value)[:100],
+                remedy=f"correct {name}=",
+            )
+        )
+
+
+def _positive(name: str, value: Any) -> float:
+    """A positive, finite number."""
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
+    if not good:
+        raise ExportError(
+            describe(
+                f"The option '{name}' is not a positive number.",
+                expected="a number > 0" + (" [s]" if name == "period" else ""),
+                received=repr(value)[:100],
+                remedy=f"correct {name}=",
+            )
+        )
+    return float(value)
+
+
+def _version() -> str:
+    """Of the toolbox."""
+    try:
+        return importlib.metadata.version("covocp")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _today() -> str:
+    """The date, or that of SOURCE_DATE_EPOCH for builds that can be repeated."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    moment = (
+        datetime.datetime.fromtimestamp(int(epoch), datetime.UTC)
+        if epoch.isdigit()
+        else datetime.datetime.now(datetime.UTC)
+    )
+    return moment.date().isoformat()

@@ -1,0 +1,333 @@
+"""The laws as Python calls them: of the compiled library through ctypes, or evaluated by CasADi, the same way."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from covocp.errors import ExportError, describe
+from covocp.export.header import struct_name
+from covocp.export.laws import CODES, STATUSES, Law, Port, span, stacked_size
+from covocp.matrices import Array
+
+NAMES = tuple(STATUSES)
+WHOLE = ("status", "index")  # fields of a struct that are int in C
+
+
+class Backend(Protocol):
+    """What evaluates a law: all its inputs as a row -> results as a row, status."""
+
+    def __call__(self, row: Array) -> tuple[Array, int]:
+        """One point."""
+
+
+def evaluated(law: Law) -> Backend:
+    """A law evaluated by CasADi."""
+
+    def call(row: Array) -> tuple[Array, int]:
+        values = law.values(row[None, :])[0]
+        if law.kind == "function":
+            finite = bool(np.isfinite(values).all())
+            return values, CODES["OK" if finite else "RESULT_NOT_FINITE"]
+        return values[:-1], int(values[-1])
+
+    return call
+
+
+class Library:
+    """A shared library.
+
+    Args:
+        path: where it is.
+        package: its name.
+        precision: "double" or "single".
+
+    Raises:
+        ExportError: it cannot be loaded.
+    """
+
+    def __init__(self, path: Path, package: str, precision: str) -> None:
+        """Load it."""
+        self._package = package
+        self._real: Any = ctypes.c_double if precision == "double" else ctypes.c_float
+        try:
+            self._library = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise ExportError(
+                describe(
+                    f"The library of '{package}' cannot be loaded.",
+                    expected="a shared library for this machine, and what it is linked with",
+                    received=str(error),
+                    remedy="build() it here",
+                )
+            ) from error
+
+    def backend(self, law: Law) -> Backend:
+        """The C function of a law; buffers are its own, so it must not run in two threads at a time."""
+        if law.kind in ("sample", "controller"):
+            return self._with_struct(law)
+        inputs, outputs = self._buffer(stacked_size(law.inputs)), self._buffer(stacked_size(law.results))
+        function = getattr(self._library, f"{self._package}_{law.name}")
+        function.restype = ctypes.c_int
+        function.argtypes = None
+        given, received = (np.frombuffer(buffer, dtype=self._real) for buffer in (inputs, outputs))
+        first = [self._workspace(law)] if law.kind == "solver" else []
+        results = [self._pointer(outputs, span(law.results, port.name).start) for port in law.results]
+        sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
+        pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
+        real = self._real
+
+        def call(row: Array) -> tuple[Array, int]:
+            given[: row.size] = row
+            received[:] = np.nan
+            arguments = [real(given[o]) if p is None else p for (_, o), p in zip(sources, pointers, strict=True)]
+            status = function(*first, *arguments, *results)
+            return received[: stacked_size(law.results)].astype(float), int(status)
+
+        return call
+
+    def started(self, law: Law) -> Array:
+        """Fields of a controller's struct after init, stacked."""
+        struct = self._struct(law)()
+        init = getattr(self._library, f"{self._package}_init")
+        init.restype = None
+        init(ctypes.byref(struct))
+        return np.concatenate([_fields(struct, port) for port in law.outputs])
+
+    def _with_struct(self, law: Law) -> Backend:
+        """A C function that fills or keeps a struct."""
+        struct = self._struct(law)()
+        function = getattr(self._library, f"{self._package}_{law.name}")
+        function.restype = ctypes.c_int
+        inputs = self._buffer(stacked_size(law.inputs))
+        given = np.frombuffer(inputs, dtype=self._real)
+        real = self._real
+        sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
+        pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
+        kept = [(law.held[p.name], span(law.inputs, p.name)) for p in law.inputs if p.name in law.held]
+        controls = [port for port in law.outputs if port.name == "control"] if law.kind == "controller" else []
+        control = [self._buffer(port.size) for port in controls]
+
+        def call(row: Array) -> tuple[Array, int]:
+            given[: row.size] = row
+            for name, place in kept:
+                values = row[place]
+                field = getattr(struct, name)
+                if isinstance(field, ctypes.Array):
+                    field[:] = values.tolist()
+                else:
+                    setattr(struct, name, int(values[0]) if name in WHOLE else float(values[0]))
+            arguments = [real(given[o]) if p is None else p for (_, o), p in zip(sources, pointers, strict=True)]
+            own = ctypes.byref(struct)
+            status = function(*([own, *arguments, *control] if law.kind == "controller" else [*arguments, own]))
+            return np.concatenate([_fields(struct, port) for port in law.results]), int(status)
+
+        return call
+
+    def _buffer(self, size: int) -> Any:
+        return (self._real * max(1, size))()
+
+    def _pointer(self, buffer: Any, offset: int) -> Any:
+        return ctypes.byref(buffer, offset * ctypes.sizeof(self._real))
+
+    def _workspace(self, law: Law) -> Any:
+        size = ctypes.c_int.in_dll(self._library, f"{self._package}_workspace_bytes").value
+        return (ctypes.c_double * (size // ctypes.sizeof(ctypes.c_double) + 1))()
+
+    def _struct(self, law: Law) -> Any:
+        """The struct of a law as ctypes has it."""
+
+        def kind(port: Port) -> Any:
+            if port.name in WHOLE:
+                return ctypes.c_int
+            if port.scalar:
+                return self._real
+            return self._real * port.rows if port.columns == 1 else (self._real * port.columns) * port.rows
+
+        fields = [(port.name, kind(port)) for port in law.outputs]
+        return type(struct_name(self._package, law), (ctypes.Structure,), {"_fields_": fields})
+
+
+def _fields(struct: Any, port: Port) -> Array:
+    """A field of a struct, flat."""
+    return np.array(getattr(struct, port.name), dtype=float).ravel()
+
+
+class Call:
+    """One law as a function of Python.
+
+    Args:
+        law: what it is.
+        backend: what evaluates it.
+
+    Attributes:
+        status: of the last call, a name of `covocp.export.laws.STATUSES`.
+    """
+
+    def __init__(self, law: Law, backend: Backend) -> None:
+        """Keep both."""
+        self.law, self._backend = law, backend
+        self.status = "OK"
+
+    def __call__(self, *values: Any, **named: Any) -> Any:
+        """Evaluate the law.
+
+        Args:
+            values: arguments in their order, numbers or arrays of the shapes of the ports.
+            named: arguments by name.
+
+        Returns:
+            Of a function its result, or a tuple; of any other law a dict by name. NaN where C writes nothing.
+
+        Raises:
+            ExportError: arguments that are missing, too many or of another shape.
+        """
+        row = self._row(values, named)
+        results, status = self._backend(row)
+        self.status = NAMES[status]
+        parts = {p.name: _shaped(results[span(self.law.results, p.name)], p) for p in self.law.results}
+        if self.law.kind != "function":
+            return parts
+        return next(iter(parts.values())) if len(parts) == 1 else tuple(parts.values())
+
+    def _row(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> Array:
+        """All inputs, stacked."""
+        ports = self.law.arguments
+        given = {port.name: value for port, value in zip(ports, values, strict=False)} | dict(named)
+        defaults = {"guess": self._default_guess()} if self.law.kind == "solver" else {}
+        given = {**defaults, **given}
+        wrong = len(values) > len(ports) or set(given) != {port.name for port in ports}
+        parts = []
+        for port in ports if not wrong else ():
+            array = np.asarray(given[port.name], dtype=float)
+            wrong = wrong or array.size != port.size
+            parts.append(array.ravel())
+        if wrong:
+            raise ExportError(
+                describe(
+                    f"The arguments of '{self.law.name}' do not fit.",
+                    expected=", ".join(f"{p.name} {p.shape or '()'}" for p in ports),
+                    received=f"{len(values)} values; " + ", ".join(f"{k} {np.shape(v)}" for k, v in given.items()),
+                    remedy="give these arguments in these shapes",
+                )
+            )
+        return np.concatenate([np.zeros(0), *parts])
+
+    def _default_guess(self) -> Array:
+        return self.law.safe[span(self.law.outputs, "variables")]
+
+
+class Controller(Call):
+    """A controller as a function of Python: `step(measurement, time)` -> control.
+
+    Attributes:
+        state: fields of its struct by name, as arrays.
+    """
+
+    def __init__(self, law: Law, backend: Backend, start: Callable[[], Array]) -> None:
+        """Start it."""
+        super().__init__(law, backend)
+        self._start = start
+        self.init()
+
+    def init(self) -> None:
+        """Set it to the start of the nominal, its estimate to the mean."""
+        self._values, self.status = self._start(), "OK"
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Fields of the struct."""
+        ports = self.law.outputs
+        return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in ports}
+
+    def step(self, measurement: Any, time: float) -> Array:
+        """The control for a measurement at a time.
+
+        Args:
+            measurement: shape (r,); entries that are NaN are left out.
+            time: of the measurement [s].
+
+        Returns:
+            The control, shape (m,), to be held until the next step.
+        """
+        row = np.zeros(stacked_size(self.law.inputs))
+        for port in self.law.inputs:
+            place = span(self.law.inputs, port.name)
+            if port.name in self.law.held:
+                row[place] = self._values[span(self.law.outputs, self.law.held[port.name])]
+        row[span(self.law.inputs, "measurement")] = np.asarray(measurement, dtype=float).ravel()
+        row[span(self.law.inputs, "time")] = time
+        results, status = self._backend(row)
+        self._values = np.append(results, status)
+        self.status = NAMES[status]
+        return results[span(self.law.results, "control")]
+
+    def __call__(self, measurement: Any, time: float) -> Array:
+        """The same as `step`."""
+        return self.step(measurement, time)
+
+
+def _shaped(values: Array, port: Port) -> Any:
+    """Flat values in the shape of the port."""
+    return float(values[0]) if port.scalar else values.reshape(port.shape)
+
+
+class Laws(Mapping[str, Call]):
+    """The laws of a package by name, also as attributes; calling it calls the principal one.
+
+    That is the controller, else the solver, else the first.
+    """
+
+    def __init__(self, calls: Mapping[str, Call]) -> None:
+        """Keep them."""
+        self._calls = dict(calls)
+
+    @property
+    def principal(self) -> Call:
+        """The law that a call of the whole stands for."""
+        for kind in ("controller", "solver"):
+            for call in self._calls.values():
+                if call.law.kind == kind:
+                    return call
+        return next(iter(self._calls.values()))
+
+    def __call__(self, *values: Any, **named: Any) -> Any:
+        """Call the principal law."""
+        return self.principal(*values, **named)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in self._calls:
+            return self._calls[name]
+        return getattr(self.principal, name)
+
+    def __getitem__(self, name: str) -> Call:
+        return self._calls[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._calls)
+
+    def __len__(self) -> int:
+        return len(self._calls)
+
+
+def laws_of(laws: tuple[Law, ...], library: Library | None) -> Laws:
+    """The laws as functions of Python, of a library or, without one, of CasADi."""
+    calls: dict[str, Call] = {}
+    for law in laws:
+        backend = evaluated(law) if library is None else library.backend(law)
+        if law.kind == "controller":
+            start = _starter(law, library)
+            calls[law.name] = Controller(law, backend, start)
+        else:
+            calls[law.name] = Call(law, backend)
+    return Laws(calls)
+
+
+def _starter(law: Law, library: Library | None) -> Callable[[], Array]:
+    return (lambda: law.start.copy()) if library is None else (lambda: library.started(law))

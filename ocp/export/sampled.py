@@ -1,0 +1,265 @@
+"""Perturbation filter and feedback for samples of a fixed period: everything but a few products is done beforehand.
+
+For the samples t_k = k period, with y the estimate of the deviation and w the control held since the last sample,
+
+    y-_k = Phi_k y_(k-1) + Gamma_k w + g_k,          g_k = - int Phi G u dt: the nominal goes on, the control is held
+    y_k  = y-_k + L_k (m_k - h_k - M_k y-_k - H_k (w - u_k)),      u_k  =  u(t_k) - C(t_k) y_k,  then limited
+
+Phi, Gamma, g by the two-stage Gauss method between the nodes of the mesh. L_k = P- M' (M P- M' + U/period)^-1 is the
+gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import ExportError, describe
+from covocp.export.controller import STATUSES, field_ports, first_fields, points
+from covocp.export.design import Design, clipped
+from covocp.export.history import History
+from covocp.export.laws import LARGEST, Law, Port, flat, shaped, span, status_of
+from covocp.integrators import GAUSS_NODES
+from covocp.matrices import Array
+
+# A duration that is a whole number of periods to this accuracy ends with a sample.
+WHOLE = 1e-9
+MOST_SAMPLES = 200_000
+CONTINUE = -1.0
+HELD = {"estimate": "estimate", "last": "index", "held": "control"}
+ABOUT = (
+    "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the",
+    "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held",
+    "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g",
+    "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one",
+    "period; the control is u - C y, limited. A measurement of which a row is not finite is left out. At time zero the control",
+    "is that of the nominal.",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """Tables, a row for each sample from 0 to K: nominal and gains there, transition from the sample before.
+
+    parts: by name, (K + 1, rows, columns); period [s].
+    """
+
+    parts: dict[str, Array]
+    period: float
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return int(self.parts["u"].shape[0]) - 1
+
+    def at(self, k: Any) -> dict[str, Any]:
+        """The matrices of a sample, MX expressions."""
+        flat_rows = np.hstack([part.reshape(part.shape[0], -1) for part in self.parts.values()])
+        column = ca.MX(ca.DM(flat_rows.T))[:, k]
+        result, offset = {}, 0
+        for name, part in self.parts.items():
+            rows, columns = part.shape[1:]
+            result[name] = shaped(column[offset : offset + rows * columns], rows, columns)
+            offset += rows * columns
+        return result
+
+
+def sampled_law(design: Design, tables: History, period: float, tolerance: float) -> Law:
+    """The law (estimate, last sample, held control, measurement, time) -> control and all that the struct keeps."""
+    n, m, r = design.sizes
+    samples = discretised(design, tables, period)
+    y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
+    measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
+    clock = tables.clock(time, last * period)
+    wanted = ca.fmin(ca.fmax(ca.floor(clock.time / period + 0.5), 0.0), float(samples.count))
+    backwards = wanted < last
+    valid = ca.if_else(backwards, 0.0, clock.within)
+    ahead = ca.if_else(valid, wanted > last, 0.0)
+    index = ca.if_else(valid, last + ahead, wanted)
+    more = ca.if_else(ahead, wanted > index, 0.0)
+    at = samples.at(index)
+    present = ca.sum1(ca.fabs(measured) <= LARGEST) >= r
+    before = ca.if_else(ahead, at["Phi"] @ y + at["Gamma"] @ held + at["g"], y)
+    residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
+    used = ca.if_else(ahead, ca.if_else(more, 0.0, present), 0.0)
+    corrected = before + at["L"] @ ca.if_else(used, residual, 0.0)
+    good = ca.mmax(ca.fabs(corrected)) <= LARGEST
+    estimate = ca.if_else(good, corrected, y)
+    moved = at["u"] - at["C"] @ ca.if_else(ca.if_else(good, valid, 0.0), estimate, 0.0)
+    conditions = [
+        *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
+        (ca.logic_not(present), "MEASUREMENT_MISSING"),
+    ]  # fmt: skip
+    kept = ca.if_else(valid, index, last)
+    fields = {
+        "time": kept * period,
+        "estimate": estimate,
+        "control": ca.if_else(more, held, clipped(moved, design.limits)),
+        "index": kept,
+        "nominal_state": at["x"],
+        "nominal_control": at["u"],
+        "feedback_gain": at["C"],
+        "filter_gain": at["L"],
+        "status": ca.if_else(more, CONTINUE, status_of(conditions)),
+    }
+    core = ca.Function("step", [y, last, held, measured, time], [flat(v) for v in fields.values()])
+    return Law(
+        name="step",
+        kind="controller",
+        about=(*ABOUT, f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."),
+        core=core,
+        inputs=_ports(design),
+        outputs=field_ports(design, fields),
+        statuses=STATUSES,
+        held=HELD,
+        start=first_fields(design, tables, fields),
+        points=lambda random, count: _points(design, tables, samples, random, count),
+        tolerance=tolerance,
+    )
+
+
+def discretised(design: Design, tables: History, period: float) -> Samples:
+    """Transitions and gains for samples of a period.
+
+    Args:
+        design: continuous model and gains along the nominal.
+        tables: the nominal.
+        period: of the samples [s].
+
+    Raises:
+        ExportError: less than one period, or too many.
+    """
+    count = int(np.floor(tables.duration / period + WHOLE))
+    if not 1 <= count <= MOST_SAMPLES:
+        raise ExportError(
+            describe(
+                "The period of the controller does not fit the duration.",
+                expected=f"1 to {MOST_SAMPLES} periods within {tables.duration:g} s",
+                received=f"period={period!r}",
+                remedy="choose another period; period=None takes any time between two steps",
+            )
+        )
+    t = np.minimum(np.arange(count + 1) * period, tables.duration)
+    x, u, e, h, M, H, U, C = _at_samples(design, tables, t)
+    E0 = np.asarray(design.gain(x[0], u[0], e[0], 0.0)[1].full())
+    moves = _Moves.of(design, tables, t)
+    n, m, r = design.sizes
+    Phi, Gamma, g = np.zeros((count + 1, n, n)), np.zeros((count + 1, n, m)), np.zeros((count + 1, n, 1))
+    Phi[0], P, gains = np.eye(n), E0, [np.zeros((n, r))]
+    for k in range(1, count + 1):
+        Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
+        gain = np.linalg.solve(M[k] @ P @ M[k].T + U[k] / period, M[k] @ P).T
+        rest = np.eye(n) - gain @ M[k]
+        P = rest @ P @ rest.T + gain @ (U[k] / period) @ gain.T
+        P = 0.5 * (P + P.T)
+        gains.append(gain)
+    parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
+    return Samples(parts=parts | {"g": g, "L": np.array(gains)}, period=period)
+
+
+def _nominal(tables: History, t: Array) -> tuple[Array, Array, Array]:
+    """x, u, e at some times, rows."""
+    time = ca.MX.sym("time")
+    now = tables.at(time)
+    values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
+    x, u, e = (np.asarray(v.full()).T for v in values)
+    return x, u, e
+
+
+def _stacked(value: Any, count: int) -> Array:
+    """Matrices beside each other as (count, rows, columns)."""
+    array = np.asarray(value.full())
+    return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
+
+
+def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
+    """x, u, e, h, M, H, U, C at the samples."""
+    x, u, e = _nominal(tables, t)
+    _, _, h, M, H, U = (_stacked(v, t.size) for v in design.linear.map(t.size)(x.T, u.T, t[None, :]))
+    C = _stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
+    return x, u, e, h, M, H, U, C
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Moves:
+    """Gauss steps between nodes and samples: h times F, G, G u, Q at both points of each; first step of each period."""
+
+    F: tuple[Array, Array]
+    G: tuple[Array, Array]
+    Gu: tuple[Array, Array]
+    Q: tuple[Array, Array]
+    first: Any
+
+    @staticmethod
+    def of(design: Design, tables: History, t: Array) -> _Moves:
+        """All steps between the first and the last sample."""
+        inside = tables.nodes[(tables.nodes > t[0]) & (tables.nodes < t[-1])]
+        grid = np.unique(np.concatenate([t, inside]))
+        near = np.diff(grid, prepend=-np.inf) <= WHOLE * np.median(np.diff(t))
+        grid = np.array([*grid[~near]])
+        h = np.diff(grid)
+        parts: dict[str, list[Array]] = {"F": [], "G": [], "Gu": [], "Q": []}
+        m = design.sizes[1]
+        for c in GAUSS_NODES:
+            at = grid[:-1] + c * h
+            x, u, _ = _nominal(tables, at)
+            F, G = (_stacked(v, at.size) for v in design.linear.map(at.size)(x.T, u.T, at[None, :])[:2])
+            Q = _stacked(design.noise.map(at.size)(x.T, u.T, at[None, :]), at.size)
+            for name, value in (("F", F), ("G", G), ("Gu", G @ u[:, :m, None]), ("Q", Q)):
+                parts[name].append(h[:, None, None] * value)
+        pairs = {name: (values[0], values[1]) for name, values in parts.items()}
+        return _Moves(**pairs, first=np.searchsorted(grid, t - 0.5 * h.min()))
+
+    def over(self, k: int, P: Array) -> tuple[Array, Array, Array, Array]:
+        """Phi, Gamma, g over period k, and the covariance P after it without a measurement."""
+        n, m = self.G[0].shape[1:]
+        z = np.hstack([np.eye(n), np.zeros((n, m + 1))])
+        for i in range(int(self.first[k]), int(self.first[k + 1])):
+            forcing = [np.hstack([np.zeros((n, n)), G[i], -Gu[i]]) for G, Gu in zip(self.G, self.Gu, strict=True)]
+            z = gauss_step((self.F[0][i], self.F[1][i]), z, (forcing[0], forcing[1]))
+            zero = np.zeros((n, n))
+            joint = [np.block([[-F[i].T, zero], [Q[i], F[i]]]) for F, Q in zip(self.F, self.Q, strict=True)]
+            D = gauss_step((joint[0], joint[1]), np.eye(2 * n), (np.zeros(()), np.zeros(())))
+            moved = np.linalg.solve(D[:n, :n].T, (D[n:, :n] + D[n:, n:] @ P).T)
+            P = np.asarray(0.5 * (moved + moved.T), dtype=float)
+        return z[:, :n], z[:, n : n + m], z[:, n + m :], P
+
+
+def gauss_step(H: tuple[Array, Array], z: Array, f: tuple[Array, Array]) -> Array:
+    """One step of the two-stage Gauss method for z' = H z + f, H and f at both points times the length of the step.
+
+    The elimination is that of `covocp.integrators.gauss_matrix`.
+    """
+    g = np.sqrt(3.0) / 6.0
+    a = 0.5 - 2.0 * g
+    unit = np.eye(z.shape[0])
+    left, right = unit - g * H[1], unit - g * H[0]
+    matrix = left @ right - a / 2 * (H[0] + H[1])
+    stage = np.linalg.solve(matrix, left @ (z + g * f[0]) + a / 2 * (f[0] + f[1]))
+    return np.asarray(z + (right @ stage - z - g * f[0]) / a)
+
+
+def _ports(design: Design) -> tuple[Port, ...]:
+    """Ports of the inputs."""
+    n, m, r = design.sizes
+    return (
+        Port(name="estimate", rows=n),
+        Port(name="last"),
+        Port(name="held", rows=m),
+        Port(name="measurement", rows=r, about=", ".join(design.statement.measurement_names)),
+        Port(name="time", unit="s", about="of the measurement"),
+    )
+
+
+def _points(design: Design, tables: History, samples: Samples, random: np.random.Generator, count: int) -> Array:
+    """As for any time between two steps, the last step at a sample a few periods before."""
+    rows = points(design, tables, random, count)
+    place = span(_ports(design), "last")
+    before = random.choice([0, 1, 1, 1, 1, 2, 5, -1], count)
+    time = np.nan_to_num(rows[:, -1], nan=0.0, posinf=tables.duration, neginf=0.0)
+    index = np.floor(np.clip(time, 0.0, tables.duration) / samples.period + 0.5)
+    rows[:, place] = np.clip(index - before, 0, samples.count)[:, None]
+    return rows

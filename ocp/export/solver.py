@@ -1,0 +1,289 @@
+"""The solver of a problem as a law: initial state, parameters and a guess in, a plan out.
+
+The transcription is that of every shooting method, its NLP solver one of CasADi's that has C code. The status is not
+the solver's own opinion: it follows from the conditions of a minimum at what it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.errors import ExportError, describe
+from covocp.export.laws import CODES, Law, Port, flat
+from covocp.export.linking import PLUGINS, Linking
+from covocp.export.names import identifier
+from covocp.export.replanning import Replannable, replannable, stacked
+from covocp.guess import choose_scales, quadrature_weights
+from covocp.integrators import COMPILED_SOLVER
+from covocp.matrices import Array
+from covocp.mesh import Options
+from covocp.methods import Solver
+from covocp.nlp import NLP
+from covocp.problem import Problem
+from covocp.shooting import transcribe
+from covocp.solution import Solution
+
+# In the NLP's own units: what counts as solved, and what the solvers are asked for.
+INFEASIBLE, STATIONARY = 1e-6, 1e-5
+ASKED = 1e-8
+MAX_ITERATIONS = 200
+# Shooting states are scaled by more than their magnitude where the Hessian is of limited memory, as for Ipopt.
+STRETCH = 10.0
+TOLERANCE = 1e-8
+TRIALS = 6
+MOST_POINTS = 12
+SEED = 1971
+STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
+ABOUT = (
+    "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of",
+    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an",
+    "argument is not finite, the plan made at the export is returned, and the status says so.",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    """What the core is made of."""
+
+    made: Replannable
+    nlp: NLP
+    solution: Solution
+    scale: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in their order."""
+        st = self.nlp.statement
+        return tuple(b.name for b in (*st.of_kind("parameter"), *st.of_kind("unknown")))
+
+
+def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tuple[Law, Linking | None]:
+    """The solver of a problem, and what has to be linked with it.
+
+    Args:
+        problem: to be solved again and again.
+        method: a plugin of CasADi's nlpsol that has C code.
+        options: of the mesh; plugin_options.
+
+    Raises:
+        ExportError: unknown method or option, or a method that does not solve the problem from its own solution.
+        ProblemError: options of the mesh that mean nothing.
+        SolveError: the problem itself has no solution.
+    """
+    if method not in PLUGINS:
+        raise ExportError(
+            describe(
+                f"The method {method!r} has no C code.",
+                expected="one of " + ", ".join(map(repr, PLUGINS)),
+                received=f"method={method!r}",
+                remedy="'sqpmethod' needs nothing else; the others are linked",
+            )
+        )
+    known = {entry.name for entry in fields(Options)} | {"plugin_options"}
+    for name in options:
+        if name not in known:
+            raise ExportError(
+                describe(
+                    f"export_c has no option '{name}' for a problem.",
+                    expected="one of " + ", ".join(sorted(known)),
+                    received=f"{name}={options[name]!r}"[:100],
+                    remedy="correct or remove it",
+                )
+            )
+    task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
+    own = dict(options.get("plugin_options") or {})
+    for exact in _hessians(task.nlp, method, own):
+        law = _law(task, method, _settings(method, exact, own))
+        solved = [int(row[-1]) == CODES["OK"] for row in law.values(law.points(np.random.default_rng(SEED), TRIALS))]
+        if solved[0] and sum(solved) >= len(solved) - 1 - len(solved) // 3:
+            return law, PLUGINS[method]
+    raise ExportError(
+        describe(
+            f"The method '{method}' does not solve '{problem.name}' again from its own solution.",
+            expected="a plan near that of the export, for initial values near those of the problem",
+            received=f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints, not converged",
+            remedy="another method ('ipopt', linked), fewer intervals, or plugin_options such as "
+            "{'convexify_strategy': 'regularize'}",
+        )
+    )
+
+
+def _task(problem: Problem, options: dict[str, Any]) -> _Task:
+    """Reference solution and transcription."""
+    made = replannable(problem)
+    solution = Solver(made.fixed, **options).solve(progress=False)
+    statement = made.problem.statement()
+    mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
+    scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
+    if mesh.eliminated and statement.matrices:
+        weights = quadrature_weights(mesh)
+        scales = replace(scales, x=STRETCH * scales.x, u=scales.u * np.sqrt(weights.mean() / weights)[:, None])
+    cost = abs(solution.cost)
+    return _Task(
+        made=made,
+        nlp=transcribe(statement, mesh, scales),
+        solution=solution,
+        scale=cost if np.isfinite(cost) and cost > 0.0 else 1.0,
+    )
+
+
+def _hessians(nlp: NLP, method: str, own: Mapping[str, Any]) -> list[bool]:
+    """Whether the Hessian is exact, in the order in which that is tried."""
+    if "hessian_approximation" in own or method == "fatrop":
+        return [True]
+    return [False] if nlp.mesh.eliminated and nlp.statement.matrices else [True, False]
+
+
+def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of the plugin."""
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+    settings["calc_lam_p"] = False
+    if method == "sqpmethod":
+        settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": ASKED, "tol_pr": ASKED}
+        settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}
+        settings["qpsol_options"] = {
+            "print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False,
+        }  # fmt: skip
+        settings["hessian_approximation"] = "exact" if exact else "limited-memory"
+    elif method == "ipopt":
+        settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": ASKED, "max_iter": MAX_ITERATIONS}
+        if not exact:
+            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": 20}
+    for key, value in own.items():
+        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
+    return settings
+
+
+def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
+    """The law for these settings."""
+    nlp, entries = task.nlp, task.made.entries
+    try:
+        solver = ca.nlpsol("nlp", method, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+    except RuntimeError as error:
+        raise ExportError(
+            describe(
+                f"The plugin '{method}' refuses the problem or its settings.",
+                expected="a plugin of this CasADi, and options that it has",
+                received=str(error).strip().splitlines()[-1],
+                remedy="correct plugin_options, or take another method",
+            )
+        ) from error
+    symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
+    guess = ca.MX.sym("guess", nlp.w.shape[0])
+    p = ca.vertcat(ca.MX(0, 1), *stacked(entries, symbols, task.names))
+    bounds = _bounds(task, p, symbols.get("duration"))
+    start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
+    result = solver(x0=start, p=ca.vertcat(p, task.scale), **bounds)
+    x, _, u, duration, running, terminal, g = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
+    infeasible, stationary = _residuals(task, result, g, p, bounds)
+    bad = ca.logic_not(ca.logic_and(infeasible <= INFEASIBLE, stationary <= STATIONARY))
+    taken = {entry.port.name for entry in entries} | {"guess", "workspace"}
+    outputs = [(Port(name=identifier("time", taken), rows=nlp.mesh.nodes.size, unit="s", about="of the nodes"), None)]
+    values = [duration * ca.DM(nlp.mesh.nodes)]
+    for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):
+        for block in blocks:
+            about = f"{what} '{block.name}', a row for each " + _where(what, nlp)
+            name = identifier(block.name if block.name not in taken else f"{what}_{block.name}", taken)
+            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
+            outputs.append((port, None))
+            values.append(source[block.span, :].T)
+    for name, value, about in (
+        ("cost", running + terminal, "of the plan"),
+        ("infeasibility", infeasible, "largest violation of a constraint, in the solver's units"),
+        ("stationarity", stationary, "largest slope of the Lagrangian that is left, in the solver's units"),
+        ("variables", result["x"], "of the solver, the guess of a next call"),
+    ):
+        outputs.append((Port(name=identifier(name, taken), rows=int(value.shape[0]), about=about), None))
+        values.append(value)
+    values.append(ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"]))
+    inputs = [*symbols.values(), guess]
+    core = ca.Function("solve", inputs, [flat(v) for v in values])
+    ports = (*(entry.port for entry in entries), Port(name="guess", rows=int(nlp.w.shape[0]), about="where to start"))
+    default = np.concatenate([*(entry.value for entry in entries), nlp.pack(task.solution.trajectory)])
+    columns = core(*np.split(default, np.cumsum([port.size for port in ports])[:-1]))
+    safe = np.concatenate([np.asarray(c.full()).ravel() for c in columns])
+    return Law(
+        name="solve",
+        kind="solver",
+        about=ABOUT,
+        core=core,
+        inputs=ports,
+        outputs=(*(port for port, _ in outputs), Port(name="status")),
+        statuses=STATUSES,
+        safe=safe,
+        points=lambda random, count: _points(task, default, random, count),
+        most=MOST_POINTS,
+        tolerance=TOLERANCE,
+    )
+
+
+def _where(what: str, nlp: NLP) -> str:
+    """Of which times the rows of a result are."""
+    return "interval" if what == "control" and nlp.mesh.control == "constant" else "node"
+
+
+def _bounds(task: _Task, p: Any, duration: Any) -> dict[str, Any]:
+    """Bounds of the NLP as expressions of the parameters: `NLP.bounds` with symbols where values are prescribed."""
+    nlp, st, mesh = task.nlp, task.nlp.statement, task.nlp.mesh
+    numbers = nlp.bounds(st.values)
+    known = [np.flatnonzero(~np.isnan(v)) for v in st.boundary_values(st.values)]
+    values = st.boundary(p)
+    count = len(mesh.starts)
+    last_e = st.nx * count + st.ne * (count - 1)
+    places = [(0, known[0], values[0], nlp.scales.x), (st.nx * (count - 1), known[1], values[1], nlp.scales.x)]
+    if not mesh.eliminated:
+        places += [(st.nx * count, known[2], values[2], nlp.scales.e), (last_e, known[3], values[3], nlp.scales.e)]
+    lower, upper = ca.MX(ca.DM(numbers["lbx"])), ca.MX(ca.DM(numbers["ubx"]))
+    for offset, rows, value, scale in places:
+        if rows.size:
+            fixed = value[rows.tolist()] / ca.DM(scale[rows])
+            lower[(offset + rows).tolist()] = fixed
+            upper[(offset + rows).tolist()] = fixed
+    if duration is not None:
+        lower[-1] = upper[-1] = duration / nlp.scales.duration
+    lbg, ubg = ca.MX(ca.DM(numbers["lbg"])), ca.MX(ca.DM(numbers["ubg"]))
+    offset = 0
+    for entry in nlp.rows:
+        size = entry.lower.size
+        if entry.kind == "final_matrices":
+            target = values[3][known[3].tolist()] / ca.DM(entry.scale)
+            lbg[offset : offset + size] = target
+            ubg[offset : offset + size] = target
+        offset += size
+    return {"lbx": lower, "ubx": upper, "lbg": lbg, "ubg": ubg}
+
+
+def _residuals(task: _Task, result: Mapping[str, Any], g: Any, p: Any, bounds: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
+    nlp = task.nlp
+    multipliers = ca.MX.sym("multipliers", nlp.g.shape[0])
+    slope = ca.gradient(nlp.f + ca.dot(multipliers, nlp.g), nlp.w)
+    function = ca.Function("lagrangian_slope", [nlp.w, nlp.p, multipliers], [ca.densify(slope)])
+    left = function(result["x"], ca.vertcat(p, task.scale), result["lam_g"]) + result["lam_x"]
+    both = ca.vertcat(result["x"], g)
+    lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
+    weights = ca.vertcat(result["lam_x"], result["lam_g"])
+    violation = ca.mmax(ca.fmax(0.0, ca.fmax(lower - both, both - upper)))
+    slack = ca.if_else(weights > 0.0, upper - both, both - lower)
+    loose = ca.mmax(ca.if_else(weights == 0.0, 0.0, ca.fmin(ca.fabs(weights), ca.fabs(slack))))
+    return violation, ca.fmax(ca.norm_inf(left), loose)
+
+
+def _points(task: _Task, default: Array, random: np.random.Generator, count: int) -> Array:
+    """The arguments of the export, then others near them; one that is not finite."""
+    rows = np.tile(default, (count, 1))
+    offset = 0
+    for entry in task.made.entries:
+        size = entry.port.size
+        rows[1:, offset : offset + size] += entry.deviation * random.uniform(-1.0, 1.0, (count - 1, size))
+        if entry.port.columns > 1:
+            rows[1:, offset : offset + size] *= random.uniform(0.9, 1.1, (count - 1, 1))
+        offset += size
+    if count > TRIALS and offset:
+        rows[TRIALS, 0] = np.nan
+    return rows
