@@ -43,6 +43,7 @@ classical nominal is even the better one (1.78 against 2.03). Erratum: in [6.12-
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -256,10 +257,15 @@ def _at(values: Array, fractions: Array) -> Array:
     return np.asarray(legendre.legval(2 * fractions - 1, _coefficients(values)))
 
 
-def figures() -> dict[str, list[tuple[str, co.Problem]]]:
-    """What the figures of Schmidt 5.2 and 5.3 show: three weights each; by title, with the labels of the curves."""
+def figures() -> dict[str, Any]:
+    """What the figures of Schmidt 5.2, 5.3 (three weights each) and 6.12 (two nominals) show, by title."""
     weights = (0.1, 1.0, 10.0)
+    loop = steering()
     return {
         "Schmidt 5.2: identification at equilibrium": [(f"weight {w:g}", problem(w, final=0.0)) for w in weights],
         "Schmidt 5.3: identification during a transient": [(f"weight {w:g}", problem(w, final=1.0)) for w in weights],
+        "Schmidt 6.12: steered by feedback": {
+            "designs": [("combined", loop), ("classical", loop, "deterministic")],
+            "names": ["u", "x", ("rms", "x"), ("rms", "b"), "C"],
+        },
     }

@@ -31,7 +31,7 @@ class Model:
     Attributes:
         name: for messages and file names.
         make: the function.
-        module: where it is; may have `figures() -> {title: [(label, problem), ...]}`.
+        module: where it is; may have `figures()`, see `Model.figures`.
         script: the file, for a function of the user's.
     """
 
@@ -70,12 +70,17 @@ class Model:
             )
         return problem
 
-    def figures(self) -> dict[str, list[tuple[str, Problem]]]:
-        """What the figures of the source show: labelled problems by title; empty where the model names none."""
+    def figures(self) -> dict[str, Any]:
+        """What the figures of the source show, by title; empty where the model names none.
+
+        A figure is a list of designs, (label, problem) or (label, problem, nominal); or a dict of "designs" to such a
+        list, and of what else `plot_solutions` takes: "names", "over", ... The nominal is that of `solve`, or a dict of
+        control to history, which is evaluated.
+        """
         own = self.make is getattr(self.module, "problem", None)
         if self.script is not None or not own or not hasattr(self.module, "figures"):
             return {}
-        figures: dict[str, list[tuple[str, Problem]]] = self.module.figures()
+        figures: dict[str, Any] = self.module.figures()
         return figures
 
     def _values(self, settings: Sequence[str]) -> dict[str, Any]:

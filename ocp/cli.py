@@ -6,8 +6,9 @@ import argparse
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ import covocp as co
 from covocp.catalogue import find_model, models, parse_value, split_setting
 from covocp.errors import CovocpError, ProblemError, SolveError, describe
 from covocp.files import check_target
+from covocp.mesh import Options
 from covocp.plot import SUFFIXES as FIGURES
 from covocp.storage import SUFFIXES as FILES
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
+# Solutions and exit codes by problem and nominal: figures of one model share them.
+Known = dict[tuple[int, str], tuple[Any, int]]
 # Arguments of `solve` that have an option of their own here.
 TAKEN = ("problem", "method", "intervals", "progress", "allow_failure", "parameters", "methods", "method_options")
 
@@ -152,35 +156,44 @@ def _plot(arguments: argparse.Namespace) -> int:
     target = check_target(arguments.plot or f"{model.name}.png", FIGURES)
     figures = model.figures() if not arguments.set else {}
     figures = figures or {"": [("", model.build(arguments.set))]}
-    worst = 0
-    for number, (title, problems) in enumerate(figures.items(), start=1):
+    worst, known = 0, Known()
+    for number, (title, content) in enumerate(figures.items(), start=1):
         path = target if len(figures) == 1 else target.with_name(f"{target.stem}-{number}{target.suffix}")
-        worst = max(worst, _figure(title, problems, path, arguments))
+        figure = dict(content) if isinstance(content, Mapping) else {"designs": content}
+        worst = max(worst, _figure(title, figure, path, arguments, known))
     return worst
 
 
-def _figure(title: str, problems: list[tuple[str, Any]], path: Path, arguments: argparse.Namespace) -> int:
-    """Solve the problems of one figure and draw it."""
+def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.Namespace, known: Known) -> int:
+    """Solve the problems of one figure, those that no other figure has solved, and draw it."""
     from covocp.plot import plot_solutions
 
     worst, labels, solutions = 0, [], []
-    for label, problem in problems:
-        solution, code = _solved(problem, arguments)
+    for label, problem, *nominal in figure.pop("designs"):
+        key = (id(problem), repr(nominal))
+        if key not in known:
+            known[key] = _solved(problem, arguments, *nominal)
+        solution, code = known[key]
         worst = max(worst, code)
         if solution is not None:
             labels.append(label)
             solutions.append(solution)
     if solutions:
-        plot_solutions(solutions, labels=labels, title=title or None, path=path)
+        plot_solutions(solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure)
         _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
     return worst
 
 
-def _solved(problem: Any, arguments: argparse.Namespace) -> tuple[Any, int]:
+def _solved(problem: Any, arguments: argparse.Namespace, nominal: Any = None) -> tuple[Any, int]:
     """The solution, or the last iterate, and the exit code; a failure is told on the standard error."""
     shared, own = _options(arguments.option, (arguments.method,))
     options = {**shared, **own.get(arguments.method, {})}
     try:
+        if isinstance(nominal, Mapping):  # given, not solved for: only the mesh matters
+            mesh = {name: value for name, value in options.items() if name in {f.name for f in fields(Options)}}
+            return co.evaluate(problem, nominal=nominal, intervals=arguments.intervals, **mesh), 0
+        if nominal is not None:
+            options["nominal"] = nominal
         solution = co.solve(
             problem, arguments.method, intervals=arguments.intervals, progress=not arguments.quiet, **options
         )

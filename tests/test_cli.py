@@ -9,6 +9,7 @@ import pytest
 
 import covocp as co
 import covocp.models
+import covocp.plot
 from covocp.cli import main
 from covocp.progress import Progress
 
@@ -152,9 +153,10 @@ def test_plot_draws_the_figures_of_the_source(capsys, tmp_path):
         capsys, "plot", "unknown_lag", "--intervals", 20, "--option", "substeps=3", "--output", tmp_path / "lag.png"
     )
     assert code == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["lag-1.png", "lag-2.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lag-1.png", "lag-2.png", "lag-3.png"]
     assert "Schmidt 5.2" in out
     assert "Schmidt 5.3" in out
+    assert "Schmidt 6.12" in out
 
 
 def test_plot_names_its_file_after_the_model(capsys, tmp_path, monkeypatch):
@@ -170,17 +172,41 @@ def test_plot_with_parameters_draws_that_problem(capsys, tmp_path, monkeypatch):
     assert (code, out.strip()) == (0, "figure: unknown_lag.png")
 
 
-@pytest.mark.parametrize("name", ["unknown_lag", "damped_oscillator", "noisy_integrator"])
-def test_figures_of_models_are_labelled_problems(name):
+@pytest.mark.parametrize("name", ["unknown_lag", "damped_oscillator", "noisy_integrator", "mars_entry"])
+def test_figures_of_models_are_labelled_designs(name):
     from covocp.catalogue import find_model
 
     figures = find_model(name).figures()
     assert figures
-    for problems in figures.values():
-        labels = [label for label, _ in problems]
-        assert len(set(labels)) == len(labels) == 3
-        statements = [problem.statement() for _, problem in problems]
-        assert len({s.values.tobytes() for s in statements}) == 3
+    for figure in figures.values():
+        designs = figure["designs"] if isinstance(figure, dict) else figure
+        labels = [label for label, *_ in designs]
+        assert len(set(labels)) == len(labels) >= 2
+        nominals = {(problem.statement().values.tobytes(), repr(nominal)) for _, problem, *nominal in designs}
+        assert len(nominals) == len(designs)
+
+
+def test_figures_share_solutions_and_have_names_and_given_nominals(capsys, tmp_path, monkeypatch):
+    from covocp.models import unknown_lag
+
+    problem, drawn, solved = unknown_lag.steering(), [], []
+    designs = [("combined", problem), ("classical", problem, "deterministic"), ("nothing", problem, {"u": 0.0})]
+    figures = {"one": {"designs": designs, "names": [("rms", "x")]}, "two": {"designs": designs[:2], "over": "x"}}
+    monkeypatch.setattr(unknown_lag, "figures", lambda: figures)
+    solve = co.solve
+    monkeypatch.setattr(co, "solve", lambda *a, **k: solved.append(k) or solve(*a, **k))
+    draw = covocp.plot.plot_solutions
+    monkeypatch.setattr(covocp.plot, "plot_solutions", lambda s, *n, **k: drawn.append((s, n, k)) or draw(s, *n, **k))
+    code, out, _ = run(capsys, "plot", "unknown_lag", "--intervals", 40, "--output", tmp_path / "lag.png")
+    assert code == 0
+    assert out.count("figure: ") == len(list(tmp_path.iterdir())) == 2
+    assert len(solved) == 2
+    (first, names, _), (second, _, options) = drawn
+    assert names == (("rms", "x"),)
+    assert options["over"] == "x"
+    assert [s.method for s in first] == ["ipopt", "ipopt", "evaluate"]
+    assert [s.stats.get("nominal") for s in second] == [None, "deterministic"]
+    assert first[0] is second[0]
 
 
 def test_warnings_are_lines(capsys):

@@ -150,7 +150,7 @@ def test_what_is_no_executor_is_refused(lag, executor):
 
 
 def test_an_interrupt_keeps_the_finished_runs(lag, here, monkeypatch):
-    from covocp import workers
+    from covocp.simulation import workers
 
     simulated = workers.run_batch
 
@@ -186,7 +186,7 @@ def test_an_interrupt_of_an_executor_keeps_the_finished_runs(lag, here):
 
 
 def test_an_interrupt_before_the_first_run_is_one(lag, monkeypatch):
-    from covocp import workers
+    from covocp.simulation import workers
 
     def interrupted(*given):
         raise KeyboardInterrupt
@@ -197,7 +197,7 @@ def test_an_interrupt_before_the_first_run_is_one(lag, monkeypatch):
 
 
 def test_an_interrupt_while_the_step_is_chosen_is_one(lag, monkeypatch):
-    from covocp import step_choice
+    from covocp.simulation import step_choice
 
     simulated = step_choice.run_batch
 
