@@ -259,9 +259,8 @@ def _expand(problem: Problem, expected: Expected) -> Expansion:
         *(ca.MX(s.size, s.size) if q is None else q for s, q in zip(problem.states, noises, strict=True)),
         ca.MX(count, count),
     )
-    by_state = ca.vertcat(*(ca.gradient(expected.running, symbol) for symbol in augmented))
-    by_control = ca.vertcat(*(ca.gradient(expected.running, symbol) for symbol in controls))
-    at_end = ca.vertcat(*(ca.gradient(expected.terminal, symbol) for symbol in augmented))
+    by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
+    at_end = _slope(expected.terminal, augmented).T
     weight = _weight_matrix(expected.terminal_weight, entries, "terminal weight")
     end = _slope(at_end, augmented) + (0 if weight is None else weight)
     _check_terminal_weights(problem, end)
@@ -293,8 +292,21 @@ def _check_rates(problem: Problem) -> None:
 
 
 def _slope(expression: Any, symbols: list[Any]) -> Any:
-    """Jacobian by several symbols, side by side."""
-    return ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+    """Jacobian by several symbols, side by side.
+
+    An interpolation table expands to scalar operations and its derivative does not, so that of its expansion is taken.
+    """
+    slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+    own = ca.symvar(expression)
+    try:
+        ca.Function("slope", own, [slope]).expand()
+    except RuntimeError:
+        try:
+            expression = ca.Function("expression", own, [expression]).expand()(*own)
+        except RuntimeError:  # nor does the expression: the statement is in matrix operations
+            return slope
+        slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+    return slope
 
 
 def _trace(a: Any, b: Any) -> Any:

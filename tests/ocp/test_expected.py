@@ -171,6 +171,21 @@ def test_time_in_the_cost_is_a_state_that_is_known():
     assert costs[0] == pytest.approx(costs[1], rel=1e-12)
 
 
+def test_interpolation_tables():
+    """Their derivatives have no scalar form of their own; against the function in the table."""
+    knots = np.linspace(-3, 3, 49)
+    table = ca.interpolant("table", "bspline", [knots], np.sin(knots))
+    costs = []
+    for function in (table, ca.sin):
+        ocp = co.Problem(duration=2.0)
+        x, u = ocp.state("x", initial=0.5, variance=0.5), ocp.control("u")
+        ocp.dynamics(x, -function(x) + u, noise=0.3)
+        ocp.measurement("m", x + 0.3 * function(2 * x), noise=0.2)
+        ocp.minimize_expected(running=0.5 * u**2 + x**2 + 0.2 * function(x), terminal=x**2)
+        costs.append(solve(ocp, intervals=20).cost)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-4)  # third derivatives of the spline: h
+
+
 # --- weights ----------------------------------------------------------------------------------------------------------
 
 
