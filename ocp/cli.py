@@ -1,4 +1,4 @@
-"""The command `covocp`: list, solve, compare and plot models and the user's own problems."""
+"""The command `covocp`: list, solve, compare, plot and export models and the user's own problems."""
 
 from __future__ import annotations
 
@@ -79,7 +79,22 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
     plot.add_argument("--plot", "--output", metavar="FILE", help="name of the figures; MODEL.png by default")
     plot.set_defaults(run=_plot)
+    _export_options(commands.add_parser("export", help="solve a model and write C code, compiled and compared"))
     return parser
+
+
+def _export_options(export: argparse.ArgumentParser) -> None:
+    """Options of `covocp export`."""
+    _common(export)
+    export.add_argument("directory", metavar="DIR", help="folder to make")
+    export.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
+    export.add_argument("--name", help="of the package, an identifier in C; that of the folder by default")
+    export.add_argument("--precision", choices=("double", "single"), default="double", help="of all numbers (double)")
+    export.add_argument("--period", type=float, metavar="SECONDS", help="of the samples of a controller; any by default")
+    export.add_argument("--samples", type=_whole, default=1000, metavar="N", help="points of the comparison (1000)")
+    export.add_argument("--overwrite", action="store_true", help="replace a package that is there")
+    export.add_argument("--solver", action="store_true", help="write the solver of the model, for re-planning")
+    export.set_defaults(run=_export)
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
@@ -182,6 +197,30 @@ def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.
         plot_solutions(solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure)
         _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
     return worst
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    """covocp export MODEL DIR."""
+    from covocp.export import export_c
+    from covocp.export.folder import check_folder
+
+    check_folder(arguments.directory, arguments.overwrite)
+    what = find_model(arguments.model).build(arguments.set)
+    settings: dict[str, Any] = {"name": arguments.name, "precision": arguments.precision}
+    settings |= {"overwrite": arguments.overwrite, "period": arguments.period}
+    code = 0
+    if arguments.solver:
+        shared, _ = _options(arguments.option, ())
+        settings |= {**shared, "intervals": arguments.intervals}
+    else:
+        what, code = _solved(what, arguments)
+        if code:
+            return code
+    package = export_c(what, arguments.directory, **settings)
+    check = package.check(samples=arguments.samples)
+    if not arguments.quiet:
+        print(package)
+    return 0 if check.ok else FAILED
 
 
 def _solved(problem: Any, arguments: argparse.Namespace, nominal: Any = None) -> tuple[Any, int]:

@@ -80,12 +80,12 @@ def size_names(package: str, law: Law) -> dict[str, tuple[str, ...]]:
 
 def described(port: Port) -> str:
     """Unit, meaning and entries of a port, for a comment."""
-    parts = [f"[{port.unit}]" if port.unit else "", port.about]
+    parts = [" ".join(part for part in (f"[{port.unit}]" if port.unit else "", port.about) if part)]
+    if port.entries:
+        parts[0] += f" ({', '.join(port.entries)})"
     if port.columns > 1:
         parts.append(f"{port.rows} x {port.columns}, row by row")
-    if port.entries:
-        parts.append("(" + ", ".join(port.entries) + ")")
-    return " ".join(part for part in parts if part)
+    return "; ".join(part for part in parts if part)
 
 
 def code(package: str, status: str) -> str:

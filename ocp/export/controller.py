@@ -34,12 +34,12 @@ STATUSES = (
 )  # fmt: skip
 HELD = {"estimate": "estimate", "last": "time", "held": "control"}
 ABOUT = (
-    "Perturbation filter and feedback. The control returned is held until the next call; from the last call at s to",
-    "this one at t = s + h the estimate y of the deviation from the nominal is",
-    "  predicted by y' = F y + G (u_held - u) (two-stage Gauss method, stable for any h), and",
-    "  corrected by L (m - what is expected), L = h E M' (h M E M' + U)^-1; then the control is u - C y, limited.",
-    "A row of the measurement that is not finite is left out. The first measurement that counts is that of the first",
-    "call after time zero: it stands for the time from zero to it.",
+    "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
+    "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
+    "u), one step of the two-stage Gauss method, stable for any h; it is corrected by L (m - what is expected) with "
+    "L = h E M' (h M E M' + U)^-1; the control is u - C y, limited.",
+    "A row of the measurement that is not finite is left out. The first measurement that counts is that of the "
+    "first call after time zero: it stands for the time from zero to then.",
 )
 
 

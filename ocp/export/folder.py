@@ -22,10 +22,10 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
         ExportError: it exists and may not be replaced, or its parent does not exist or cannot be written to.
     """
     try:
-        target = Path(directory)
+        target = Path(directory).absolute()
     except TypeError as error:
         raise _refused(repr(directory), "the name of a folder", type(directory).__name__, "give a name") from error
-    parent = target.absolute().parent
+    parent = target.parent
     if target.exists() or target.is_symlink():
         whole = target.is_dir() and not target.is_symlink()
         if not overwrite:
@@ -52,7 +52,7 @@ def write_folder(target: Path, files: Mapping[str, str], mark: Mapping[str, obje
     Raises:
         ExportError: something cannot be written; the target is as it was.
     """
-    parent = target.absolute().parent
+    parent = target.parent
     part, old = (parent / f".{target.name}.{uuid.uuid4().hex}" for _ in range(2))
     try:
         part.mkdir()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from covocp.export.c_text import code, comment, constant, described, size_names, status_lines
+from covocp.export.c_text import code, comment, constant, described, real, size_names, status_lines
 from covocp.export.casadi_code import Sizes
 from covocp.export.laws import Law, Port, stacked_size
 
@@ -75,6 +75,9 @@ def _declared(package: str, law: Law, sizes: Sizes) -> str:
     for name, constants in size_names(package, law).items():
         for text, number in zip(constants, (ports[name].rows, ports[name].columns), strict=False):
             defined.append(f"#define {text} {number}")
+    for name, number in law.constants.items():
+        label, _, unit = name.partition(" ")
+        defined.append(f"#define {constant(package, label)} {real(number)} /* {unit} */")
     parts = ["\n".join(defined)] if defined else []
     if law.kind in ("sample", "controller"):
         parts.append(_fields(package, law))

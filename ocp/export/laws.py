@@ -81,7 +81,7 @@ class Law:
         name: the C function is <package>_<name>.
         kind: "function": arguments in, results out; "sample": a time in, a struct out; "controller": a struct that is
             kept from step to step; "solver": with a workspace that the caller provides.
-        about: what it computes, lines.
+        about: what it computes, paragraphs.
         core: flat columns of the inputs -> flat columns of the outputs; the last output of a law that has statuses is
             the status, a number.
         inputs: ports of the core.
@@ -91,6 +91,7 @@ class Law:
         start: of a controller: first values of the fields, stacked.
         safe: of a solver: outputs where it fails, stacked.
         points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
+        constants: numbers for the header, by name and unit: "DURATION [s]".
         most: largest number of points.
         tolerance: largest deviation of C from Python, relative.
     """
@@ -106,6 +107,7 @@ class Law:
     held: Mapping[str, str] = field(default_factory=dict)
     start: Array = field(default_factory=lambda: np.zeros(0))
     safe: Array = field(default_factory=lambda: np.zeros(0))
+    constants: Mapping[str, float] = field(default_factory=dict)
     most: int = 100_000
     tolerance: float = 1e-12
 

@@ -110,7 +110,7 @@ def _link_line(linking: str) -> str:
 
 def _function(name: str, law: Law) -> str:
     """Signature, meaning, arguments, results."""
-    lines = [f"### `{name}_{law.name}`", f"```c\n{signature(name, law)};\n```", " ".join(law.about)]
+    lines = [f"### `{name}_{law.name}`", f"```c\n{signature(name, law)};\n```", "\n\n".join(law.about)]
     listed = [(port, "argument") for port in law.arguments]
     listed += [(port, "field" if law.kind in ("sample", "controller") else "result") for port in law.outputs]
     rows = [f"| `{port.name}` | {role} | {described(port) or '-'} |" for port, role in listed if port.name != "status"]
@@ -130,7 +130,7 @@ def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int]) -> 
     where = {law.name: "workspace of the caller" if law.kind == "solver" else "stack" for law in laws}
     rows = [f"| `{name}_{law}` | {size} | {where[law]} |" for law, size in work_bytes.items()]
     return (
-        "These functions allocate nothing. Arrays that a call works in, in bytes on a machine of 64 bits; the frames of "
-        "the functions it calls come on top, some hundred bytes to a few times these arrays: `-fstack-usage` lists "
+        "These functions allocate nothing. Arrays that a call works in, in bytes on a machine of 64 bits; the frames "
+        "of the functions it calls come on top, some hundred bytes to a few times these arrays: `-fstack-usage` lists "
         "them.\n\n| function | bytes | where |\n|---|---|---|\n" + "\n".join(rows)
     )

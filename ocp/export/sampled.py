@@ -31,12 +31,12 @@ MOST_SAMPLES = 200_000
 CONTINUE = -1.0
 HELD = {"estimate": "estimate", "last": "index", "held": "control"}
 ABOUT = (
-    "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the",
-    "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held",
-    "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g",
-    "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one",
-    "period; the control is u - C y, limited. A measurement of which a row is not finite is left out. At time zero the control",
-    "is that of the nominal.",
+    "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the "
+    "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held "
+    "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
+    "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
+    "period; the control is u - C y, limited.",
+    "A measurement of which a row is not finite is left out. At time zero the control is that of the nominal.",
 )
 
 
@@ -110,6 +110,7 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
         name="step",
         kind="controller",
         about=(*ABOUT, f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."),
+        constants={"PERIOD [s]": period},
         core=core,
         inputs=_ports(design),
         outputs=field_ports(design, fields),

@@ -40,8 +40,8 @@ MOST_POINTS = 12
 SEED = 1971
 STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
 ABOUT = (
-    "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of",
-    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an",
+    "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
+    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an "
     "argument is not finite, the plan made at the export is returned, and the status says so.",
 )
 

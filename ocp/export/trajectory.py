@@ -50,6 +50,7 @@ def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
         core=core,
         inputs=(Port(name="time", unit="s"),),
         outputs=tuple(ports),
+        constants={"DURATION [s]": tables.duration},
         statuses=("OK", "TIME_BEFORE", "TIME_AFTER", "TIME_NOT_FINITE", "FAILED"),
         points=lambda random, count: times(tables, random, count)[:, None],
         tolerance=tolerance,
