@@ -219,7 +219,10 @@ def test_free_duration_is_that_of_the_solution():
     assert again.cost == pytest.approx(best.cost, rel=1e-9)
     assert co.evaluate(free, nominal={"u": 0.0}, intervals=20).duration == 1.0
     # A fixed duration takes the control at the same share of its own time.
-    assert co.evaluate(lasting(3.0), nominal=best).duration == 3.0
+    longer = co.evaluate(lasting(3.0), nominal=best, grid=np.linspace(0, 1, 33))
+    assert longer.duration == 3.0
+    shares = longer.mesh.nodes
+    np.testing.assert_allclose(longer["u"], np.interp(shares, best.mesh.nodes, best["u"]), atol=1e-12)
 
 
 def test_parameters():
