@@ -134,10 +134,15 @@ def choose_mesh(statement: Statement, options: Options, stiffness: float) -> Mes
 
 
 def choose_step(statement: Statement, options: Options) -> Step:
-    """The covariance step: gauss where every rate has the Riccati form, else rk4."""
+    """The covariance step: gauss where every rate has the Riccati form, else rk4.
+
+    Where E and S of a closed loop are variables, rk4: written out in scalars its exact Hessian is had in a fraction of
+    the time (Mars entry: 0.6 s an evaluation; the second derivatives of gauss's linear systems take minutes).
+    """
     riccati = all(form is not None for form in statement.riccati) and not statement.coupled
     if options.covariance_step == "auto":
-        return "gauss" if riccati else "rk4"
+        stated = bool(statement.behind) and not _choose_eliminated(statement, options)
+        return "gauss" if riccati and not stated else "rk4"
     if options.covariance_step != "rk4" and not riccati:
         names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
         reason = "feeds back into the nominal" if statement.coupled else "is not of the form F E + E F' + Q - E W E"

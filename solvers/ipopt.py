@@ -35,6 +35,14 @@ SMALLEST_CURVATURE = 1e-6
 
 JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
 
+# Covariances of a closed loop start where they were simulated, some close to their bound of zero, which they never reach:
+# the barrier must not move them far. Best gain: Mars entry takes 10 iterations and had no end before. Free gain: measured
+# on seven structures and bounds of the gain of the lag, on two grids.
+INSIDE: dict[str, dict[str, Any]] = {
+    "best gain": {"mu_init": 1e-5, "bound_push": 1e-8, "bound_frac": 1e-8},
+    "free gain": {"mu_init": 1e-2, "bound_push": 1e-4, "bound_frac": 1e-4},
+}
+
 MESSAGES = {
     "Solve_Succeeded": "solved",
     "Solved_To_Acceptable_Level": "solved to the acceptable level only: the tolerance asked for was not reached",
@@ -96,6 +104,8 @@ def prepare(
             # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
             "fixed_variable_treatment": "make_parameter_nodual",
         }
+        if statement.loop is not None and not mesh.eliminated:
+            settings["ipopt"] |= INSIDE["best gain" if statement.behind else "free gain"]
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
     if compile:
