@@ -35,9 +35,9 @@ SMALLEST_CURVATURE = 1e-6
 
 JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
 
-# Covariances of a closed loop start where they were simulated, some close to their bound of zero, which they never reach:
-# the barrier must not move them far. Best gain: Mars entry takes 10 iterations and had no end before. Free gain: measured
-# on seven structures and bounds of the gain of the lag, on two grids.
+# Covariances of a closed loop start where they were simulated, some close to their bound of zero, which they never
+# reach: the barrier must not move them far. Best gain: Mars entry takes 10 iterations and had no end before. Free gain:
+# measured on seven structures and bounds of the gain of the lag, on two grids.
 INSIDE: dict[str, dict[str, Any]] = {
     "best gain": {"mu_init": 1e-5, "bound_push": 1e-8, "bound_frac": 1e-8},
     "free gain": {"mu_init": 1e-2, "bound_push": 1e-4, "bound_frac": 1e-4},
