@@ -56,7 +56,7 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     predicted = _predict(design, y, held, [tables.at(t) for t in middle], middle, h)
     now = tables.at(clock.time)
     corrected, C, L, missing = _corrected(design, predicted, (held, measured, h), now, clock.time)
-    good = ca.mmax(ca.fabs(corrected)) <= LARGEST
+    good = ca.sum1(ca.fabs(corrected)) <= LARGEST  # false for NaN, which mmax leaves out
     estimate = ca.if_else(good, corrected, y)
     acting = ca.if_else(good, valid, 0.0)
     nominal = now.u[:m]

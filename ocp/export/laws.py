@@ -90,6 +90,7 @@ class Law:
         held: of a controller: input -> field of the struct where it is kept.
         start: of a controller: first values of the fields, stacked.
         safe: of a solver: outputs where it fails, stacked.
+        defaults: of a solver: inputs of the export, stacked.
         points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
         constants: numbers for the header, by name and unit: "DURATION [s]".
         most: largest number of points.
@@ -107,6 +108,7 @@ class Law:
     held: Mapping[str, str] = field(default_factory=dict)
     start: Array = field(default_factory=lambda: np.zeros(0))
     safe: Array = field(default_factory=lambda: np.zeros(0))
+    defaults: Array = field(default_factory=lambda: np.zeros(0))
     constants: Mapping[str, float] = field(default_factory=dict)
     most: int = 100_000
     tolerance: float = 1e-12

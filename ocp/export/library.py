@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -55,7 +57,10 @@ class Library:
         self._package = package
         self._real: Any = ctypes.c_double if precision == "double" else ctypes.c_float
         try:
-            self._library = ctypes.CDLL(str(path))
+            # A copy: the loader takes a second library of the same path for the one that it has already.
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+                copy = shutil.copy2(path, Path(folder) / path.name)
+                self._library = ctypes.CDLL(str(copy))
         except OSError as error:
             raise ExportError(
                 describe(
@@ -177,7 +182,8 @@ class Call:
         """Evaluate the law.
 
         Args:
-            values: arguments in their order, numbers or arrays of the shapes of the ports.
+            values: arguments in their order, numbers or arrays of the shapes of the ports; of a solver those that are
+                left out are those of the export.
             named: arguments by name.
 
         Returns:
@@ -198,8 +204,8 @@ class Call:
         """All inputs, stacked."""
         ports = self.law.arguments
         given = {port.name: value for port, value in zip(ports, values, strict=False)} | dict(named)
-        defaults = {"guess": self._default_guess()} if self.law.kind == "solver" else {}
-        given = {**defaults, **given}
+        if self.law.kind == "solver":
+            given = {port.name: self.law.defaults[span(self.law.inputs, port.name)] for port in ports} | given
         wrong = len(values) > len(ports) or set(given) != {port.name for port in ports}
         parts = []
         for port in ports if not wrong else ():
@@ -216,9 +222,6 @@ class Call:
                 )
             )
         return np.concatenate([np.zeros(0), *parts])
-
-    def _default_guess(self) -> Array:
-        return self.law.safe[span(self.law.outputs, "variables")]
 
 
 class Controller(Call):

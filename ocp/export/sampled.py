@@ -86,7 +86,7 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
     residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
     used = ca.if_else(ahead, ca.if_else(more, 0.0, present), 0.0)
     corrected = before + at["L"] @ ca.if_else(used, residual, 0.0)
-    good = ca.mmax(ca.fabs(corrected)) <= LARGEST
+    good = ca.sum1(ca.fabs(corrected)) <= LARGEST  # false for NaN, which mmax leaves out
     estimate = ca.if_else(good, corrected, y)
     moved = at["u"] - at["C"] @ ca.if_else(ca.if_else(good, valid, 0.0), estimate, 0.0)
     conditions = [

@@ -77,8 +77,15 @@ static void speed_{law}(long count)
     {real} got[{outputs}] = {{0}};
     const clock_t begin = clock();
     long i;
+    int row = 0, tried;
     for (i = 0; i < count; ++i) {{
-        call_{law}({law}_in[i % {rows}], got);
+        for (tried = 0; tried < {rows}; ++tried) {{ /* the next point where nothing is wrong */
+            row = (row + 1) % {rows};
+            if ({law}_status[row] == 0) {{
+                break;
+            }}
+        }}
+        call_{law}({law}_in[row], got);
         sink_ = got[0];
     }}
     printf("{law}: %.2f ns\\n", 1e9 * (double)(clock() - begin) / CLOCKS_PER_SEC / (double)count);

@@ -216,6 +216,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         outputs=(*(port for port, _ in outputs), Port(name="status")),
         statuses=STATUSES,
         safe=safe,
+        defaults=default,
         points=lambda random, count: _points(task, default, random, count),
         most=MOST_POINTS,
         tolerance=TOLERANCE,

@@ -1,0 +1,310 @@
+"""The exported controller against its formulas, computed otherwise; against the covariances of the design; when misused."""
+
+import numpy as np
+import pytest
+from exports import FOLDER, lag, mars, package
+from scipy.integrate import solve_ivp
+
+import covocp as co
+from covocp.export import export_c
+from covocp.export.controller import controller_law
+from covocp.export.design import design_of
+from covocp.export.history import history
+from covocp.export.laws import span
+
+pytestmark = pytest.mark.needs_cc
+B, U = 1.0, 1.0  # mean of the time constant, measurement noise density
+
+
+def slopes(solution, t):
+    """F, G of the lag along its nominal."""
+    x = float(solution.at(t)["x"])
+    return np.array([[-B, -x], [0.0, 0.0]]), np.array([1.0, 0.0])
+
+
+def predicted(solution, y, held, begin, end):
+    """The estimate without measurement, integrated accurately."""
+
+    def rate(t, y):
+        F, G = slopes(solution, t)
+        return F @ y + G * (held - float(solution.at(t)["u"]))
+
+    return solve_ivp(rate, (begin, end), y, rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+def gain(solution, t, h):
+    """h E M' (h M E M' + U)^-1 for M = (1, 0)."""
+    E = solution.at(t)["E"]
+    return h * E[:, 0] / (h * E[0, 0] + U)
+
+
+def after(controller, steps):
+    """Run some (measurement, time) pairs; the state after each."""
+    controller.init()
+    states = []
+    for reading, time in steps:
+        controller.step(reading, time)
+        states.append({**controller.state, "status": controller.status})
+    return states
+
+
+def test_two_steps_follow_the_formulas():
+    solution, controller = lag(), package("lag").python().step
+    first, second = after(controller, [(0.7, 0.05), (-0.2, 0.13)])
+    y = np.zeros(2)
+    held, begin = float(solution.at(0.0)["u"]), 0.0
+    for state, reading, time in ((first, 0.7, 0.05), (second, -0.2, 0.13)):
+        before = predicted(solution, y, held, begin, time)
+        sample = solution.at(time)
+        L = gain(solution, time, time - begin)
+        y = before + L * (reading - float(sample["x"]) - before[0])
+        C = sample["S"][0, :]  # B^-1 G' S, B = 1
+        held, begin = float(sample["u"]) - C @ y, time
+        np.testing.assert_allclose(state["filter_gain"], L, rtol=1e-12)
+        np.testing.assert_allclose(state["feedback_gain"][0], C, rtol=1e-12)
+        np.testing.assert_allclose(state["estimate"], y, rtol=0, atol=1e-7)  # one Gauss step of order 4
+        assert state["control"] == pytest.approx(held, abs=1e-7)
+        assert state["nominal_control"] == pytest.approx(float(sample["u"]), abs=1e-14)
+        assert state["nominal_state"] == pytest.approx(float(sample["x"]), abs=1e-14)
+        assert (state["status"], state["time"]) == ("OK", time)
+
+
+def test_prediction_is_of_fourth_order():
+    """Without a measurement: error of one step against an accurate integration."""
+    solution, controller = lag(), package("lag").python().step
+    errors = []
+    steps = (1.6, 0.8, 0.4)
+    for h in steps:
+        controller.init()
+        controller.step(1.0, 4.0)
+        held, start = controller.state["control"], controller.state["estimate"]
+        controller.step(np.nan, 4.0 + h)
+        assert controller.status == "MEASUREMENT_MISSING"
+        errors.append(np.abs(controller.state["estimate"] - predicted(solution, start, held, 4.0, 4.0 + h)).max())
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert (orders > 4.0).all()  # of one step: 5, where the kinks of the nominal do not show
+
+
+def test_gain_tends_to_the_continuous_one_and_is_stable_for_any_step():
+    solution, controller = mars(), package("mars").python().step
+    node = 40
+    for h, tolerance in ((1e-2, 2e-2), (1e-3, 2e-3)):
+        controller.init()
+        controller.step([0.0, 0.0], solution.t[node] - h)
+        controller.step([0.0, 0.0], solution.t[node])
+        ratio = controller.state["filter_gain"] / h / solution.gains["K"][node]
+        np.testing.assert_allclose(ratio, 1.0, rtol=tolerance)
+    st, T, p = solution.statement, solution.duration, solution.parameters
+    for h in (1.0, 30.0, solution.t[node]):
+        controller.init()
+        controller.step([0.0, 0.0], solution.t[node] - h)
+        controller.step([0.0, 0.0], solution.t[node])
+        M = st.measurement(solution.trajectory.x[node], solution.controls[node], solution.t[node], T, p)[1].full()
+        values = np.linalg.eigvals(controller.state["filter_gain"] @ M)
+        assert np.abs(values.imag).max() < 1e-6
+        assert values.real.min() > -1e-6
+        assert values.real.max() < 1.0
+
+
+def test_rows_that_are_missing_leave_the_filter_of_the_others():
+    solution, controller = mars(), package("mars").python().step
+    t, h = 600.0, 2.0
+    st, T, p = solution.statement, solution.duration, solution.parameters
+    sample = solution.at(t)
+    x = np.array([sample[b.name] for b in st.states])
+    M = st.measurement(x, float(sample["lift_to_drag"]), t, T, p)[1].full()
+    E, kept = sample["E"], M[1:]
+    expected = h * E @ kept.T / (h * kept @ E @ kept.T + 0.02)
+    controller.init()
+    controller.step([np.nan, np.nan], t - h)
+    controller.step([np.nan, 3.0], t)
+    assert controller.status == "MEASUREMENT_MISSING"
+    np.testing.assert_allclose(controller.state["filter_gain"][:, 1:], expected, rtol=1e-9)
+    np.testing.assert_array_equal(controller.state["filter_gain"][:, 0], 0.0)
+    assert np.isfinite(controller.state["estimate"]).all()
+
+
+def test_terminal_deviations_are_those_of_the_design():
+    """400 actual lags at once, unknown constants and all noises: sample against predicted, three sigma and the step."""
+    solution = lag()
+    law = controller_law(design_of(solution, None), history(solution, "double"), 1e-12)
+    runs, steps = 400, 250
+    h = solution.duration / steps
+    random = np.random.default_rng(11)
+    core = law.core.map(runs)
+    x = random.normal(size=runs)
+    b = B + np.sqrt(0.05) * random.normal(size=runs)
+    fields = np.tile(law.start[:, None], (1, runs))
+
+    def field(name):
+        return fields[span(law.outputs, name)]
+
+    for k in range(steps):
+        u = field("control")[0]
+        decay = np.exp(-b * h)
+        x = decay * x + u * (1 - decay) / b + np.sqrt((1 - decay**2) / (2 * b)) * random.normal(size=runs)
+        reading = x + np.sqrt(U / h) * random.normal(size=runs)
+        columns = core(field("estimate"), field("time"), field("control"), reading, np.full(runs, (k + 1) * h))
+        fields = np.vstack([column.full() for column in columns])
+    assert not field("status").any()
+    ratio = np.std(x - solution["x"][-1], ddof=0) / solution.deviation("x")[-1]
+    assert ratio == pytest.approx(1.03, abs=3 / np.sqrt(2 * runs))  # 3 % are due to the step: a delay of h
+
+
+def test_samples_of_a_short_period_are_the_continuous_law():
+    """Both controllers on the same readings: the discrete gains differ by the step only."""
+    random = np.random.default_rng(4)
+    readings = random.normal(size=1000)
+    controls = []
+    for name in ("lag", "lag_sampled"):
+        controller = package(name).python().step
+        controller.init()
+        controls.append([controller.step(m, (k + 1) * 0.01)[0] for k, m in enumerate(readings)])
+    difference = np.abs(np.array(controls[0]) - controls[1]).max()
+    assert difference < 0.01 * np.abs(controls[1]).max()
+
+
+# --- misuse -----------------------------------------------------------------------------------------------------------
+
+NAMES = ["lag", "lag_sampled"]
+
+
+def ready(name):
+    """A controller in the middle of its work."""
+    controller = package(name).python().step
+    after(controller, [(0.4, 1.0), (0.1, 1.5), (0.9, 2.0)])
+    return controller
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("reading", [np.nan, np.inf, -np.inf, 1e200])
+def test_readings_that_are_not_finite_are_predicted_over(name, reading):
+    controller = ready(name)
+    start, held = controller.state["estimate"], float(controller.state["control"])
+    control = controller.step(reading, 2.01)
+    assert controller.status == "MEASUREMENT_MISSING"
+    expected = predicted(lag(), start, held, 2.0, 2.01)
+    np.testing.assert_allclose(controller.state["estimate"], expected, rtol=0, atol=1e-8)
+    assert np.isfinite(control).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("time", "status", "clamped"),
+    [
+        (np.nan, "TIME_NOT_FINITE", 2.0),
+        (np.inf, "TIME_NOT_FINITE", 2.0),
+        (-0.5, "TIME_BEFORE", 0.0),
+        (11.0, "TIME_AFTER", 10.0),
+        (1.0, "TIME_BACKWARDS", 1.0),
+    ],
+)
+def test_times_outside_the_range_give_the_nominal_control_and_keep_the_estimate(name, time, status, clamped):
+    controller = ready(name)
+    before = controller.state
+    control = controller.step(0.3, time)
+    assert controller.status == status
+    assert control[0] == pytest.approx(float(lag().at(clamped)["u"]), abs=1e-12)
+    np.testing.assert_array_equal(controller.state["estimate"], before["estimate"])
+    assert controller.state["time"] == before["time"]
+    controller.step(0.3, 2.5)
+    assert controller.status == "OK"
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e308])
+def test_an_estimate_that_is_lost_leaves_the_nominal_control(name, bad):
+    law = next(law for law in package(name).laws if law.name == "step")
+    rows = law.points(np.random.default_rng(0), 60)[40:41]
+    rows[:, span(law.inputs, "estimate")] = bad
+    rows[:, span(law.inputs, "measurement")] = 0.1
+    rows[:, span(law.inputs, "time")] = 5.0
+    rows[:, span(law.inputs, "last")] = 4.99 if name == "lag" else 499
+    backend = package(name)._library().backend(law)
+    values, status = backend(rows[0])
+    assert status == 6
+    control = values[span(law.outputs, "control")]
+    assert control[0] == pytest.approx(float(lag().at(5.0)["u"]), abs=1e-12)
+
+
+def test_a_step_at_the_same_time_changes_nothing_but_counts_as_ok():
+    controller = ready("lag")
+    before = controller.state
+    control = controller.step(5.0, 2.0)
+    assert controller.status == "OK"
+    np.testing.assert_allclose(controller.state["estimate"], before["estimate"], rtol=0, atol=1e-14)
+    assert control[0] == pytest.approx(before["control"], abs=1e-14)
+
+
+def test_samples_that_are_left_out_are_predicted_over_one_by_one():
+    controller = ready("lag_sampled")
+    late = package("lag_sampled").python().step
+    after(late, [(0.4, 1.0), (0.1, 1.5), (0.9, 2.0)])
+    control = late.step(0.8, 2.25)
+    held = float(controller.state["control"])
+    for k in range(201, 225):
+        controller.step(np.nan, k * 0.01)
+        controller._values[span(controller.law.outputs, "control")] = held  # it was held all the time
+    expected = controller.step(0.8, 2.25)
+    assert (controller.status, late.status) == ("OK", "OK")
+    np.testing.assert_allclose(control, expected, rtol=1e-12)
+    np.testing.assert_allclose(late.state["estimate"], controller.state["estimate"], rtol=1e-12)
+    assert late.state["index"] == 225
+
+
+def test_the_nearest_sample_is_taken():
+    early, late = ready("lag_sampled"), None
+    one = early.step(0.5, 2.0149)
+    late = package("lag_sampled").python().step
+    after(late, [(0.4, 1.0), (0.1, 1.5), (0.9, 2.0)])
+    assert late.step(0.5, 2.0051)[0] == one[0]
+
+
+@pytest.mark.parametrize("limits", ["bounds", {"lift_to_drag": (0.3, 0.6)}])
+def test_limits_hold(limits):
+    made = export_c(mars(), FOLDER / f"limited_{len(limits)}_{type(limits).__name__}", limits=limits)
+    controller = made.reference().step
+    low, high = (0.0, 1.0) if limits == "bounds" else (0.3, 0.6)
+    controls = []
+    for sign in (1.0, -1.0):
+        controller.init()
+        controls += [controller.step([sign * 400.0, sign * 400.0], 200.0 + k)[0] for k in range(60)]
+    assert min(controls) == low
+    assert max(controls) == high
+
+
+# --- what cannot be a controller --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"period": 0.0}, "not a positive number"),
+        ({"period": np.nan}, "not a positive number"),
+        ({"period": "fast"}, "not a positive number"),
+        ({"period": 11.0}, "does not fit the duration"),
+        ({"period": 1e-9}, "does not fit the duration"),
+        ({"limits": "hard"}, "unknown kind"),
+        ({"limits": {"u": 3.0}}, "no pair"),
+        ({"limits": {"u": (1.0, -1.0)}}, "u"),
+        ({"limits": {"thrust": (0.0, 1.0)}}, "thrust"),
+        ({"feedback": False, "period": 0.1}, "those of a controller"),
+        ({"intervals": 10}, "no option 'intervals' for a solution"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, words):
+    with pytest.raises(co.CovocpError, match=words):
+        export_c(lag(), FOLDER / "refused", **options)
+    assert not (FOLDER / "refused").exists()
+
+
+def test_a_closed_loop_read_from_a_file_needs_its_problem(tmp_path):
+    from covocp.models import unknown_lag
+
+    path = lag().save(tmp_path / "lag.npz")
+    with pytest.raises(co.ExportError, match=r"load\(path, problem="):
+        export_c(co.load(path), FOLDER / "no_problem")
+    export_c(co.load(path), FOLDER / "no_feedback", feedback=False)
+    problem = unknown_lag.steering(parameter_variance=0.05)
+    made = export_c(co.load(path, problem=problem), FOLDER / "with_problem")
+    assert [law.name for law in made.laws] == ["sample", "step"]
