@@ -295,7 +295,7 @@ def test_terminal_costate_along_a_given_nominal():
 
 @cache
 def optimum(formulation, method="ipopt"):
-    options = {"covariances": formulation} if method == "ipopt" else {}
+    options = {"covariances": formulation, "covariance_step": "gauss"} if method == "ipopt" else {}
     return solve(loop.problem(), method=method, intervals=30, tolerance=1e-8, **options)
 
 

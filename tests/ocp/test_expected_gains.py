@@ -273,3 +273,13 @@ def test_gains_that_run_away():
 def test_as_many_entries_as_nodes():
     found = co.evaluate(loop.problem(gain=co.Gain()), nominal={"u": 0.0, "w": 0.0, "C": np.zeros(6)}, intervals=5)
     assert (found.gains["C"] == 0).all()
+
+
+@pytest.mark.xfail(reason="a constant gain is a state without row in the covariances, and shifts those after it")
+def test_covariances_by_name_beside_a_constant_gain():
+    found = steered(*STRUCTURES[4])
+    np.testing.assert_array_equal(found.covariance("x"), found.loop.X[:, :1, :1])
+    np.testing.assert_array_equal(found.covariance("b"), found.loop.X[:, 1:, 1:])
+    np.testing.assert_allclose(found.deviation("b"), np.sqrt(5.0), rtol=1e-9)
+    with pytest.raises(co.ProblemError):
+        found.covariance("C")

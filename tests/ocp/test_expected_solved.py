@@ -70,7 +70,8 @@ def linear_quadratic_gaussian(q, r, e):
 @cache
 def separated():
     # Matrices as states: with second derivatives, so that the controls are had to more digits than the cost is flat.
-    solver = co.Solver(linear_quadratic(), intervals=60, tolerance=1e-9, covariances="states")
+    options = {"covariances": "states", "covariance_step": "gauss"}  # the step of `evaluate`
+    solver = co.Solver(linear_quadratic(), intervals=60, tolerance=1e-9, **options)
     return [solver.solve({"q": q, "r": r, "e": list(e)}, progress=False) for q, r, e in STATISTICS]
 
 
@@ -146,7 +147,7 @@ def test_constant_controls(covariances):
 
 @cache
 def curved(covariances="eliminated", method="ipopt", **options):
-    options |= {"covariances": covariances} if method == "ipopt" else {}
+    options |= {"covariances": covariances, "covariance_step": "gauss"} if method == "ipopt" else {}
     return solve(loop.problem(), method=method, intervals=20, tolerance=1e-8, **options)
 
 
