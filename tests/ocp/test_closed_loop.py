@@ -25,10 +25,15 @@ def reference():
 
 
 @cache
+def problem(curved=True):
+    """Built once; without `curved` S(T) does not depend on x(T)."""
+    return loop.problem(curved=curved, terminal_weight=None if curved else {"r": 0.5})
+
+
+@cache
 def evaluated(substeps=16, step="gauss", *, curved=True):
     """Along the same control as the reference."""
-    problem = loop.problem(curved=curved, terminal_weight=None if curved else {"r": 0.5})
-    return co.evaluate(problem, nominal=NOMINAL, intervals=4, substeps=substeps, covariance_step=step)
+    return co.evaluate(problem(curved), nominal=NOMINAL, intervals=4, substeps=substeps, covariance_step=step)
 
 
 def histories(found, exact):
@@ -91,7 +96,7 @@ def test_incorrect_statistics():
 
 
 def test_statistics_of_the_design_as_truth_change_nothing():
-    for truth in ({}, {"noise": 1.0}, loop.problem()):
+    for truth in ({}, {"noise": 1.0}, problem()):
         found = co.evaluate(evaluated(), truth=truth)
         for one, two in histories(found.loop, reference()):
             np.testing.assert_allclose(one, two, atol=1e-6)
@@ -127,7 +132,7 @@ def test_both_forms_of_the_cost_agree(nominal, control):
     """(E-1) = (E-20), Z = 0, c's variance is kept, along a nominal that is optimal in no sense; by order four."""
     errors = []
     for substeps in (2, 4, 8):
-        found = co.evaluate(loop.problem(), nominal=NOMINALS[nominal], intervals=20, substeps=substeps, control=control)
+        found = co.evaluate(problem(), nominal=NOMINALS[nominal], intervals=20, substeps=substeps, control=control)
         o = found.optimality
         np.testing.assert_allclose(found.loop.X[:, 2, 2], 0.15, rtol=1e-11)
         assert o.conservation < 1e-11
@@ -259,23 +264,20 @@ def test_two_ways_to_the_costates_in_a_loop(step, limit):
     np.testing.assert_allclose(solution.costates.matrices, other.matrices, atol=limit)
 
 
-def slope_by_differences(curved, i, j):
-    costs = []
-    problem = loop.problem(curved=curved, terminal_weight=None if curved else {"r": 0.5})
-    for sign in (1, -1):
-        moved = CONTROLS.copy()
-        moved[i, j] += sign * 1e-4
-        nominal = {"u": moved[:, 0], "w": moved[:, 1]}
-        costs.append(co.evaluate(problem, nominal=nominal, intervals=4, substeps=4).cost)
-    return (costs[0] - costs[1]) / 2e-4
-
-
 @pytest.mark.parametrize("curved", [False, True])
 def test_slopes_of_the_cost_by_the_controls(curved):
     """Of the discretised problem: only the differences' own error, 1e-8."""
     _, found, _ = discrete_costates(evaluated(4, curved=curved).extremal)
-    for i, j in ((0, 0), (1, 1), (2, 0), (3, 1), (4, 0)):
-        assert found[i, j] == pytest.approx(slope_by_differences(curved, i, j), rel=1e-6, abs=1e-7)
+
+    def cost(i, j, change):
+        moved = CONTROLS.copy()
+        moved[i, j] += change
+        nominal = {"u": moved[:, 0], "w": moved[:, 1]}
+        return co.evaluate(problem(curved), nominal=nominal, intervals=4, substeps=4).cost
+
+    for i, j in ((0, 0), (2, 1), (4, 0)):
+        slope = (cost(i, j, 1e-4) - cost(i, j, -1e-4)) / 2e-4
+        assert found[i, j] == pytest.approx(slope, rel=1e-6, abs=1e-7)
 
 
 def nonquadratic_end(solution):
@@ -296,7 +298,7 @@ def test_terminal_costate_along_a_given_nominal():
 @cache
 def optimum(formulation, method="ipopt"):
     options = {"covariances": formulation, "covariance_step": "gauss"} if method == "ipopt" else {}
-    return solve(loop.problem(), method=method, intervals=30, tolerance=1e-8, **options)
+    return solve(problem(), method=method, intervals=30, tolerance=1e-8, **options)
 
 
 @pytest.mark.parametrize(
