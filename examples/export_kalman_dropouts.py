@@ -44,4 +44,6 @@ for _ in range(1000):
     gap = max(gap, float(np.abs(estimate - other).max()))
 rms = np.sqrt(np.mean(np.square(errors), axis=0))
 print(f"1000 cycles, a third of the readings lost: C and numpy differ by {gap:.1e}")
-print(f"rms error {rms[0]:.3f} m, {rms[1]:.3f} m/s; the filter expects {np.sqrt(covariance[0, 0]):.3f} m after the last")
+print(
+    f"rms error {rms[0]:.3f} m, {rms[1]:.3f} m/s; the filter expects {np.sqrt(covariance[0, 0]):.3f} m after the last"
+)

@@ -1,4 +1,4 @@
-"""Mars entry: the nominal, its filter and its feedback as C; the gains for samples of half a second, and as they come."""
+"""Mars entry: nominal, filter and feedback as C; for samples of half a second, and for any time between steps."""
 
 import tempfile
 from pathlib import Path

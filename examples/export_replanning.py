@@ -1,4 +1,4 @@
-"""A solver in C that plans again and again: from where the lag has come, for the time that is left, with what is known.
+"""A solver in C that plans again and again: from where the lag is, for the time that is left, with what is known.
 
 The plan identifies the time constant. Each second C is given the state, the covariance of the estimate and the
 remaining time, starts from the plan before, and returns a new one.
@@ -27,8 +27,8 @@ int main(void)
     for (k = 0; k < 6; ++k) {
         status = lag_planner_solve(&workspace, state, E, weight, b, left, guess, t, u, x, &cost, &infeasibility,
             &stationarity, variables);
-        printf("%d s: x = %6.3f, status %d, cost %8.5f, slope left %.0e, first control %7.4f\\n", k, state, status, cost,
-            stationarity, u[0]);
+        printf("%d s: x = %6.3f, status %d, cost %8.5f, slope left %.0e, first control %7.4f\\n",
+            k, state, status, cost, stationarity, u[0]);
         guess = variables;
         state += -b * state + u[0];              /* a second later, roughly */
         E[3] = 5.0 - 0.4 * (k + 1);              /* and a little more is known of b */

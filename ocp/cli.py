@@ -90,7 +90,9 @@ def _export_options(export: argparse.ArgumentParser) -> None:
     export.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
     export.add_argument("--name", help="of the package, an identifier in C; that of the folder by default")
     export.add_argument("--precision", choices=("double", "single"), default="double", help="of all numbers (double)")
-    export.add_argument("--period", type=float, metavar="SECONDS", help="of the samples of a controller; any by default")
+    export.add_argument(
+        "--period", type=float, metavar="SECONDS", help="of the samples of a controller; any by default"
+    )
     export.add_argument("--samples", type=_whole, default=1000, metavar="N", help="points of the comparison (1000)")
     export.add_argument("--overwrite", action="store_true", help="replace a package that is there")
     export.add_argument("--solver", action="store_true", help="write the solver of the model, for re-planning")

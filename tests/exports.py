@@ -20,6 +20,7 @@ from covocp.models import agile_aircraft, mars_entry, unknown_lag
 FOLDER = Path(tempfile.mkdtemp(prefix="covocp_export_"))
 atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 STRICT = ["-Werror"]
+PLANNER = {"intervals": 12, "substeps": 2}  # substeps="auto" depends on the parameters
 STEP = 0.1
 TRANSITION = np.array([[1.0, STEP], [0.0, 1.0]])
 NOISE = np.array([[STEP**3 / 3, STEP**2 / 2], [STEP**2 / 2, STEP]])
@@ -68,7 +69,7 @@ def filter_functions() -> list[ca.Function]:
 
 def theta_d_functions() -> list[ca.Function]:
     """θ-D regulator, servo and filter gain of the agile aircraft."""
-    x, t = ca.SX.sym("x", 5), ca.SX.sym("t")
+    x = ca.SX.sym("x", 5)
     A0, bilinear, B, measured = agile_aircraft.matrices()
     A = x[1] * ca.DM(bilinear)
     track, level = agile_aircraft.tracking(), agile_aircraft.regulation()
@@ -93,8 +94,10 @@ def package(name: str) -> CPackage:
         "steps": lambda p: export_c(open_lag("constant"), p),
         "filters": lambda p: export_c(filter_functions(), p),
         "theta": lambda p: export_c(theta_d_functions(), p, ranges={"x": (-0.5, 0.5), "t": (0.0, 30.0)}),
-        "planner": lambda p: export_c(unknown_lag.problem(weight=10.0), p, intervals=12),
+        "planner": lambda p: export_c(unknown_lag.problem(weight=10.0), p, **PLANNER),
     }
-    made = makers[name](FOLDER / name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)  # the mesh of the planner is coarse
+        made = makers[name](FOLDER / name)
     made.build(flags=STRICT)
     return made

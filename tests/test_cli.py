@@ -216,6 +216,60 @@ def test_warnings_are_lines(capsys):
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.needs_cc
+def test_export_writes_compiles_and_compares(capsys, tmp_path):
+    folder = tmp_path / "integrator_c"
+    code, out, err = run(capsys, "export", "noisy_integrator", folder, "--intervals", 10, "--samples", 50)
+    assert code == 0, err
+    assert out.startswith("C package 'integrator_c'")
+    assert "sample: 50 points, largest relative deviation" in out
+    assert "self-test in C: passed" in out
+    assert (folder / "integrator_c.h").exists()
+    assert_refused(run(capsys, "export", "noisy_integrator", folder, "--quiet"), "overwrite=True")
+    arguments = ["--overwrite", "--quiet", "--precision", "single", "--name", "other", "--samples", 20]
+    code, out, _ = run(capsys, "export", "noisy_integrator", folder, "--intervals", 10, *arguments)
+    assert (code, out) == (0, "")
+    assert (folder / "other.h").exists()
+    assert "typedef float other_real;" in (folder / "other.h").read_text(encoding="utf-8")
+
+
+@pytest.mark.needs_cc
+def test_export_writes_controllers_and_solvers(capsys, tmp_path):
+    code, out, err = run(
+        capsys, "export", "unknown_lag:steering", tmp_path / "lag", "--intervals", 80, "--period", 0.1, "--samples", 50
+    )
+    assert code == 0, err
+    assert "lag_sample, lag_step (double precision)" in out
+    code, out, err = run(
+        capsys, "export", "bryson_denham", tmp_path / "planner", "--intervals", 10, "--solver", "--set", "limit=0.2"
+    )
+    assert code == 0, err
+    assert "planner_solve" in out
+
+
+def test_export_of_a_failed_solve_writes_nothing(capsys, tmp_path):
+    arguments = ["--intervals", 30, "--option", "max_iterations=3"]
+    code, _, err = run(capsys, "export", "unknown_lag", tmp_path / "lag", *arguments)
+    assert code == 1
+    assert "was not solved" in err
+    assert not (tmp_path / "lag").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--name", "int"], "cannot be the name of a C package"),
+        (["--period", "0.1"], "those of a controller"),
+        (["--solver", "--period", "0.1"], "no option 'period' for a problem"),
+        (["--solver", "--option", "colour=3"], "no option 'colour'"),
+    ],
+)
+def test_wrong_exports_are_refused(capsys, tmp_path, arguments, words):
+    outcome = run(capsys, "export", "noisy_integrator", tmp_path / "out", "--intervals", "10", *arguments)
+    assert_refused(outcome, words)
+    assert not (tmp_path / "out").exists()
+
+
 # --- wrong input ------------------------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ from covocp.export.linking import Linking
 COMPILERS = ("cc", "gcc", "clang")
 STANDARD = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-O2")
 TOOLS = ("auto", "cc", "cmake")
+MISSING = {"auto": "C compiler and no CMake", "cc": "C compiler", "cmake": "CMake"}
 FOLDER = "build"
 LINES = 20  # of a compiler's message that an error quotes
 TIMEOUT = 1800.0  # s
@@ -79,7 +80,7 @@ def build(sources: Sources, tool: str = "auto", flags: Sequence[str] = ()) -> Bu
         return _by_cmake(sources, tuple(flags))
     raise ExportError(
         describe(
-            f"'{sources.name}' cannot be compiled: there is no {'C compiler' if tool == 'cc' else tool}.",
+            f"'{sources.name}' cannot be compiled: there is no {MISSING[tool]}.",
             expected="a C compiler on the path (" + ", ".join(COMPILERS) + ") or in the variable CC, or CMake",
             received="CC=" + os.environ.get("CC", "") + ", PATH=" + os.environ.get("PATH", ""),
             remedy="install one, such as gcc; or compile the sources elsewhere (README.md says how)",

@@ -61,8 +61,8 @@ class Generated:
 
 
 def core_name(package: str, law: Law) -> str:
-    """Name of CasADi's function of a law."""
-    return f"{package}_{law.name}_core"
+    """Name of CasADi's function of a law; CasADi allows no two underscores together."""
+    return re.sub("_+", "_", f"{package}_{law.name}_core")
 
 
 def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:

@@ -83,7 +83,7 @@ def _law(function: ca.Function, ranges: Mapping[str, Any], units: Mapping[str, s
     }
     kept = tuple(port for port in inputs if port.size)
     return Law(
-        name=identifier(function.name(), set(), "law"),
+        name="real_law" if function.name() == "real" else function.name(),  # <package>_real is a type
         kind="function",
         about=(str(function),),
         core=_core(function, inputs, outputs),
@@ -114,7 +114,7 @@ def _core(function: ca.Function, inputs: list[Port], outputs: list[Port]) -> ca.
     ]
     results = function.call(arguments, symbolic is ca.SX, False)
     values = [flat(value) for value, port in zip(results, outputs, strict=True) if port.size]
-    return ca.Function(identifier(function.name(), set(), "law"), columns, values)
+    return ca.Function(function.name(), columns, values)
 
 
 def _limits(ports: tuple[Port, ...], ranges: Mapping[str, Any]) -> dict[str, tuple[Array, Array]]:

@@ -75,9 +75,9 @@ def _declared(package: str, law: Law, sizes: Sizes) -> str:
     for name, constants in size_names(package, law).items():
         for text, number in zip(constants, (ports[name].rows, ports[name].columns), strict=False):
             defined.append(f"#define {text} {number}")
-    for name, number in law.constants.items():
+    for name, value in law.constants.items():
         label, _, unit = name.partition(" ")
-        defined.append(f"#define {constant(package, label)} {real(number)} /* {unit} */")
+        defined.append(f"#define {constant(package, label)} {real(value)} /* {unit} */")
     parts = ["\n".join(defined)] if defined else []
     if law.kind in ("sample", "controller"):
         parts.append(_fields(package, law))

@@ -1,4 +1,4 @@
-"""The exported controller against its formulas, computed otherwise; against the covariances of the design; when misused."""
+"""The exported controller: its formulas computed otherwise, the covariances of the design, misuse."""
 
 import numpy as np
 import pytest
