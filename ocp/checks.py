@@ -192,7 +192,7 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
                 expected=number if scalar else matrix,
                 received=f"{float(numbers.item()):g}" if scalar else text,
                 remedy=f"check the {what} given for '{name}'"
-                + (": every measurement needs some noise" if definite else ""),
+                + (": every measurement needs some noise" if definite and "noise" in what else ""),
             )
         )
 

@@ -80,7 +80,7 @@ def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
     numbers = as_number(block.name, "guess", values)
     if numbers.ndim == 0:
         numbers = np.full((at.size, block.size), float(numbers))
-    elif numbers.shape == (block.size,) and numbers.size != at.size:
+    elif numbers.shape == (block.size,):
         numbers = np.tile(numbers, (at.size, 1))
     elif numbers.ndim == 1 and block.size == 1:
         numbers = numbers[:, None]
@@ -186,6 +186,10 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
     if statement.measurement is not None:
         density = np.asarray(statement.measurement(x, u, 0.0, duration, parameters)[2].full())
         check_density(", ".join(statement.measurement_names), "measurement noise density", density, definite=True)
+    if statement.loop is not None:
+        weights = np.asarray(statement.loop.expansion(x, u, 0.0, duration, parameters)[3].full())
+        fed = statement.control_names[: weights.shape[0]]
+        check_density(", ".join(fed), "control weight", weights, definite=True)
     rates, matrix_rates, running = (np.asarray(v.full()).ravel() for v in statement.rates(*arguments))
     terminal = np.asarray(statement.terminal(x, e, duration, parameters).full()).ravel()
     groups = [

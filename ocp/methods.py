@@ -119,6 +119,9 @@ class Solver:
         self.statement: Statement = problem.statement()
         self._problem, self._classical = problem, cast("Solver | None", None)
         self._options = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        if nominal == "deterministic":  # the steps of what runs around it
+            around = evaluation_mesh(self.statement, self._options, self.statement.values)
+            self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else deterministic(problem).statement()
         self._solved = solved
         self._prepared = cast(

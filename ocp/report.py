@@ -27,7 +27,7 @@ NO_FEEDBACK = 1e-6
 # Name of the gain of a constrained feedback, and of what the deviations add to an expected cost.
 GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
 # Multipliers below this share of the cost are not shown.
-NEGLIGIBLE = 1e-9
+NEGLIGIBLE = 1e-6
 # Relative difference of costs below which two starts count as having found the same optimum.
 SAME_OPTIMUM = 1e-5
 

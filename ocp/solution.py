@@ -414,7 +414,8 @@ class Solution:
 
     def _augmented_span(self, key: Any) -> slice:
         offset = 0
-        candidates = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
+        both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
+        candidates = [q for q in both if entry_names((q,))[0] in self.augmented]  # constants of a gain have no row
         name = name_of(key, self.symbols, tuple(q.name for q in candidates))
         for q in candidates:
             if q.name == name:

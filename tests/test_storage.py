@@ -215,7 +215,7 @@ def changed(path, change):
     ("change", "words"),
     [
         (lambda tree: tree.update(format="other"), "of another format"),
-        (lambda tree: tree.update(version=2), "version is 2"),
+        (lambda tree: tree.update(version=1), "version is 1"),
         (lambda tree: tree.pop("version"), "version is None"),
         (lambda tree: tree.pop("rates"), "lacks the entries rates"),
         (lambda tree: tree["mesh"].pop("nodes"), "lacks the entries mesh.nodes"),

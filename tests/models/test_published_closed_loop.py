@@ -211,9 +211,6 @@ def test_a_stationary_point_above_the_classical_design_is_reported():
     assert good.cost < good.stats["classical_cost"]
 
 
-@pytest.mark.xfail(
-    reason="the classical nominal takes other steps than the covariances around it, so it misses x(T)", strict=True
-)
 @pytest.mark.parametrize("decay", [1.0, 2.0])
 def test_no_false_alarm(decay):
     """Linear and quadratic: both designs are the same, on a coarse mesh too."""

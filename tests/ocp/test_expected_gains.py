@@ -269,13 +269,11 @@ def test_gains_that_run_away():
     assert away.cost > 1e50
 
 
-@pytest.mark.xfail(reason="evaluate_guess refuses a vector with as many entries as there are nodes", strict=True)
 def test_as_many_entries_as_nodes():
     found = co.evaluate(loop.problem(gain=co.Gain()), nominal={"u": 0.0, "w": 0.0, "C": np.zeros(6)}, intervals=5)
     assert (found.gains["C"] == 0).all()
 
 
-@pytest.mark.xfail(reason="a constant gain is a state without row in the covariances, and shifts those after it")
 def test_covariances_by_name_beside_a_constant_gain():
     found = steered(*STRUCTURES[4])
     np.testing.assert_array_equal(found.covariance("x"), found.loop.X[:, :1, :1])

@@ -169,7 +169,6 @@ def test_weights_and_gains_that_do_not_fit(given, parts):
     refused(lambda: Declared().expect(**given), *parts)
 
 
-@pytest.mark.xfail(reason="numbers of weights that come from parameters are not checked before solving", strict=True)
 @pytest.mark.parametrize("value", [-1.0, 0.0])
 def test_control_weight_from_a_parameter(value):
     d = Declared()
