@@ -13,9 +13,10 @@ COSTS = {"mars": 5.7667749e-4, "lag": 2.027146}
 NAMES = {"mars": "Mars", "lag": "6.12"}
 SAME_COST = 1e-4  # relative
 COARSE_COST = 5e-3  # the same on a coarse mesh, where covariance steps differ
-AGAINST_HAND = 1.25  # largest time of covocp's F3 over that of the script by hand
-# How many times as long the script by hand takes at least as covocp's default.
-TIMES_AS_LONG = {"mars": 3.0, "lag": 1.0}
+# Largest time of covocp's F3 over that of the script by hand, and how many times as long that takes at least as covocp's
+# default. On the lag, a tenth of a second, the checks after the solution weigh as much as the solution: stated only.
+AGAINST_HAND: dict[str, float | None] = {"mars": 1.25, "lag": None}
+TIMES_AS_LONG: dict[str, float | None] = {"mars": 3.0, "lag": None}
 LINEAR = 0.03  # relative error of the linear prediction of Mars's terminal deviations
 SAMPLING = 4.0  # standard errors of a sample deviation, which are 1/sqrt(2 runs)
 
@@ -39,7 +40,9 @@ def judge_system(cases: Sequence[Case], part: str, system: str, size: int, refer
             for code, cost in costs.items()
         ],
         figure(f"{name}: time, F3 by hand / covocp", ratio(by_hand, times["covocp"]), least=TIMES_AS_LONG[system]),
-        figure(f"{name}: time, covocp, F3 / F3 by hand", ratio(times["covocp, states"], by_hand), most=AGAINST_HAND),
+        figure(
+            f"{name}: time, covocp, F3 / F3 by hand", ratio(times["covocp, states"], by_hand), most=AGAINST_HAND[system]
+        ),
         figure(f"{name}: time of an iteration of the gradient method, s", iteration),
         *[
             figure(f"{name}: peak memory, {label}, MB", value(cases, part, code, size, key="memory"))

@@ -15,6 +15,8 @@ from covocp.statement import Statement
 
 ELIMINATED_SEGMENTS = 10
 LARGEST_SUBSTEPS = 64
+# Entries of E and S up to which their step is written out in scalars where they are variables.
+SCALAR_ENTRIES = 12
 # h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
 STIFFNESS_PER_STEP = 1.0
 
@@ -136,12 +138,14 @@ def choose_mesh(statement: Statement, options: Options, stiffness: float) -> Mes
 def choose_step(statement: Statement, options: Options) -> Step:
     """The covariance step: gauss where every rate has the Riccati form, else rk4.
 
-    Where E and S of a closed loop are variables, rk4: written out in scalars its exact Hessian is had in a fraction of
-    the time (Mars entry: 0.6 s an evaluation; the second derivatives of gauss's linear systems take minutes).
+    Where E and S of a closed loop are variables and small, rk4: written out in scalars, its exact derivatives cost a
+    third of those of gauss's linear systems (lag of section 6.12, 6 entries). For large ones these are cheaper (Mars
+    entry, 30 entries: 1.6 and 0.2 s for Hessian and Jacobian, with rk4 1.8 and 0.7 s and twice the memory).
     """
     riccati = all(form is not None for form in statement.riccati) and not statement.coupled
     if options.covariance_step == "auto":
-        stated = bool(statement.behind) and not _choose_eliminated(statement, options)
+        small = statement.ne <= SCALAR_ENTRIES
+        stated = bool(statement.behind) and small and not _choose_eliminated(statement, options)
         return "gauss" if riccati and not stated else "rk4"
     if options.covariance_step != "rk4" and not riccati:
         names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
