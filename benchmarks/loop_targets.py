@@ -13,8 +13,8 @@ COSTS = {"mars": 5.7667749e-4, "lag": 2.027146}
 NAMES = {"mars": "Mars", "lag": "6.12"}
 SAME_COST = 1e-4  # relative
 COARSE_COST = 5e-3  # the same on a coarse mesh, where covariance steps differ
-# Largest time of covocp's F3 over that of the script by hand, and how many times as long that takes at least as its
-# default. On the lag, a tenth of a second, the checks after the solution weigh as much as the solution: stated only.
+# Largest time of covocp's F3 over that of the script by hand; least time of that script over that of covocp's default.
+# On the lag, a tenth of a second, the checks after the solution weigh as much as the solution: stated only.
 AGAINST_HAND: dict[str, float | None] = {"mars": 1.25, "lag": None}
 TIMES_AS_LONG: dict[str, float | None] = {"mars": 3.0, "lag": None}
 LINEAR = 0.03  # relative error of the linear prediction of Mars's terminal deviations

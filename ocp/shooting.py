@@ -27,6 +27,10 @@ from covocp.statement import Conditions, Statement
 from covocp.trajectory import Trajectory
 
 
+# Steps that a sequence of numbers takes at a time.
+NUMERIC_RUN = 10
+
+
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
     """Build the NLP of a statement on a mesh.
 
@@ -269,7 +273,7 @@ def _sequence(
         step = propagate_step(statement, positions, mesh.linear_solver)
         matrices = [step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions]
     if kicks is None:
-        values = step.mapaccum("propagate", count)(first, *matrices)
+        values = _accumulated(step, first, matrices, count)
         return values, values
     inputs = step.mx_in()
     kick = ca.MX.sym("kick", first.shape[0])
@@ -279,6 +283,25 @@ def _sequence(
     at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
     passed, before = kicked.mapaccum("propagate", count)(first, *matrices, at_nodes)
     return before, passed
+
+
+def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int) -> Any:
+    """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
+    if not isinstance(arguments[0], ca.DM):
+        return step.mapaccum("propagate", count)(first, *arguments)
+    runs: dict[int, ca.Function] = {}
+    value, passed = first, []
+    for begin in range(0, count, NUMERIC_RUN):
+        length = min(NUMERIC_RUN, count - begin)
+        function = runs.setdefault(length, step if length == 1 else step.mapaccum("propagate", length))
+        parts = []
+        for argument in arguments:
+            width = argument.shape[1] // count
+            parts.append(argument[:, begin * width : (begin + length) * width])
+        values = function(value, *parts)
+        passed.append(values)
+        value = values[:, -1]
+    return ca.horzcat(*passed)
 
 
 def _runge_kutta_step(statement: Statement, positions: tuple[int, ...]) -> ca.Function:
