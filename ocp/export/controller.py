@@ -25,6 +25,7 @@ from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.trajectory import times
 from covocp.integrators import COMPILED_SOLVER, GAUSS_NODES
 from covocp.matrices import Array
+from covocp.statement import Statement, entry_names
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8
@@ -121,16 +122,25 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
         "index": "of the last sample",
         "status": "of the last step",
     }
+    controls = with_units(st, st.control_names[:m])
     entries = {
-        "estimate": design.labels, "nominal_state": st.state_names, "control": st.control_names[:m],
-        "nominal_control": st.control_names[:m],
-    }  # fmt: skip
+        "estimate": with_units(st, design.labels),
+        "nominal_state": with_units(st, st.state_names),
+        "control": controls,
+        "nominal_control": controls,
+    }
     ports = []
     for name in fields:
         rows, columns = shapes.get(name, (1, 1))
         unit, listed = units.get(name, ""), entries.get(name, ())
         ports.append(Port(name=name, rows=rows, columns=columns, unit=unit, about=about[name], entries=listed))
     return tuple(ports)
+
+
+def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of entries with the units of their symbols."""
+    units = {name: block.unit for block in statement.blocks for name in entry_names((block,))}
+    return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 
 def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Array:

@@ -111,7 +111,7 @@ def _explained(package: str, law: Law) -> list[str]:
     if law.kind == "sample":
         lines.append("point (result): see there")
     if law.kind == "solver":
-        lines.append("workspace: any, of the caller; one for each thread. guess may be NULL: that of the export.")
+        lines.append("workspace: any, of the caller. guess may be NULL: that of the export. One call at a time.")
     return [*lines, "Returns: " + ", ".join(code(package, name) for name in law.statuses) + "."]
 
 

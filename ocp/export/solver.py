@@ -154,6 +154,8 @@ def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any
         settings["ipopt"] = {"print_level": 0, "sb": "yes", "tol": ASKED, "max_iter": MAX_ITERATIONS}
         if not exact:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": 20}
+    elif method == "fatrop":
+        settings["fatrop"] = {"print_level": 0, "tolerance": ASKED, "max_iter": MAX_ITERATIONS}
     for key, value in own.items():
         settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
     return settings

@@ -1,5 +1,6 @@
 """The exported controller: its formulas computed otherwise, the covariances of the design, misuse."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, lag, mars, package
@@ -85,6 +86,27 @@ def test_prediction_is_of_fourth_order():
     assert (orders > 4.0).all()  # of one step: 5, where the kinks of the nominal do not show
 
 
+def test_a_measurement_that_sees_the_control_is_corrected_by_the_one_that_was_held():
+    ocp = co.Problem(duration=4.0, name="direct")
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.3), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.2)
+    ocp.measurement("m", x + 0.5 * u, noise=0.1)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
+    solution = co.evaluate(ocp, nominal={"u": np.linspace(0.2, 0.6, 41)})
+    controller = export_c(solution, FOLDER / "direct").reference().step
+    first, second = after(controller, [(0.9, 1.0), (0.4, 1.1)])
+    held, y = first["control"], first["estimate"]
+    before = solve_ivp(
+        lambda t, y: -y + held - float(solution.at(t)["u"]), (1.0, 1.1), [float(y)], rtol=1e-12, atol=1e-14
+    ).y[0, -1]
+    now = solution.at(1.1)
+    E, nominal = float(now["E"].item()), float(now["u"])
+    L = 0.1 * E / (0.1 * E + 0.1)
+    expected = before + L * (0.4 - float(now["x"]) - 0.5 * nominal - before - 0.5 * (held - nominal))
+    assert second["filter_gain"] == pytest.approx(L, rel=1e-12)
+    assert second["estimate"] == pytest.approx(expected, abs=1e-8)
+
+
 def test_gain_tends_to_the_continuous_one_and_is_stable_for_any_step():
     solution, controller = mars(), package("mars").python().step
     node = 40
@@ -162,6 +184,44 @@ def test_samples_of_a_short_period_are_the_continuous_law():
         controls.append([controller.step(m, (k + 1) * 0.01)[0] for k, m in enumerate(readings)])
     difference = np.abs(np.array(controls[0]) - controls[1]).max()
     assert difference < 0.01 * np.abs(controls[1]).max()
+
+
+def unscalar():
+    """A lag whose rate solves a linear system, which has no form in scalars."""
+    ocp = co.Problem(duration=4.0, name="implicit")
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.1), ocp.control("u")
+    matrix = ca.vertcat(ca.horzcat(2.0 + x**2, 0.1), ca.horzcat(0.1, 1.0))
+    ocp.dynamics(x, u - ca.solve(matrix, ca.vertcat(x, 0.1), "qr")[0], noise=0.1)
+    ocp.measurement("m", x, noise=0.5)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
+    return ocp
+
+
+def many_states(n=5):
+    """A chain with 2 n states, two controls, correlated measurements that see the control."""
+    ocp = co.Problem(duration=3.0, name="chain")
+    y = ocp.state("y", n, initial=np.zeros(n), variance=0.1)
+    v = ocp.state("v", n, initial=np.zeros(n), variance=0.1)
+    u = ocp.control("u", 2)
+    force = [(y[i - 1] if i else 0) - 2 * y[i] + (y[i + 1] if i < n - 1 else 0) - 0.1 * v[i] ** 3 for i in range(n)]
+    force[0], force[-1] = force[0] + u[0], force[-1] + u[1]
+    ocp.dynamics(y, v)
+    ocp.dynamics(v, ca.vertcat(*force), noise=0.1)
+    ocp.measurement("ends", ca.vertcat(y[0] + 0.1 * u[0], y[n - 1]), noise=np.array([[0.2, 0.05], [0.05, 0.1]]))
+    ocp.measurement("square", v[0] ** 2, noise=0.3)
+    ocp.minimize_expected(running=0.5 * ca.sumsqr(u), terminal_weight={y: np.ones(n)})
+    return ocp
+
+
+@pytest.mark.parametrize("period", [None, 0.05])
+@pytest.mark.parametrize("make", [unscalar, many_states])
+def test_models_without_scalar_form_and_with_many_states(make, period):
+    solution = co.evaluate(make(), nominal={"u": np.linspace(0.2, 0.6, 11)} if make is unscalar else {"u": 0.3})
+    made = export_c(solution, FOLDER / f"{make.__name__}_{'sampled' if period else 'any'}", period=period)
+    made.build(flags=["-Werror", "-O0"])
+    check = made.check(samples=300)
+    assert check.deviation <= 1e-12
+    assert check.ok
 
 
 # --- misuse -----------------------------------------------------------------------------------------------------------
