@@ -26,7 +26,6 @@ from covocp.nlp import NLP, Rows, Scales
 from covocp.statement import Conditions, Statement
 from covocp.trajectory import Trajectory
 
-
 # Steps that a sequence of numbers takes at a time.
 NUMERIC_RUN = 10
 
