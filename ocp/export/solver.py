@@ -6,7 +6,7 @@ the solver's own opinion: it follows from the conditions of a minimum at what it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -181,28 +181,11 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     bounds = _bounds(task, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
     result = solver(x0=start, p=ca.vertcat(p, task.scale), **bounds)
-    x, _, u, duration, running, terminal, g = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
-    infeasible, stationary = _residuals(task, result, g, p, bounds)
-    bad = ca.logic_not(ca.logic_and(infeasible <= INFEASIBLE, stationary <= STATIONARY))
-    taken = {entry.port.name for entry in entries} | {"guess", "workspace"}
-    outputs = [(Port(name=identifier("time", taken), rows=nlp.mesh.nodes.size, unit="s", about="of the nodes"), None)]
-    values = [duration * ca.DM(nlp.mesh.nodes)]
-    for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):
-        for block in blocks:
-            about = f"{what} '{block.name}', a row for each " + _where(what, nlp)
-            name = identifier(block.name if block.name not in taken else f"{what}_{block.name}", taken)
-            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
-            outputs.append((port, None))
-            values.append(source[block.span, :].T)
-    for name, value, about in (
-        ("cost", running + terminal, "of the plan"),
-        ("infeasibility", infeasible, "largest violation of a constraint, in the solver's units"),
-        ("stationarity", stationary, "largest slope of the Lagrangian that is left, in the solver's units"),
-        ("variables", result["x"], "of the solver, the guess of a next call"),
-    ):
-        outputs.append((Port(name=identifier(name, taken), rows=int(value.shape[0]), about=about), None))
-        values.append(value)
-    values.append(ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"]))
+    evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
+    residuals = _residuals(task, result, evaluated[-1], p, bounds)
+    outputs = _results(task, result["x"], evaluated, residuals)
+    bad = ca.logic_not(ca.logic_and(residuals[0] <= INFEASIBLE, residuals[1] <= STATIONARY))
+    values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"])]
     inputs = [*symbols.values(), guess]
     core = ca.Function("solve", inputs, [flat(v) for v in values])
     ports = (*(entry.port for entry in entries), Port(name="guess", rows=int(nlp.w.shape[0]), about="where to start"))
@@ -223,6 +206,31 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         most=MOST_POINTS,
         tolerance=TOLERANCE,
     )
+
+
+def _results(
+    task: _Task, variables: Any, evaluated: Sequence[Any], residuals: tuple[Any, Any]
+) -> list[tuple[Port, Any]]:
+    """Results of the solver with their values: times, controls, states, cost, residuals, variables."""
+    nlp = task.nlp
+    x, _, u, duration, running, terminal, _ = evaluated
+    last = {
+        "cost": (running + terminal, "of the plan"),
+        "infeasibility": (residuals[0], "largest violation of a constraint, in the solver's units"),
+        "stationarity": (residuals[1], "largest slope of the Lagrangian that is left, in the solver's units"),
+        "variables": (variables, "of the solver, the guess of a next call"),
+    }
+    taken = {entry.port.name for entry in task.made.entries} | {"guess", "time", *last}
+    times = Port(name="time", rows=nlp.mesh.nodes.size, unit="s", about="of the nodes")
+    results = [(times, duration * ca.DM(nlp.mesh.nodes))]
+    for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):
+        for block in blocks:
+            about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
+            name = identifier(block.name if block.name not in taken else f"{what}_{block.name}", taken)
+            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
+            results.append((port, source[block.span, :].T))
+    results += [(Port(name=n, rows=int(v.shape[0]), about=about), v) for n, (v, about) in last.items()]
+    return results
 
 
 def _where(what: str, nlp: NLP) -> str:

@@ -90,7 +90,7 @@ def test_arguments_that_are_not_finite_return_the_plan_of_the_export(name, value
 def test_a_problem_without_a_solution_is_not_called_solved():
     """Bounds on the control that do not let the state arrive in the time that is left."""
     ocp = co.Problem(duration=2.0)
-    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    x, v = ocp.state("cost", initial=0.0, final=1.0), ocp.state("variables", initial=0.0, final=0.0)
     a = ocp.control("a", lower=-2.0, upper=2.0)
     ocp.dynamics(x, v)
     ocp.dynamics(v, a)
@@ -106,7 +106,7 @@ def test_a_problem_without_a_solution_is_not_called_solved():
     assert planner.status == "OK"
     assert plan["infeasibility"] < 1e-6
     assert plan["a"].shape == (11,)
-    np.testing.assert_allclose(plan["x"][[0, -1]], [0.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(plan["state_cost"][[0, -1]], [0.0, 1.0], atol=1e-8)
 
 
 def test_a_free_duration_stays_free():
