@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     __version__: str
     from covocp.certificate import Certificate as Certificate
     from covocp.certificate import certify as certify
+    from covocp.export import CPackage as CPackage
+    from covocp.export import export_c as export_c
     from covocp.law_simulation import LawSimulation as LawSimulation
     from covocp.law_simulation import simulate_law as simulate_law
     from covocp.merit import Worth as Worth
@@ -46,6 +48,8 @@ else:
         "Comparison": "covocp.solvers.compare",
         "compare": "covocp.solvers.compare",
         "load": "covocp.storage",
+        "CPackage": "covocp.export",
+        "export_c": "covocp.export",
         "LawSimulation": "covocp.law_simulation",
         "simulate_law": "covocp.law_simulation",
         "MonteCarlo": "covocp.simulation",

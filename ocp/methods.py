@@ -199,7 +199,7 @@ class Solver:
             return solution
         if classical is None:
             return solution
-        if solution.cost > classical + WORSE * abs(classical):
+        if solution.cost > classical + (WORSE + solution.mesh_error) * abs(classical):
             warnings.warn(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
                 f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic').",
