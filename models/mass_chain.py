@@ -28,7 +28,6 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm, solve_continuous_lyapunov
 
 import covocp as co
 
@@ -91,7 +90,8 @@ def problem(masses: int = 1, weight: float = 20.0) -> co.Problem:
 def least_energy_control(masses: int, duration: float) -> Callable[[Array], Array]:
     """Control that moves the last mass of the chain without cubic forces from rest to its target with least energy.
 
-    u(t) = B' exp(A' (T - t)) c, with c such that the last mass arrives, from the controllability Gramian.
+    u(t) = B' exp(A' (T - t)) c, with c such that the last mass arrives, from the controllability Gramian; in the modes
+    of A, which are all damped oscillations and distinct.
 
     Args:
         masses: m.
@@ -105,14 +105,17 @@ def least_energy_control(masses: int, duration: float) -> Callable[[Array], Arra
     A = np.block([[np.zeros((m, m)), np.eye(m)], [-STIFFNESS * D.T @ D, -DAMPING * D.T @ D]])
     B = np.eye(2 * m)[:, m : m + 1]
     arrival = np.eye(2 * m)[[m - 1, 2 * m - 1]]  # rows of y_m and v_m
-    final = expm(A * duration) @ B
-    gramian = solve_continuous_lyapunov(A, final @ final.T - B @ B.T)
-    multiplier = arrival.T @ np.linalg.solve(arrival @ gramian @ arrival.T, np.array([TARGET, 0.0]))
+    poles, modes = np.linalg.eig(A)
+    driven = np.linalg.solve(modes, B).ravel()
+    sums = poles[:, None] + poles.conj()
+    gramian = np.outer(driven, driven.conj()) * np.expm1(sums * duration) / sums
+    response = arrival @ modes  # of the last mass to each mode
+    multiplier = np.linalg.solve((response @ gramian @ response.conj().T).real, np.array([TARGET, 0.0]))
 
     def control(s: Array) -> Array:
         """At the fractions s of the duration."""
         remaining = duration * (1 - np.asarray(s, dtype=float))
-        return np.asarray((expm(A * remaining[..., None, None]) @ B)[..., 0] @ multiplier)
+        return np.asarray((np.exp(remaining[..., None] * poles) * driven @ (multiplier @ response)).real)
 
     return control
 

@@ -331,7 +331,7 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
 
 def stiffness(statement: Statement, nodes: Array, control: str, parameters: Array, *, matrices: bool) -> float:
     """Largest h times spectral radius of what Runge-Kutta steps, at the start: f_x, with `matrices` 2 (F - E W)."""
-    u = controls_guess(statement, nodes, control, None)[:1].ravel() if statement.nu else np.zeros(0)
+    u = controls_guess(statement, nodes[:2], control)[0]
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
     x, e = starts(statement, mesh, parameters)
     duration = statement.duration.guess

@@ -288,18 +288,13 @@ def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int
     """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
     if not isinstance(arguments[0], ca.DM):
         return step.mapaccum("propagate", count)(first, *arguments)
-    runs: dict[int, ca.Function] = {}
+    lengths = [min(NUMERIC_RUN, count - begin) for begin in range(0, count, NUMERIC_RUN)]
+    runs = {length: step if length == 1 else step.mapaccum("propagate", length) for length in set(lengths)}
+    parts = [ca.horzsplit(argument, NUMERIC_RUN * (argument.shape[1] // count)) for argument in arguments]
     value, passed = first, []
-    for begin in range(0, count, NUMERIC_RUN):
-        length = min(NUMERIC_RUN, count - begin)
-        function = runs.setdefault(length, step if length == 1 else step.mapaccum("propagate", length))
-        parts = []
-        for argument in arguments:
-            width = argument.shape[1] // count
-            parts.append(argument[:, begin * width : (begin + length) * width])
-        values = function(value, *parts)
-        passed.append(values)
-        value = values[:, -1]
+    for length, *columns in zip(lengths, *parts, strict=True):
+        passed.append(runs[length](value, *columns))
+        value = passed[-1][:, -1]
     return ca.horzcat(*passed)
 
 

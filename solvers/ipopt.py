@@ -342,12 +342,18 @@ class _Monitor(ca.Callback):
         """Columns."""
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i).removeprefix("lam_")], 1)
 
-    def eval(self, arg: Any) -> list[int]:
+    def has_eval_buffer(self) -> bool:
+        """Numbers come as they lie in memory: matrices made of them would take longer than a small iteration."""
+        return True
+
+    def eval_buffer(self, arg: tuple[memoryview, ...], res: tuple[memoryview, ...]) -> int:
         """One iteration."""
-        if self._progress is None:
-            return [0]
-        g = np.asarray(arg[ca.nlpsol_out().index("g")].full()).ravel()
-        violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
-        self._progress.update(self._iteration, float(arg[ca.nlpsol_out().index("f")]) * self._scale, float(violation))
-        self._iteration += 1
-        return [int(self._progress.stop)]
+        stop = False
+        if self._progress is not None:
+            cost, g = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in ("f", "g"))
+            violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
+            self._progress.update(self._iteration, float(cost[0]) * self._scale, float(violation))
+            self._iteration += 1
+            stop = self._progress.stop
+        np.frombuffer(res[0], dtype=float)[:] = stop
+        return 0
