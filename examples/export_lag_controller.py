@@ -36,5 +36,6 @@ def fly(controller, seed=1):
 in_c, in_python = fly(package.python().step), fly(package.reference().step)
 print(f"{STEPS} steps in the loop: C and Python differ by {np.abs(in_c - in_python).max():.1e}")
 print(f"x(T) = {in_c[-1, 0]:.3f}, meant to be {solution['x'][-1]:g} with deviation {solution.deviation('x')[-1]:.3f}")
+print(co.simulate(solution, 100, seed=1, law=package.python(), period=0.02, progress=False))
 for name, t in package.time().items():
     print(f"{name}: {t.c:.0f} ns in C, {t.virtual_machine:.0f} in CasADi, {t.python:.0f} from Python")

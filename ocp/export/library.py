@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -54,6 +56,7 @@ class Library:
 
     def __init__(self, path: Path, package: str, precision: str) -> None:
         """Load it."""
+        self._made_from = (path, package, precision)
         self._package = package
         self._real: Any = ctypes.c_double if precision == "double" else ctypes.c_float
         try:
@@ -70,6 +73,10 @@ class Library:
                     remedy="build() it here",
                 )
             ) from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process loads it from where it is."""
+        return Library, self._made_from
 
     def backend(self, law: Law) -> Backend:
         """The C function of a law; buffers are its own, so it must not run in two threads at a time."""
@@ -165,18 +172,41 @@ def _fields(struct: Any, port: Port) -> Array:
 class Call:
     """One law as a function of Python.
 
+    It may be copied and sent to another process; copies share the compiled function and nothing else.
+
     Args:
         law: what it is.
-        backend: what evaluates it.
+        library: that evaluates it; None: CasADi does.
 
     Attributes:
         status: of the last call, a name of `covocp.export.laws.STATUSES`.
     """
 
-    def __init__(self, law: Law, backend: Backend) -> None:
+    def __init__(self, law: Law, library: Library | None) -> None:
         """Keep both."""
-        self.law, self._backend = law, backend
+        self.law, self._library = law, library
+        self._backend = evaluated(law) if library is None else library.backend(law)
         self.status = "OK"
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Call:
+        """What changes from call to call is replaced then, never written into: a copy of the references is enough."""
+        return copy.copy(self)
+
+    def __copy__(self) -> Call:
+        """One more caller of the same function."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what belongs to this process."""
+        law = replace(self.law, points=no_points)
+        return {name: value for name, value in self.__dict__.items() if name != "_backend"} | {"law": law}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In another process."""
+        self.__dict__.update(state)
+        self._backend = evaluated(self.law) if self._library is None else self._library.backend(self.law)
 
     def __call__(self, *values: Any, **named: Any) -> Any:
         """Evaluate the law.
@@ -231,15 +261,25 @@ class Controller(Call):
         state: fields of its struct by name, as arrays.
     """
 
-    def __init__(self, law: Law, backend: Backend, start: Callable[[], Array]) -> None:
+    def __init__(self, law: Law, library: Library | None) -> None:
         """Start it."""
-        super().__init__(law, backend)
-        self._start = start
+        super().__init__(law, library)
         self.init()
 
     def init(self) -> None:
         """Set it to the start of the nominal, its estimate to the mean."""
-        self._values, self.status = self._start(), "OK"
+        self._values = self.law.start.copy() if self._library is None else self._library.started(self.law)
+        self.status = "OK"
+
+    @property
+    def period(self) -> float | None:
+        """Time between two steps that it was made for [s]; None: any."""
+        return next((value for name, value in self.law.constants.items() if name.startswith("PERIOD")), None)
+
+    @property
+    def estimate(self) -> Array:
+        """Its estimate of the deviation from the nominal, (n,)."""
+        return np.asarray(self._values[span(self.law.outputs, "estimate")])
 
     @property
     def state(self) -> dict[str, Any]:
@@ -321,16 +361,9 @@ class Laws(Mapping[str, Call]):
 
 def laws_of(laws: tuple[Law, ...], library: Library | None) -> Laws:
     """The laws as functions of Python, of a library or, without one, of CasADi."""
-    calls: dict[str, Call] = {}
-    for law in laws:
-        backend = evaluated(law) if library is None else library.backend(law)
-        if law.kind == "controller":
-            start = _starter(law, library)
-            calls[law.name] = Controller(law, backend, start)
-        else:
-            calls[law.name] = Call(law, backend)
-    return Laws(calls)
+    return Laws({law.name: (Controller if law.kind == "controller" else Call)(law, library) for law in laws})
 
 
-def _starter(law: Law, library: Library | None) -> Callable[[], Array]:
-    return (lambda: law.start.copy()) if library is None else (lambda: library.started(law))
+def no_points(random: np.random.Generator, count: int) -> Array:
+    """Stands for the points of a law in another process, where nothing is compared."""
+    raise NotImplementedError

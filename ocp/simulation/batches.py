@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from covocp.matrices import Array
+from covocp.simulation.flown import own_copy, stepped
 from covocp.simulation.plan import Plan
 from covocp.simulation.vectorised import LANES, padded, vectorise
 
@@ -108,6 +109,7 @@ class _Simulation:
         self.own = plan.unknowns[:, None] + start[states:]
         self.step.inputs[2][:] = self.own
         self.observe.inputs[1][:] = self.own
+        self.laws = [own_copy(plan.flown.law) for _ in range(self.runs)] if plan.flown else []
         self.left = np.full(width, np.inf)
         self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
         rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
@@ -125,6 +127,9 @@ class _Simulation:
         size, inside = np.empty_like(moved), np.empty(moved.shape, dtype=bool)
         domain = plan.domain[:, None]
         where = {int(k): i for i, k in enumerate(plan.stored)}
+        sampled = {int(k): i for i, k in enumerate(plan.samples)}
+        if sampled:
+            self._sample(0)
         self._store(where[0])
         before = self.before
         before[:] = self.observe.outputs[0][: 2 * plan.size]
@@ -138,9 +143,26 @@ class _Simulation:
             if not inside.all():
                 self._leave(~inside.all(axis=0), plan.times[k])
             before[:] = moved
+            if k + 1 in sampled:
+                self._sample(sampled[k + 1])
             if k + 1 in where:
                 self._store(where[k + 1])
         return self._batch()
+
+    def _sample(self, number: int) -> None:
+        """Step the laws of the runs that are inside the domain; the mean of what was measured starts anew."""
+        flown, spans, z = self.plan.flown, self.plan.spans, self.step.inputs[0]
+        assert flown is not None
+        measured, controls = z[spans["measured"]], self.plan.fed_back
+        mean = measured / flown.period if number else np.full_like(measured, np.nan)
+        for i in np.flatnonzero(np.isinf(self.left[: self.runs])).tolist():
+            result = stepped(
+                self.laws[i], mean[:, i].copy(), float(flown.times[number]), controls, flown.estimates * self.plan.size
+            )
+            z[spans["held"], i] = result[:controls]
+            if flown.estimates:
+                z[spans["estimate"], i] = result[controls:]
+        measured[:] = 0.0
 
     def _leave(self, gone: Any, time: float) -> None:
         """Note when runs leave the domain, and where they were before."""
@@ -198,7 +220,7 @@ class _Simulation:
         return Batch(
             first=self.first,
             deviation=np.ascontiguousarray(y[:, :n]),
-            estimate=np.ascontiguousarray(y[:, n:]),
+            estimate=np.ascontiguousarray(y[:, n:]) if plan.estimates else np.full_like(y[:, n:], np.nan),
             cost=np.where(stayed, self._cost(), np.nan),
             left=self.left[:runs],
             asked=flags[0],

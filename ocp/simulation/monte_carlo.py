@@ -37,7 +37,9 @@ class MonteCarlo:
         requested: number of runs asked for.
         numbers: of the runs that were simulated, (R,).
         seed: of the random numbers.
-        filter: "perturbation" or "extended".
+        filter: "perturbation", "extended", or "law" where a law of the user's flew.
+        period: time between two steps of the law [s], else NaN.
+        estimated: whether there are estimates; a law may have none.
         fed_back: whether there is a feedback; False: plant and filter along an open-loop control.
         truth: what was simulated instead of the design's system, in words; "" where it is the design's.
         level: probability of the confidence bands.
@@ -49,7 +51,7 @@ class MonteCarlo:
             predicted_error: of the error of the estimate; predicted_mean: mean of the deviation, (K, n).
         design, design_error: the same mean squares as the design expects them; they differ where there is a truth.
         deviations: at the end, (R, n); of a run that left the domain, just before it did.
-        estimates: the filter's estimates of them, (R, n).
+        estimates: the filter's estimates of them, (R, n); those of a law at its last step, NaN where it has none.
         costs: of each run, (R,); NaN where it left the domain, or without an expected cost.
         predicted_cost: linear prediction for what was simulated, NaN where there is none; design_cost: of the design.
         left: time at which a run left the domain [s], inf where it did not, (R,).
@@ -71,6 +73,8 @@ class MonteCarlo:
     numbers: Any
     seed: int
     filter: str
+    period: float
+    estimated: bool
     fed_back: bool
     truth: str
     level: float
@@ -182,7 +186,20 @@ class MonteCarlo:
         return self._shaped(np.sqrt(np.diagonal(self.predicted, axis1=1, axis2=2)[:, rows]), block)
 
     def error_covariance(self, a: Any, b: Any = None) -> Array:
-        """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b)."""
+        """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b).
+
+        Raises:
+            ProblemError: a law flew that tells no estimate.
+        """
+        if not self.estimated:
+            raise ProblemError(
+                describe(
+                    "There are no errors of estimates.",
+                    expected="a filter of the design, or a law with an attribute 'estimate'",
+                    received="a law without one",
+                    remedy="let the law tell its estimate of the deviation from the nominal, (n,)",
+                )
+            )
         one, two = self.rows(a, controls=False)[0], self.rows(a if b is None else b, controls=False)[0]
         n, product = self.size, self.moments.product
         actual, estimate = product[:, :n, :n], product[:, n : 2 * n, n : 2 * n]

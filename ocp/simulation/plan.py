@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.matrices import Array
+from covocp.simulation.flown import Flown, sample_indices
 from covocp.simulation.run_step import (
     Setting,
     factor,
@@ -19,7 +20,7 @@ from covocp.simulation.run_step import (
     start_of,
     step_function,
 )
-from covocp.simulation.schedule import Grid, coefficients, stored_indices, table
+from covocp.simulation.schedule import Grid, coefficients, table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +40,7 @@ class Plan:
     seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
     pairs: whether each noise is the sum of those of two half steps.
     paths: number of runs whose histories are kept.
+    flown: the law of the user; samples: indices of the times at which it is stepped.
     """
 
     step: ca.Function
@@ -60,6 +62,13 @@ class Plan:
     pilot: bool
     pairs: bool
     paths: int
+    flown: Flown | None
+    samples: Any
+
+    @property
+    def estimates(self) -> bool:
+        """Whether there are estimates."""
+        return self.flown is None or self.flown.estimates
 
     @property
     def size(self) -> int:
@@ -70,9 +79,8 @@ class Plan:
 def make_plan(
     setting: Setting,
     grid: Grid,
-    base: Grid,
+    stored: Array,
     *,
-    store: int,
     seed: int,
     paths: int = 0,
     pilot: bool = False,
@@ -82,9 +90,8 @@ def make_plan(
 
     Args:
         setting: what is simulated.
-        grid: the steps; they divide those of `base`.
-        base: the grid among whose times the stored ones are chosen.
-        store: number of stored times.
+        grid: the steps.
+        stored: times of theirs at which moments are kept [s].
         seed: of the random numbers.
         paths: number of runs whose histories are kept.
         pilot: whether the runs are for choosing the step.
@@ -94,7 +101,6 @@ def make_plan(
     chosen = coefficients(design, setting.filter)
     before, after = table(setting.solution, grid, chosen)
     varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
-    stored = np.searchsorted(grid.t, base.t[stored_indices(base, store)])
     run = run_symbols(setting, chosen)
     return Plan(
         step=step_function(run, before[0], varying),
@@ -102,8 +108,8 @@ def make_plan(
         finish=finish_function(run),
         steps=np.hstack([before[:, varying], after[:, varying], grid.h[:, None]]),
         times=grid.t[:-1],
-        stored=stored,
-        stored_coefficients=np.vstack([before, after[-1:]])[stored],
+        stored=np.searchsorted(grid.t, stored),
+        stored_coefficients=np.vstack([before, after[-1:]])[np.searchsorted(grid.t, stored)],
         start=start_of(run),
         unknowns=setting.actual.start[design.states :],
         spread=np.asarray(factor(ca.DM(setting.actual.variance)).full()),
@@ -117,4 +123,6 @@ def make_plan(
         pilot=pilot,
         pairs=pairs,
         paths=paths,
+        flown=setting.flown,
+        samples=sample_indices(setting.flown, grid),
     )

@@ -56,6 +56,10 @@ class Prediction:
         """Mean square of the error of the estimate, E where the truth is the design, (K, n, n)."""
         return self._about_nominal(np.hstack([-np.eye(self.size), np.eye(self.size)]))
 
+    def at(self, rows: Any) -> Prediction:
+        """The prediction at some of its times; the fastest rates stay those of all intervals."""
+        return Prediction(mean=self.mean[rows], covariance=self.covariance[rows], rates=self.rates)
+
     def _about_nominal(self, chosen: Array) -> Array:
         mean = self.mean @ chosen.T
         return np.asarray(chosen @ self.covariance @ chosen.T + mean[:, :, None] * mean[:, None, :])

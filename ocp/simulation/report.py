@@ -33,6 +33,8 @@ def summary(sample: MonteCarlo) -> str:
 def _head(sample: MonteCarlo) -> str:
     name = sample.name or "problem without a name"
     what = f"{sample.filter} filter" + (" and feedback" if sample.fed_back else ", no feedback (open-loop control)")
+    if sample.filter == "law":
+        what = f"a law stepped every {sample.period:.6g} s"
     lines = [f"{name}: {sample.runs} runs of the actual system, seed {sample.seed}, {what}"]
     if sample.truth:
         lines.append(f"truth: {sample.truth}")
@@ -53,6 +55,8 @@ def _head(sample: MonteCarlo) -> str:
 
 def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design: Array) -> str:
     """One row for each component; the design's own expectation where the truth is another system."""
+    if not entries:
+        return ""
     columns = [title, "predicted", "sample", "band", "ratio", "mean", "robust", ""]
     rows = []
     for i, entry in enumerate(entries):

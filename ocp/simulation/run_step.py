@@ -12,6 +12,9 @@ The perturbation filter estimates the deviation from the nominal with the gains 
     dy = (F y + G du + K (m - h - M y - h_u du)) dt,    du = sat(u - C y) - u.
 
 The extended filter estimates the state itself, linearised where it is, with a covariance of its own in each run.
+
+A law of the user takes the place of both: its control is held over the steps between its samples, while the actual
+measurement is integrated for its next one.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ import numpy as np
 from covocp.matrices import Array, half_length, pack_symbolic, unpack_symbolic
 from covocp.riccati import inverse, riccati_rate
 from covocp.simulation.actual import System
-from covocp.simulation.schedule import Coefficients, Filter, filter_gain
+from covocp.simulation.flown import Flown
+from covocp.simulation.schedule import Coefficients, Estimator, filter_gain
 from covocp.solution import Solution
 
 # A pivot of a factorisation counts as zero below this share of its diagonal entry.
@@ -54,14 +58,16 @@ class Setting:
     """What is simulated: the solution, both systems, the kind of filter, limits of the control, domain.
 
     domain: largest deviations, of the actual system and of the estimate, that count as inside, (n,).
+    flown: the law, where it is that of the user.
     """
 
     solution: Solution
     design: System
     actual: System
-    filter: Filter
+    filter: Estimator
     limits: Limits
     domain: Array
+    flown: Flown | None = None
 
     @property
     def costs(self) -> bool:
@@ -73,8 +79,9 @@ class Setting:
 class Run:
     """Symbols of one run, and where the parts of its state lie.
 
-    z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "cost", "asked" and "outside"
-    (flags). noisy: states with process noise; bounded: states, and fed-back controls, with bounds.
+    z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "measured" (what a law has
+    measured since its last step, an integral), "cost", "asked" and "outside" (flags), "held" (control of a law).
+    noisy: states with process noise; bounded: states, and fed-back controls, with bounds.
     """
 
     setting: Setting
@@ -108,9 +115,11 @@ def run_symbols(setting: Setting, coefficients: Coefficients) -> Run:
         "x": design.states,
         "estimate": design.size,
         "E": half_length(design.size) if setting.filter == "extended" else 0,
+        "measured": design.measured if setting.flown else 0,
         "cost": int(setting.costs),
         "asked": design.fed_back,
         "outside": sum(map(len, bounded)),
+        "held": design.fed_back if setting.flown else 0,
     }
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return Run(
@@ -140,6 +149,8 @@ def start_of(run: Run) -> Array:
     design, solution = run.setting.design, run.setting.solution
     z = np.zeros(run.z.shape[0])
     z[run.spans["x"]] = run.setting.actual.start[: design.states]
+    if run.setting.flown:
+        z[run.spans["held"]] = solution.controls[0, : design.fed_back]
     if run.setting.filter == "extended":
         z[run.spans["estimate"]] = design.start
         z[run.spans["E"]] = solution.trajectory.e[0][design.covariance]
@@ -171,10 +182,11 @@ def step_function(run: Run, constant: Array, varying: Any) -> ca.Function:
     half = z[moving] + h / 2 * first
     g = _noise(run, half, applied, sides, h) @ (ca.sqrt(h) * w)
     g = ca.vertcat(g, run.symbolic.zeros(first.shape[0] - g.shape[0]))
-    second, _, _ = _drift(run, z[moving] + h * first + g, sides[1])
+    second, _, _ = _drift(run, ca.vertcat(z[moving] + h * first + g, _rows(z, moving.stop)), sides[1])
     after = z[moving] + h / 2 * (first + second) + g
-    flags = ca.fmax(_rows(z, moving.stop), _flags(run, after, asked, applied))
-    outputs = [ca.densify(ca.vertcat(after, flags)), _moved(run, after, sides[1])]
+    end = run.spans["held"].start
+    flags = ca.fmax(_rows(z, moving.stop, end), _flags(run, after, asked, applied))
+    outputs = [ca.densify(ca.vertcat(after, flags, _rows(z, end))), _moved(run, after, sides[1])]
     options = {"cse": True} if run.symbolic is ca.SX else {}
     return ca.Function("step", [z, w, run.own, ca.vertcat(*symbols, h)], outputs, options)
 
@@ -243,7 +255,7 @@ def _rows(column: Any, first: int, last: int | None = None) -> Any:
 def _own_deviation(run: Run, z: Any, c: dict[str, Any]) -> Any:
     """The estimate of the deviation from the nominal, (n,)."""
     estimate = z[run.spans["estimate"]]
-    return estimate if run.setting.filter == "perturbation" else estimate - _nominal(run, c)
+    return estimate - _nominal(run, c) if run.setting.filter == "extended" else estimate
 
 
 def _nominal(run: Run, c: dict[str, Any]) -> Any:
@@ -259,7 +271,10 @@ def _moved(run: Run, z: Any, c: dict[str, Any]) -> Any:
 
 def _control(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any]:
     """The control that the feedback asks for, and the one that there is, both of the fed-back rows."""
-    asked = _rows(c["u"], 0, run.setting.design.fed_back) - c["C"] @ _own_deviation(run, z, c)
+    if run.setting.flown:
+        asked = _rows(z, run.spans["held"].start)
+    else:
+        asked = _rows(c["u"], 0, run.setting.design.fed_back) - c["C"] @ _own_deviation(run, z, c)
     limits, applied = run.setting.limits, []
     for i, (low, high) in enumerate(zip(limits.lower.tolist(), limits.upper.tolist(), strict=True)):
         value = ca.fmax(asked[i], low) if np.isfinite(low) else asked[i]
@@ -275,7 +290,9 @@ def _drift(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any, Any]:
     rate, _, _, _, h, _, _, _ = _linear(run, setting.actual, (x, run.own), u, c)
     moved = fed - _rows(c["u"], 0, design.fed_back)
     parts = [_rows(rate, 0, design.states)]
-    if setting.filter == "perturbation":
+    if setting.flown:
+        parts += [run.symbolic.zeros(design.size), h]
+    elif setting.filter == "perturbation":
         parts.append(c["drift"] @ z[run.spans["estimate"]] + c["input"] @ moved + c["K"] @ (h - c["h"]))
     else:
         parts += _extended(run, z, u, h, c)
@@ -313,6 +330,8 @@ def _noise(run: Run, z: Any, u: Any, sides: list[dict[str, Any]], h: Any) -> Any
         process[run.noisy, :] = factor(Q[run.noisy, run.noisy])
     if not design.measured:
         return ca.vertcat(process, run.symbolic(design.size, len(run.noisy)))
+    if setting.flown:
+        return ca.diagcat(process, ca.vertcat(run.symbolic(design.size, design.measured), factor(U)))
     if setting.filter == "perturbation":
         K = (sides[0]["K"] + sides[1]["K"]) / 2
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,15 @@ from covocp.matrices import Array
 from covocp.progress import Progress
 from covocp.simulation.actual import System, actual_system, design_system
 from covocp.simulation.batches import Batch, StoppedError
+from covocp.simulation.flown import flown_law, sample_indices
 from covocp.simulation.monte_carlo import MonteCarlo
 from covocp.simulation.plan import make_plan
 from covocp.simulation.prediction import Prediction, predict
+from covocp.simulation.request import Request, wrong_argument
 from covocp.simulation.run_step import Limits, Setting, bounded_rows
 from covocp.simulation.sampling import THREE_SIGMA, moments_of
-from covocp.simulation.schedule import Filter, Grid, base_grid, nominal_at, stored_indices
+from covocp.simulation.schedule import Filter, Grid, Nominal, base_grid, nominal_at, stored_times
 from covocp.simulation.step_choice import StepChoice, choose_step, given_step
-from covocp.simulation.vectorised import padded
 from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution import Solution
 from covocp.statement import Block, entry_names
@@ -33,7 +34,6 @@ from covocp.statement import Block, entry_names
 DOMAIN = 100.0
 # What stands for no such limit; a number, so that a comparison finds inf and NaN.
 UNLIMITED = 1e300
-FILTERS = ("perturbation", "extended")
 # Runs in a batch: wide enough that numpy's operations outweigh their calls, and tasks enough for some workers.
 LARGEST_BATCH, LARGEST_TASK = 2048, 512
 # How the message of a solution begins that `evaluate` made for a truth.
@@ -46,6 +46,8 @@ def simulate(
     seed: int,
     *,
     truth: Any = None,
+    law: Any = None,
+    period: float | None = None,
     executor: Any = None,
     filter: Filter = "perturbation",
     step: float | None = None,
@@ -71,9 +73,16 @@ def simulate(
         truth: what is simulated instead of the design's system: a problem with the same states, unknowns, controls and
             measurements and any dynamics, noises and variances; or a dict of parameter or unknown to the value that it
             has in every run. Filter and feedback stay those of the design.
+        law: what flies instead of the design's filter and feedback: an object with `step(measurement, time)` that
+            returns the controls fed back, such as a CPackage's `python()`. Each run has a copy of it, started by its
+            `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual measurement
+            over the period before (NaN at time zero); its control is held until the next step. Where it has an
+            `estimate` of the deviation from the nominal, its errors are reported too.
+        period: time between two steps of the law [s]; None: its own attribute `period`.
         executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
-        filter: "perturbation" (gains of the design, about the nominal) or "extended" (relinearised at the estimate).
+        filter: "perturbation" (gains of the design, about the nominal) or "extended" (relinearised at the estimate);
+            a law has its own.
         step: longest integration step [s]; None: halved until the terminal second moments change by less than a fifth
             of their sampling error.
         limits: what the actual control can do: None (no limits: the bounds of the problem are those of the nominal),
@@ -97,71 +106,31 @@ def simulate(
     size = (LARGEST_BATCH if executor is None else LARGEST_TASK) if batch is None else batch
     request = Request(runs=runs, seed=seed, store=store, paths=paths, batch=size, level=level, filter=filter, step=step)
     design = _design(solution)
+    flown = flown_law(law, period, design, solution.duration)
+    if flown is not None and filter != "perturbation":
+        raise wrong_argument("filter", "no filter= beside law=: the law has its own", filter)
     actual = actual_system(design, truth)
-    base = base_grid(solution, store, step)
+    base = base_grid(solution, store, step, None if flown is None else flown.times)
     expected = predict(solution, design, design, base)
     true = expected if truth is None else predict(solution, design, actual, base)
     setting = Setting(
         solution=solution,
         design=design,
         actual=actual,
-        filter=filter,
+        filter=filter if flown is None else "law",
         limits=_limits(design, limits),
         domain=_domain(expected),
+        flown=flown,
     )
+    t, intervals = stored_times(base, store, sample_indices(flown, base))
     with Progress(f"simulating {solution.name}", progress) as reporter:
         chosen = _step(setting, base, true, request, reporter)
-        plan = make_plan(setting, chosen.grid, base, store=store, seed=int(seed), paths=paths)
+        plan = make_plan(setting, chosen.grid, t, seed=int(seed), paths=paths)
         harvest = simulate_batches(plan, request.ranges, executor, lambda: reporter.stop, _reporting(reporter))
     _tell(harvest, runs)
-    return _result(setting, request, chosen, base, (expected, true), harvest, truth)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What the user asked for; checked on construction. See `simulate`."""
-
-    runs: int
-    seed: int
-    store: int
-    paths: int
-    batch: int
-    level: float
-    filter: Filter
-    step: float | None
-
-    def __post_init__(self) -> None:
-        """Refuse what means nothing."""
-        for name, least in (("runs", 2), ("seed", 0), ("store", 2), ("paths", 0), ("batch", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise _wrong(name, f"a whole number, {least} or more", value)
-        if self.filter not in FILTERS:
-            raise _wrong("filter", " or ".join(map(repr, FILTERS)), self.filter)
-        for name, value, most in (("step", self.step, np.inf), ("level", self.level, 1.0)):
-            number = 0.5 if value is None and name == "step" else value
-            if isinstance(number, bool) or not isinstance(number, (int, float, np.number)) or not 0 < number < most:
-                raise _wrong(
-                    name, "a number between 0 and 1" if name == "level" else "a number > 0 [s], or None", value
-                )
-
-    @property
-    def ranges(self) -> list[tuple[int, int]]:
-        """First run of each batch, and the one after its last."""
-        count = max(1, -(-self.runs // self.batch))
-        width = padded(-(-self.runs // count))  # all about equally large
-        return [(first, min(first + width, int(self.runs))) for first in range(0, int(self.runs), width)]
-
-
-def _wrong(name: str, expected: str, received: Any) -> ProblemError:
-    return ProblemError(
-        describe(
-            f"The argument '{name}' of simulate() is wrong.",
-            expected=expected,
-            received=repr(received)[:100],
-            remedy=f"correct {name}=",
-        )
-    )
+    at = np.searchsorted(base.t, t)
+    kept = tuple(prediction.at(at) for prediction in (expected, true))
+    return _result(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, truth)
 
 
 def _design(solution: Solution) -> System:
@@ -208,14 +177,14 @@ def _limits(design: System, limits: Any) -> Limits:
             block = blocks[name_of(key, design.statement.symbols, tuple(blocks))]
             least[block.span], most[block.span] = _pair(block, value)
     elif not isinstance(limits, str) or limits != "bounds":
-        raise _wrong("limits", "None, 'bounds', or a dict of control to (lower, upper)", limits)
+        raise wrong_argument("limits", "None, 'bounds', or a dict of control to (lower, upper)", limits)
     return Limits(lower=least, upper=most, least=least, most=most)
 
 
 def _pair(block: Block, value: Any) -> tuple[Array, Array]:
     """Lower and upper limits of a control."""
     if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise _wrong(f"limits of '{block.name}", "a pair (lower, upper)", value)
+        raise wrong_argument(f"limits of '{block.name}", "a pair (lower, upper)", value)
     low, high = (
         column(block.name, what, v, block.size, inf=True)
         for what, v in zip(("lower limit", "upper limit"), value, strict=True)
@@ -235,9 +204,9 @@ def _step(setting: Setting, base: Grid, true: Prediction, request: Request, repo
     if request.step is not None:
         return given_step(base, float(request.step))
     try:
-        chosen = choose_step(
-            setting, base, true.rates, runs=request.runs, seed=request.seed, stop=lambda: reporter.stop
-        )
+        # A law would take long to fly the pilot runs; the system moves as fast under the design's own filter.
+        pilot = replace(setting, filter="perturbation", flown=None) if setting.flown else setting
+        chosen = choose_step(pilot, base, true.rates, runs=request.runs, seed=request.seed, stop=lambda: reporter.stop)
     except StoppedError:
         raise KeyboardInterrupt from None  # nothing is simulated yet
     if not chosen.settled:
@@ -289,17 +258,14 @@ def _result(
     setting: Setting,
     request: Request,
     chosen: StepChoice,
-    base: Grid,
-    predictions: tuple[Prediction, Prediction],
+    nominal: Nominal,
+    predictions: tuple[Prediction, ...],
     harvest: Harvest,
     truth: Any,
 ) -> MonteCarlo:
     """The batches put together."""
     design, solution, (expected, true) = setting.design, setting.solution, predictions
-    at = stored_indices(base, request.store)
-    intervals = base.interval[np.minimum(at, base.steps - 1)]
-    nominal = nominal_at(solution, base.t[at], intervals)
-    unknowns = np.tile(design.start[design.states :], (at.size, 1))
+    unknowns = np.tile(design.start[design.states :], (nominal.t.size, 1))
     limits, m = setting.limits, design.fed_back
     costs = _predicted_costs(solution, truth) if setting.costs else (np.nan, np.nan)
 
@@ -308,19 +274,21 @@ def _result(
         name=solution.name,
         requested=int(request.runs),
         seed=int(request.seed),
-        filter=request.filter,
+        filter=setting.filter,
+        period=np.nan if setting.flown is None else setting.flown.period,
+        estimated=setting.flown is None or setting.flown.estimates,
         fed_back=m > 0,
         truth=_in_words(truth),
         level=float(request.level),
         step=chosen,
-        t=base.t[at],
+        t=nominal.t,
         nominal=np.hstack([nominal.x[:, : design.states], unknowns]),
         nominal_control=nominal.u[:, :m],
-        predicted=true.deviation[at],
-        predicted_error=true.error[at],
-        predicted_mean=true.mean[at, : design.size],
-        design=expected.deviation[at],
-        design_error=expected.error[at],
+        predicted=true.deviation,
+        predicted_error=true.error,
+        predicted_mean=true.mean[:, : design.size],
+        design=expected.deviation,
+        design_error=expected.error,
         design_cost=costs[0],
         predicted_cost=costs[1],
         domain=setting.domain,

@@ -18,6 +18,7 @@ from covocp.simulation.actual import System
 from covocp.solution import Solution
 
 Filter = Literal["perturbation", "extended"]
+Estimator = Filter | Literal["law"]
 
 # A division is rounded up unless it is whole to this accuracy: 5 s into steps of 0.25 s are 20, not 21.
 WHOLE = 1e-9
@@ -56,19 +57,32 @@ class Grid:
         return np.maximum(1, np.ceil(self.h / length - WHOLE)).astype(int)
 
 
-def base_grid(solution: Solution, points: int, step: float | None = None) -> Grid:
-    """The intervals of the mesh, divided so that some points are about equally spread; no finer than a given step."""
-    mesh = Grid(t=solution.t, interval=np.arange(solution.mesh.intervals))
+def base_grid(solution: Solution, points: int, step: float | None = None, samples: Array | None = None) -> Grid:
+    """The intervals of the mesh, divided so that some points are about equally spread; no finer than a given step.
+
+    No interval contains one of the samples.
+    """
+    nodes = t = solution.t
+    if samples is not None:
+        new = np.abs(samples[:, None] - nodes).min(axis=1) > WHOLE * solution.duration
+        t = np.sort(np.concatenate([nodes, samples[new]]))
+    mesh = Grid(t=t, interval=np.searchsorted(nodes, t[:-1], side="right") - 1)
     parts = mesh.parts(solution.duration / max(1, points - 1))
     return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 
 
-def stored_indices(grid: Grid, points: int) -> Any:
-    """The grid's nearest times to `points` equally spread ones; the first and the last among them."""
-    wanted = np.linspace(grid.t[0], grid.t[-1], points)
-    after = np.clip(np.searchsorted(grid.t, wanted), 1, grid.steps)
-    nearer = wanted - grid.t[after - 1] < grid.t[after] - wanted
-    return np.unique(after - nearer)
+def stored_times(grid: Grid, points: int, samples: Any) -> tuple[Array, Any]:
+    """The grid's nearest times to `points` equally spread ones, and the intervals of the mesh that begin there.
+
+    The first and the last are among them; where there are samples (indices of the grid), only these else.
+    """
+    among = np.arange(grid.steps + 1) if not samples.size else np.union1d(samples, [0, grid.steps])
+    t = grid.t[among]
+    wanted = np.linspace(t[0], t[-1], points)
+    after = np.clip(np.searchsorted(t, wanted), 1, t.size - 1)
+    nearer = wanted - t[after - 1] < t[after] - wanted
+    at = among[np.unique(after - nearer)]
+    return grid.t[at], grid.interval[np.minimum(at, grid.steps - 1)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,8 +151,8 @@ class Coefficients:
         }
 
 
-def coefficients(design: System, kind: Filter) -> Coefficients:
-    """What filter and feedback of a design use, for a kind of filter."""
+def coefficients(design: System, kind: Estimator) -> Coefficients:
+    """What filter and feedback of a design use, for a kind of filter; a law of its own uses nothing of them."""
     st, n, m = design.statement, design.size, design.fed_back
     symbolic: Any = st.symbolic
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
@@ -148,7 +162,7 @@ def coefficients(design: System, kind: Filter) -> Coefficients:
         "t": t,
         "x": x,
         "u": u,
-        "C": symbolic.zeros(0, n) if loop is None else loop.gain(*a),
+        "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
     }
     if kind == "perturbation":

@@ -94,7 +94,7 @@ def choose_step(
     for _ in range(PAIRS):
         coarse, fine = (
             run_batch(
-                make_plan(setting, base.divided(p), base, store=2, seed=seed, pilot=True, pairs=p is parts),
+                make_plan(setting, base.divided(p), base.t[[0, -1]], seed=seed, pilot=True, pairs=p is parts),
                 0,
                 count,
                 stop,

@@ -52,6 +52,7 @@ class Verdict:
     left: share of the runs that left the domain. unstable: share that did, or ended more than `UNSTABLE` predicted
     deviations away. asked: share that asked for more control than there is. holds: whether the prediction is inside the
     band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain.
+    law: whether a law of the user's flew.
     """
 
     deviations: tuple[Entry, ...]
@@ -62,6 +63,7 @@ class Verdict:
     most_asking: float
     fed_back: bool
     limited: bool
+    law: bool = False
 
     @property
     def decisive(self) -> tuple[Entry, ...]:
@@ -80,7 +82,7 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it does not hold: of "unstable", "saturated"; "nonlinear" where it is neither; () where it holds."""
+        """Why it does not hold: of "unstable", "saturated"; where neither, "law" or "nonlinear"; () where it holds."""
         if self.holds:
             return ()
         found = []
@@ -88,7 +90,7 @@ class Verdict:
             found.append("unstable")
         if self.asked >= NOTICEABLE:
             found.append("saturated")
-        return tuple(found) or ("nonlinear",)
+        return tuple(found) or ("law" if self.law else "nonlinear",)
 
     @property
     def headline(self) -> str:
@@ -120,6 +122,11 @@ class Verdict:
             most = f", {_percent(self.most_asking)} at one instant" if self.most_asking else ""
             cut = "" if self.limited else " (which they were given)"
             return f"{_percent(self.asked)} of the runs ask for more control than there is{most}{cut}"
+        if reason == "law":
+            return (
+                "no run is unstable or short of control, so this law is not the filter and feedback of the design, is "
+                "stepped too rarely, or the system is too nonlinear for this spread"
+            )
         return "no run is unstable or short of control, so the system is too nonlinear for this spread"
 
 
@@ -133,13 +140,16 @@ def judge(sample: MonteCarlo) -> Verdict:
     unstable = (distance & (predicted[:states] > 0)).any(axis=1) | ~stayed
     return Verdict(
         deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
-        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level),
+        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level)
+        if sample.estimated
+        else (),
         left=sample.left_share,
         unstable=float(unstable.mean()),
         asked=sample.asked_share,
         most_asking=float(sample.asking.max(initial=0.0)),
         fed_back=sample.fed_back,
         limited=sample.limited,
+        law=sample.filter == "law",
     )
 
 
