@@ -104,15 +104,15 @@ class Library:
 
     def started(self, law: Law) -> Array:
         """Fields of a controller's struct after init, stacked."""
-        struct = self._struct(law)()
+        struct, views = self._struct(law)
         init = getattr(self._library, f"{self._package}_init")
         init.restype = None
         init(ctypes.byref(struct))
-        return np.concatenate([_fields(struct, port) for port in law.outputs])
+        return np.concatenate([views[port.name] for port in law.outputs]).astype(float)
 
     def _with_struct(self, law: Law) -> Backend:
         """A C function that fills or keeps a struct."""
-        struct = self._struct(law)()
+        struct, views = self._struct(law)
         function = getattr(self._library, f"{self._package}_{law.name}")
         function.restype = ctypes.c_int
         inputs = self._buffer(stacked_size(law.inputs))
@@ -120,23 +120,19 @@ class Library:
         real = self._real
         sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
         pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
-        kept = [(law.held[p.name], span(law.inputs, p.name)) for p in law.inputs if p.name in law.held]
+        kept = [(views[law.held[p.name]], span(law.inputs, p.name)) for p in law.inputs if p.name in law.held]
+        fields = [views[port.name] for port in law.results]
         controls = [port for port in law.outputs if port.name == "control"] if law.kind == "controller" else []
         control = [self._buffer(port.size) for port in controls]
 
         def call(row: Array) -> tuple[Array, int]:
             given[: row.size] = row
-            for name, place in kept:
-                values = row[place]
-                field = getattr(struct, name)
-                if isinstance(field, ctypes.Array):
-                    field[:] = values.tolist()
-                else:
-                    setattr(struct, name, int(values[0]) if name in WHOLE else float(values[0]))
+            for view, place in kept:
+                view[:] = row[place]
             arguments = [real(given[o]) if p is None else p for (_, o), p in zip(sources, pointers, strict=True)]
             own = ctypes.byref(struct)
             status = function(*([own, *arguments, *control] if law.kind == "controller" else [*arguments, own]))
-            return np.concatenate([_fields(struct, port) for port in law.results]), int(status)
+            return np.concatenate(fields).astype(float), int(status)
 
         return call
 
@@ -150,8 +146,8 @@ class Library:
         size = ctypes.c_int.in_dll(self._library, f"{self._package}_workspace_bytes").value
         return (ctypes.c_double * (size // ctypes.sizeof(ctypes.c_double) + 1))()
 
-    def _struct(self, law: Law) -> Any:
-        """The struct of a law as ctypes has it."""
+    def _struct(self, law: Law) -> tuple[Any, dict[str, Any]]:
+        """A struct of a law as ctypes has it, and its fields as flat arrays in the same memory."""
 
         def kind(port: Port) -> Any:
             if port.name in WHOLE:
@@ -161,12 +157,10 @@ class Library:
             return self._real * port.rows if port.columns == 1 else (self._real * port.columns) * port.rows
 
         fields = [(port.name, kind(port)) for port in law.outputs]
-        return type(struct_name(self._package, law), (ctypes.Structure,), {"_fields_": fields})
-
-
-def _fields(struct: Any, port: Port) -> Array:
-    """A field of a struct, flat."""
-    return np.array(getattr(struct, port.name), dtype=float).ravel()
+        made: Any = type(struct_name(self._package, law), (ctypes.Structure,), {"_fields_": fields})
+        struct = made()
+        memory = np.frombuffer(struct, dtype=np.dtype(made))
+        return struct, {port.name: memory[port.name].reshape(-1) for port in law.outputs}
 
 
 class Call:
@@ -264,6 +258,10 @@ class Controller(Call):
     def __init__(self, law: Law, library: Library | None) -> None:
         """Start it."""
         super().__init__(law, library)
+        self._size = stacked_size(law.inputs)
+        self._places = {port.name: span(law.inputs, port.name) for port in law.inputs}
+        self._kept = [(self._places[name], span(law.outputs, field)) for name, field in law.held.items()]
+        self._control, self._estimate = (span(law.outputs, name) for name in ("control", "estimate"))
         self.init()
 
     def init(self) -> None:
@@ -279,7 +277,7 @@ class Controller(Call):
     @property
     def estimate(self) -> Array:
         """Its estimate of the deviation from the nominal, (n,)."""
-        return np.asarray(self._values[span(self.law.outputs, "estimate")])
+        return np.asarray(self._values[self._estimate])
 
     @property
     def state(self) -> dict[str, Any]:
@@ -297,17 +295,15 @@ class Controller(Call):
         Returns:
             The control, shape (m,), to be held until the next step.
         """
-        row = np.zeros(stacked_size(self.law.inputs))
-        for port in self.law.inputs:
-            place = span(self.law.inputs, port.name)
-            if port.name in self.law.held:
-                row[place] = self._values[span(self.law.outputs, self.law.held[port.name])]
-        row[span(self.law.inputs, "measurement")] = np.asarray(measurement, dtype=float).ravel()
-        row[span(self.law.inputs, "time")] = time
+        row = np.zeros(self._size)
+        for place, field in self._kept:
+            row[place] = self._values[field]
+        row[self._places["measurement"]] = np.asarray(measurement, dtype=float).ravel()
+        row[self._places["time"]] = time
         results, status = self._backend(row)
         self._values = np.append(results, status)
         self.status = NAMES[status]
-        return results[span(self.law.results, "control")]
+        return results[self._control]
 
     def __call__(self, measurement: Any, time: float) -> Array:
         """The same as `step`."""
