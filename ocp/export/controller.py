@@ -118,7 +118,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
         "nominal_state": "the nominal at that time",
         "nominal_control": "the nominal at that time",
         "feedback_gain": "C",
-        "filter_gain": "L, of the last correction",
+        "filter_gain": "L of the last step; zero where no correction was made or a row of the measurement left out",
         "index": "of the last sample",
         "status": "of the last step",
     }

@@ -21,7 +21,7 @@ Points = Callable[[np.random.Generator, int], Array]
 # What the C functions return, in the order of their numbers.
 STATUSES = {
     "OK": "as asked for",
-    "MEASUREMENT_MISSING": "a measurement was not finite and was left out",
+    "MEASUREMENT_MISSING": "a row of the measurement was not finite and was left out",
     "TIME_BEFORE": "the time is before the start: values of the start",
     "TIME_AFTER": "the time is after the end: values of the end",
     "TIME_BACKWARDS": "the time is before that of the last step: nominal control, the estimate stays",

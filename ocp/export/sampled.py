@@ -7,6 +7,10 @@ For the samples t_k = k period, with y the estimate of the deviation and w the c
 
 Phi, Gamma, g by the two-stage Gauss method between the nodes of the mesh. L_k = P- M' (M P- M' + U/period)^-1 is the
 gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period.
+
+Of a measurement whose rows p are there the gain is P- M_p' (M_p P- M_p' + U_pp/period)^-1, P- of the full filter. As
+P- M' = L S with S = M P- M' + U/period, that is L S_.p S_pp^-1: the residuals that are missing are expected from the
+others. Only S has to be known, and only a system of the size of the measurement is solved, where a row is missing.
 """
 
 from __future__ import annotations
@@ -18,12 +22,12 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ExportError, describe
-from covocp.export.controller import STATUSES, field_ports, first_fields, points
+from covocp.export.controller import SCALAR_SIZE, STATUSES, field_ports, first_fields, points, solved
 from covocp.export.design import Design, clipped
 from covocp.export.history import History
-from covocp.export.laws import LARGEST, Law, Port, flat, shaped, span, status_of
+from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
 from covocp.integrators import GAUSS_NODES
-from covocp.matrices import Array
+from covocp.matrices import Array, pack, unpack_symbolic
 
 # A duration that is a whole number of periods to this accuracy ends with a sample.
 WHOLE = 1e-9
@@ -36,7 +40,8 @@ ABOUT = (
     "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
     "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
     "period; the control is u - C y, limited.",
-    "A measurement of which a row is not finite is left out. At time zero the control is that of the nominal.",
+    "A row of the measurement that is not finite is left out: L is then P- M' (M P- M' + U/period)^-1 of the other "
+    "rows, P- that of the filter with all of them. At time zero the control is that of the nominal.",
 )
 
 
@@ -56,13 +61,13 @@ class Samples:
         return int(self.parts["u"].shape[0]) - 1
 
     def at(self, k: Any) -> dict[str, Any]:
-        """The matrices of a sample, MX expressions."""
-        flat_rows = np.hstack([part.reshape(part.shape[0], -1) for part in self.parts.values()])
+        """The matrices of a sample, MX expressions; flat by columns as CasADi has them, so that none is turned."""
+        flat_rows = np.hstack([part.transpose(0, 2, 1).reshape(part.shape[0], -1) for part in self.parts.values()])
         column = ca.MX(ca.DM(flat_rows.T))[:, k]
         result, offset = {}, 0
         for name, part in self.parts.items():
             rows, columns = part.shape[1:]
-            result[name] = shaped(column[offset : offset + rows * columns], rows, columns)
+            result[name] = ca.reshape(column[offset : offset + rows * columns], rows, columns)
             offset += rows * columns
         return result
 
@@ -81,17 +86,18 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
     index = ca.if_else(valid, last + ahead, wanted)
     more = ca.if_else(ahead, wanted > index, 0.0)
     at = samples.at(index)
-    present = ca.sum1(ca.fabs(measured) <= LARGEST) >= r
+    present = ca.fabs(measured) <= LARGEST
+    missing = ca.sum1(present) < r
     before = ca.if_else(ahead, at["Phi"] @ y + at["Gamma"] @ held + at["g"], y)
     residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
-    used = ca.if_else(ahead, ca.if_else(more, 0.0, present), 0.0)
-    corrected = before + at["L"] @ ca.if_else(used, residual, 0.0)
+    L = _gain_of_rows(at, present, missing) * ca.logic_and(ahead, ca.logic_not(more))
+    corrected = before + L @ ca.if_else(present, residual, 0.0)
     good = ca.sum1(ca.fabs(corrected)) <= LARGEST  # false for NaN, which mmax leaves out
     estimate = ca.if_else(good, corrected, y)
     moved = at["u"] - at["C"] @ ca.if_else(ca.if_else(good, valid, 0.0), estimate, 0.0)
     conditions = [
         *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
-        (ca.logic_not(present), "MEASUREMENT_MISSING"),
+        (missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
     kept = ca.if_else(valid, index, last)
     fields = {
@@ -102,7 +108,7 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
         "nominal_state": at["x"],
         "nominal_control": at["u"],
         "feedback_gain": at["C"],
-        "filter_gain": at["L"],
+        "filter_gain": L,
         "status": ca.if_else(more, CONTINUE, status_of(conditions)),
     }
     core = ca.Function("step", [y, last, held, measured, time], [flat(v) for v in fields.values()])
@@ -120,6 +126,28 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
         points=lambda random, count: _points(design, tables, samples, random, count),
         tolerance=tolerance,
     )
+
+
+def _gain_of_rows(at: dict[str, Any], present: Any, missing: Any) -> Any:
+    """L of the rows that are there, the columns of the others zero; a system is solved only where some are missing."""
+    n, r = at["L"].shape
+    if r == 1:
+        return at["L"] * present
+    kind: Any = ca.SX if r <= SCALAR_SIZE else ca.MX
+    L, spread, rows = kind.sym("L", n, r), kind.sym("spread", at["spread"].shape[0]), kind.sym("present", r)
+    packed = unpack_symbolic(spread, r)
+    units = ca.diag(packed)
+    correlation = packed - ca.diag(units) + ca.DM.eye(r)
+    kept = ca.diag(rows)
+    among = kept @ correlation @ kept + ca.diag(1 - rows)
+    # S_.p S_pp^-1 in units of the standard deviations of the residuals
+    completed = solved(among, kept @ correlation).T @ kept
+    masked = (L @ ca.diag(units)) @ completed @ ca.diag(1.0 / units)
+    arguments = [L, spread, rows]
+    some = ca.Function("some", arguments, [ca.densify(masked)])
+    every = ca.Function("every", arguments, [L])
+    chosen: Any = ca.Function.if_else("gain", some, every)
+    return chosen(missing, at["L"], at["spread"], present)
 
 
 def discretised(design: Design, tables: History, period: float) -> Samples:
@@ -149,16 +177,29 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     moves = _Moves.of(design, tables, t)
     n, m, r = design.sizes
     Phi, Gamma, g = np.zeros((count + 1, n, n)), np.zeros((count + 1, n, m)), np.zeros((count + 1, n, 1))
-    Phi[0], P, gains = np.eye(n), E0, [np.zeros((n, r))]
+    Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
     for k in range(1, count + 1):
         Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
-        gain = np.linalg.solve(M[k] @ P @ M[k].T + U[k] / period, M[k] @ P).T
+        spreads.append(M[k] @ P @ M[k].T + U[k] / period)
+        gain = np.linalg.solve(spreads[k], M[k] @ P).T
         rest = np.eye(n) - gain @ M[k]
         P = rest @ P @ rest.T + gain @ (U[k] / period) @ gain.T
         P = 0.5 * (P + P.T)
         gains.append(gain)
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
-    return Samples(parts=parts | {"g": g, "L": np.array(gains)}, period=period)
+    parts |= {"g": g, "L": np.array(gains)}
+    if r > 1:
+        parts["spread"] = _correlations(np.array(spreads))[:, :, None]
+    return Samples(parts=parts, period=period)
+
+
+def _correlations(spreads: Array) -> Array:
+    """Covariances as half-vectors of their correlations, standard deviations on the diagonal: floats hold them too."""
+    units = np.sqrt(np.diagonal(spreads, axis1=1, axis2=2))
+    correlations = spreads / (units[:, :, None] * units[:, None, :])
+    rows = np.arange(spreads.shape[1])
+    correlations[:, rows, rows] = units
+    return pack(correlations)
 
 
 def _nominal(tables: History, t: Array) -> tuple[Array, Array, Array]:
