@@ -21,7 +21,7 @@ problem, unregularised = mars_entry.problem(), mars_entry.problem(regularization
 designs = {
     "constant lift-to-drag ratio": co.evaluate(problem, nominal=mars_entry.reference()),
     "regularised optimum": co.solve(problem),
-    "bang-bang optimum": co.solve(unregularised),  # one of many
+    "bang-bang optimum": co.solve(unregularised, intervals=183, guess={"lift_to_drag": mars_entry.bang_bang}),
 }
 for name, design in designs.items():
     runs = co.simulate(design, runs=1000, seed=1, step=0.3)
