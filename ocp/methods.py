@@ -195,10 +195,10 @@ class Solver:
                 warnings.simplefilter("ignore", CovocpWarning)  # they concern another solution
                 given = values[: self.statement.np]
                 classical = self._classical._solve_values(given)
-        except CovocpError:  # no deterministic cost, or no solution of it: there is nothing to compare with
-            return solution
+        except CovocpError as error:  # no deterministic cost: there is nothing to compare with
+            return _noted(solution, classical_missing=str(error).partition("\n")[0])
         if classical is None:
-            return solution
+            return _noted(solution, classical_missing="The problem without noise was not solved.")
         if solution.cost > classical + (WORSE + solution.mesh_error) * abs(classical):
             warnings.warn(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
@@ -206,7 +206,7 @@ class Solver:
                 CovocpWarning,
                 stacklevel=3,
             )
-        return replace(solution, stats={**solution.stats, "classical_cost": classical})
+        return _noted(solution, classical_cost=classical)
 
     def _solve_values(self, values: Array) -> float | None:
         """Cost of the classical design for stacked parameters; None where it was not found."""
@@ -322,6 +322,10 @@ class Solver:
 
 def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
     return replace(outcome, stats={**outcome.stats, **stats})
+
+
+def _noted(solution: Solution, **stats: Any) -> Solution:
+    return replace(solution, stats={**solution.stats, **stats})
 
 
 def solve(

@@ -140,6 +140,9 @@ def _costs(solution: Solution) -> str:
     if classical and solution.optimised:
         gain = 1.0 - solution.cost / classical
         words.append(f"classical design: {number(classical)}, of which {100 * gain:.3g} % are gained")
+    missing = solution.stats.get("classical_missing")
+    if missing:
+        words.append(wrapped(f"There is no classical design to compare with: {missing}", ""))
     return "\n".join([text, *words])
 
 
