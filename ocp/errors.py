@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from covocp.solution import Solution
+
+PACKAGE = __name__.partition(".")[0]
 
 
 class CovocpError(Exception):
@@ -42,6 +46,18 @@ class ExportError(CovocpError, RuntimeError):
 
 class CovocpWarning(UserWarning):
     """The result is usable, but the user should know something about it (mesh too coarse, saddle point left)."""
+
+
+def warn_user(message: str) -> None:
+    """Give a `CovocpWarning` that names the line of the user's own code from which the toolbox was called.
+
+    Args:
+        message: what the user should know.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, CovocpWarning, stacklevel=level)
 
 
 def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.checks import check_kind
 from covocp.densities import impossible_density
-from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe
+from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe, warn_user
 from covocp.evaluate import evaluate_controls, evaluation_mesh
 from covocp.expected import deterministic
 from covocp.extremal import Guess, Outcome, Prepared
@@ -200,11 +200,9 @@ class Solver:
         if classical is None:
             return _noted(solution, classical_missing="The problem without noise was not solved.")
         if solution.cost > classical + (WORSE + solution.mesh_error) * abs(classical):
-            warnings.warn(
+            warn_user(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
-                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic').",
-                CovocpWarning,
-                stacklevel=3,
+                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
             )
         return _noted(solution, classical_cost=classical)
 
@@ -273,10 +271,8 @@ class Solver:
         ]
         if not better:
             return outcome
-        warnings.warn(
-            "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction.",
-            CovocpWarning,
-            stacklevel=4,
+        warn_user(
+            "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
         return _with_stats(min(better, key=lambda c: sum(c.cost_terms.values())), left_saddle=True)
 
@@ -289,7 +285,7 @@ class Solver:
         if not outcome.converged:
             if interrupted:
                 message = "Interrupted: this is the last iterate, not a solution."
-                warnings.warn(message, CovocpWarning, stacklevel=3)
+                warn_user(message)
             if allow_failure or interrupted:
                 return solution
             lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
@@ -303,19 +299,15 @@ class Solver:
             )
         error = solution.mesh_error
         if not error <= COARSE_MESH:
-            warnings.warn(
+            warn_user(
                 f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative). "
-                "Use more intervals or substeps.",
-                CovocpWarning,
-                stacklevel=3,
+                "Use more intervals or substeps."
             )
         smallest = solution.smallest_eigenvalue
         if smallest < 0 and not solution.semidefinite:
-            warnings.warn(
+            warn_user(
                 f"A covariance is indefinite (smallest eigenvalue {smallest:.3g}); use covariance_step='gauss' or "
-                "more intervals.",
-                CovocpWarning,
-                stacklevel=3,
+                "more intervals."
             )
         return solution
 

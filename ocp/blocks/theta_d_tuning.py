@@ -5,7 +5,6 @@ Everything here is about a regulator (A0, A, B, Q, R); for a filter give the dua
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +17,7 @@ from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
 from covocp.blocks.factorisation import as_states, dependence
-from covocp.errors import CovocpWarning, ProblemError, describe
+from covocp.errors import ProblemError, describe, warn_user
 
 Array = NDArray[np.float64]
 
@@ -136,12 +135,10 @@ def convergence(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any, states: Any, *,
     if warn and not result.converges:
         worst = int(np.argmin(radii))
         at = "(" + ", ".join(f"{value:.6g}" for value in tried[worst]) + ")"
-        warnings.warn(
+        warn_user(
             f"The θ-D series does not converge at {np.sum(radii <= 1.0)} of {len(radii)} states; at x = {at} it does "
             f"up to {radii[worst]:.3g} A(x). With k = 0 more terms make the law worse there: take k_n > 0 (choose), or "
-            "put more of f into A0.",
-            CovocpWarning,
-            stacklevel=2,
+            "put more of f into A0."
         )
     return result
 

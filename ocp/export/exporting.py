@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from covocp.errors import CovocpWarning, ExportError, describe
+from covocp.errors import ExportError, describe, warn_user
 from covocp.export.building import Sources
 from covocp.export.casadi_code import Generated, Sizes, generate
 from covocp.export.controller import controller_law
@@ -158,9 +157,7 @@ def _solution(
 ) -> Content:
     """The histories of a solution, and its controller where it has feedback."""
     if not solution.converged:
-        warnings.warn(
-            f"The solution that is exported did not converge: {solution.message}.", CovocpWarning, stacklevel=3
-        )
+        warn_user(f"The solution that is exported did not converge: {solution.message}.")
     tables = history(solution, precision)
     laws = [sample_law(solution, tables, tolerance)]
     if solution.loop is not None and feedback:

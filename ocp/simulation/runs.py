@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from covocp.checks import check_bounds, column
-from covocp.errors import CovocpWarning, ProblemError, SolveError, describe
+from covocp.errors import ProblemError, SolveError, describe, warn_user
 from covocp.evaluate import evaluate
 from covocp.lookup import name_of
 from covocp.matrices import Array
@@ -155,11 +154,9 @@ def _design(solution: Solution) -> System:
         )
     design = design_system(solution)
     if not solution.converged:
-        warnings.warn(
+        warn_user(
             f"The solution that is simulated did not converge ({solution.message}): its nominal, filter and feedback "
-            "may mean nothing.",
-            CovocpWarning,
-            stacklevel=3,
+            "may mean nothing."
         )
     return design
 
@@ -210,10 +207,8 @@ def _step(setting: Setting, base: Grid, true: Prediction, request: Request, repo
     except StoppedError:
         raise KeyboardInterrupt from None  # nothing is simulated yet
     if not chosen.settled:
-        warnings.warn(
-            f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. Give step=, smaller.",
-            CovocpWarning,
-            stacklevel=3,
+        warn_user(
+            f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. Give step=, smaller."
         )
     return chosen
 
@@ -245,13 +240,13 @@ def _tell(harvest: Harvest, runs: int) -> None:
         if not done:
             raise KeyboardInterrupt
         message = f"Interrupted: {done} of {runs} runs were simulated."
-        warnings.warn(message, CovocpWarning, stacklevel=3)
+        warn_user(message)
     if not harvest.failures:
         return
     listed = "".join(f"\n  {failure}" for failure in harvest.failures[:10])
     if not done:
         raise SolveError(f"No run was simulated: every task failed.{listed}")
-    warnings.warn(f"{done} of {runs} runs were simulated; the others failed:{listed}", CovocpWarning, stacklevel=3)
+    warn_user(f"{done} of {runs} runs were simulated; the others failed:{listed}")
 
 
 def _result(

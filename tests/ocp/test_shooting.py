@@ -144,10 +144,11 @@ def test_chain(masses, options):
 
 
 def test_coarse_mesh_warns():
-    with pytest.warns(co.CovocpWarning, match="mesh is too coarse"):
-        solution = solve(damped_oscillator.problem(), intervals=20)
+    with pytest.warns(co.CovocpWarning, match="mesh is too coarse") as caught:
+        solution = co.solve(damped_oscillator.problem(), intervals=20, progress=False)
     assert solution.mesh_error > 1e-3
     assert abs(solution.cost / 863.839329 - 1) > 1e-3  # and it is
+    assert caught[0].filename == __file__  # the line of the user, not one of the toolbox
 
 
 # --- constraints ------------------------------------------------------------------------------------------------------
