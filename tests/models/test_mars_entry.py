@@ -11,6 +11,7 @@ import closed_loops
 import numpy as np
 import pytest
 from closed_loops import closed_loop, mars, mars_in_density, piecewise_linear
+from refusals import refused
 from scipy.integrate import cumulative_simpson, solve_ivp
 
 import covocp as co
@@ -316,10 +317,7 @@ def test_truth_differs_in_the_atmosphere_only():
     ],
 )
 def test_bad_input_is_refused(call, named):
-    with pytest.raises(co.ProblemError, match=named) as caught:
-        call()
-    for part in ("expected:", "received:", "remedy:"):
-        assert part in str(caught.value)
+    refused(call, named)
 
 
 def test_a_control_without_weight_is_refused():

@@ -9,6 +9,7 @@ import closed_loops
 import numpy as np
 import pytest
 from problems import lag, solve
+from refusals import refused
 
 import covocp as co
 from covocp.models import noisy_integrator, unknown_lag
@@ -25,14 +26,6 @@ def combined():
 @cache
 def classical():
     return solve(unknown_lag.steering(), grid=GRADED, nominal="deterministic")
-
-
-def refused(call, *parts):
-    """The message has its four parts, and says these things."""
-    with pytest.raises(co.ProblemError) as caught:
-        call()
-    for part in ("expected:", "received:", "remedy:", *parts):
-        assert part in str(caught.value), str(caught.value)
 
 
 # --- values of the specification --------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import covocp as co
 
@@ -28,16 +29,6 @@ class Declared:
 
 
 FOREIGN = co.Problem(duration=1.0).parameter("foreign", 1.0)
-
-
-def refused(call, *parts):
-    """The message has its four parts, and says these things."""
-    with pytest.raises(co.ProblemError) as caught:
-        call()
-    message = str(caught.value)
-    for part in ("expected:", "received:", "remedy:", *parts):
-        assert part in message, message
-    return message
 
 
 def no_control():

@@ -9,6 +9,7 @@ import nonlinear_loop as loop
 import numpy as np
 import pytest
 from problems import lag, solve
+from refusals import refused
 
 import covocp as co
 from covocp.models import mars_entry, unknown_lag
@@ -186,10 +187,7 @@ def without_deterministic_cost():
     ],
 )
 def test_bad_input(call, parts):
-    with pytest.raises(co.ProblemError) as caught:
-        call()
-    for part in ("expected:", "received:", "remedy:", *parts):
-        assert part in str(caught.value), str(caught.value)
+    refused(call, *parts)
 
 
 def test_without_a_deterministic_cost_a_nominal_is_given():

@@ -1,0 +1,187 @@
+"""What `solve` is given beside the statement: options, grids, guesses and parameters that it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+from problems import solve
+from refusals import empty, lag, uncertain, wrong
+
+import covocp as co
+
+# --- options ----------------------------------------------------------------------------------------------------------
+
+
+@wrong("no option 'interval'", "intervals", "interval=3")
+def test_unknown_option():
+    solve(lag()[0], interval=3)
+
+
+@wrong("no such method", "'ipopt'", "'ipop'")
+def test_unknown_method():
+    solve(lag()[0], method="ipop")
+
+
+@wrong("'control'", "'linear', 'constant'", "'quadratic'")
+def test_unknown_control():
+    solve(lag()[0], control="quadratic")
+
+
+@wrong("'covariances'", "'eliminated'", "'elim'")
+def test_unknown_formulation():
+    solve(lag()[0], covariances="elim")
+
+
+@wrong("'covariance_step'", "'gauss'", "'euler'")
+def test_unknown_step():
+    solve(lag()[0], covariance_step="euler")
+
+
+@wrong("'hessian'", "'exact'", "'bfgs'")
+def test_unknown_hessian():
+    solve(lag()[0], hessian="bfgs")
+
+
+@wrong("plugin", "'ipopt'", "'nosuch'")
+def test_unknown_plugin():
+    solve(lag()[0], plugin="nosuch")
+
+
+@wrong("'tolerance'", "-1")
+def test_negative_tolerance():
+    solve(lag()[0], tolerance=-1)
+
+
+@wrong("'max_iterations'", "-1")
+def test_negative_number_of_iterations():
+    solve(lag()[0], max_iterations=-1)
+
+
+@wrong("'intervals'", "positive whole number", "10.5")
+def test_half_an_interval():
+    solve(lag()[0], intervals=10.5)
+
+
+@wrong("'segments'", "positive whole number", "0")
+def test_no_segment():
+    solve(lag()[0], segments=0)
+
+
+@wrong("'segments'", "belongs to shooting")
+def test_segments_of_the_gradient_method():
+    co.solve(lag()[0], "gradient", segments=3)
+
+
+@wrong("'substeps'", "positive whole number", "'fine'")
+def test_substeps_in_words():
+    solve(lag()[0], substeps="fine")
+
+
+@wrong("grid", "increasing", "0.4")
+def test_grid_that_falls():
+    solve(lag()[0], grid=[0, 0.5, 0.4, 1])
+
+
+@wrong("grid", "divide the times by the duration")
+def test_grid_in_seconds():
+    solve(lag()[0], grid=[0, 5, 10])
+
+
+@wrong("grid", "nan")
+def test_grid_that_is_nan():
+    solve(lag()[0], grid=[0, np.nan, 1])
+
+
+@wrong("cannot be eliminated", "rate of a state depends on a matrix", "covariances='states'")
+def test_coupled_problem_eliminated():
+    ocp = empty()
+    x, u, S = ocp.state("x", initial=0), ocp.control("u"), ocp.symmetric("S", 1, initial=1.0)
+    ocp.dynamics(x, u + S)
+    ocp.dynamics(S, -S)
+    ocp.minimize(u**2 + x**2)
+    solve(ocp, covariances="eliminated")
+
+
+@wrong("'gauss'", "rate of S", "rk4")
+def test_gauss_for_a_rate_that_is_not_riccati():
+    ocp = empty()
+    x, u, S = ocp.state("x", initial=0), ocp.control("u"), ocp.symmetric("S", 1, initial=1.0)
+    ocp.dynamics(x, u)
+    ocp.dynamics(S, x - S**3)
+    ocp.minimize(u**2, S)
+    solve(ocp, covariance_step="gauss")
+
+
+@wrong("not a problem", "received: int")
+def test_a_number_for_a_problem():
+    co.solve(3)
+
+
+# --- guesses ----------------------------------------------------------------------------------------------------------
+
+
+@wrong("'v'", "cannot be guessed", "x, u, E")
+def test_guess_of_an_unknown_name():
+    solve(lag()[0], guess={"v": 1.0})
+
+
+@wrong("'random'", "'multistart'")
+def test_guess_in_words():
+    solve(lag()[0], guess="random")
+
+
+@wrong("unknown kind", "3")
+def test_guess_of_another_kind():
+    solve(lag()[0], guess=3)
+
+
+@wrong("guess of 'u'", "shape (7, 3)")
+def test_shape_of_a_guess_given_to_solve():
+    solve(lag()[0], guess={"u": np.zeros((7, 3))})
+
+
+@wrong("guess of 'E'", "symmetric 2 x 2 matrix", "shape (3, 3)")
+def test_shape_of_the_guess_of_a_matrix():
+    co.solve(lag()[0], guess={"E": np.eye(3)})
+
+
+@wrong("The options of multistart", "guess='multistart'", "seed")
+def test_seed_without_multistart():
+    co.solve(lag()[0], seed=1)
+
+
+@wrong("'starts' is not a whole number")
+def test_starts_below_zero():
+    co.solve(lag()[0], guess="multistart", starts=-1)
+
+
+# --- parameters -------------------------------------------------------------------------------------------------------
+
+
+@wrong("parameter 'w'", "v, r")
+def test_unknown_parameter():
+    co.Solver(uncertain(), intervals=10).solve({"w": 1.0}, progress=False)
+
+
+@wrong("parameters are not given by name")
+def test_parameters_in_a_list():
+    co.solve(lag()[0], parameters=[1.0])
+
+
+@wrong("value of 'v'", "a number", "shape (2,)")
+def test_shape_of_a_parameter():
+    co.Solver(uncertain(), intervals=10).solve({"v": [1.0, 2.0]}, progress=False)
+
+
+@wrong("value of 'v'", "NaN or inf")
+def test_new_parameter_that_is_inf():
+    co.Solver(uncertain(), intervals=10).solve({"v": np.inf}, progress=False)
+
+
+@wrong("noise density of 'range'", "zero")
+def test_measurement_noise_by_a_parameter():
+    co.Solver(uncertain(), intervals=10).solve({"r": 0.0}, progress=False)
+
+
+@wrong("initial value of 'E'", "negative", "-1")
+def test_variance_by_a_parameter():
+    co.Solver(uncertain(), intervals=10).solve({"v": -1.0}, progress=False)
