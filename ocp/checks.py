@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import casadi as ca
@@ -91,6 +92,11 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
             )
         )
     return numbers
+
+
+def bound_columns(name: str, lower: Any, upper: Any, size: int) -> tuple[Array, Array]:
+    """Lower and upper bounds as vectors of `size` numbers; infinite ones do not bind."""
+    return column(name, "lower bound", lower, size, inf=True), column(name, "upper bound", upper, size, inf=True)
 
 
 def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> Any:
@@ -326,6 +332,20 @@ def check_name(name: Any, declared: list[Any]) -> None:
                     expected="a unique name for each symbol, measurement and constraint",
                     received=f"'{name}', declared before at {entry.where}",
                     remedy="choose another name",
+                )
+            )
+
+
+def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
+    """Everything that moves needs a rate."""
+    for entry in entries:
+        if entry.name not in rates:
+            raise ProblemError(
+                describe(
+                    f"'{entry.name}' has no dynamics (declared at {entry.where}).",
+                    expected=f"dynamics({entry.name}, rate)",
+                    received="none",
+                    remedy="give its rate; 0 for a constant",
                 )
             )
 

@@ -1,4 +1,4 @@
-"""What a user has declared, name by name: the records that `Problem` collects and `freeze` turns into a statement."""
+"""What is declared, name by name: the records that `Problem` collects and `freeze` turns into a statement."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_positive, check_times
-from covocp.matrices import Array
+from covocp.checks import check_positive, check_times, symmetric_data
+from covocp.matrices import Array, half_length, unpack_symbolic
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
@@ -134,6 +134,49 @@ class Backward:
 
     end: ca.MX
     form: tuple[ca.MX, ca.MX, ca.MX]
+
+
+def declare_matrix(
+    name: str,
+    *,
+    labels: tuple[str, ...],
+    where: str,
+    unit: str = "",
+    initial: Any = None,
+    final: Any = None,
+    lower: float | None = None,
+    guess: Any = None,
+    covariance: bool = False,
+    estimation: bool = False,
+    backward: Backward | None = None,
+) -> Matrix:
+    """A symmetric matrix state with a symbol of its own, a row for each label.
+
+    Raises:
+        ProblemError: end values of another shape or not symmetric; those of a covariance indefinite.
+    """
+    size = len(labels)
+    half = ca.MX.sym(name, half_length(size))
+    ends = [
+        None if value is None else symmetric_data(name, what, value, size, semidefinite=covariance)
+        for what, value in (("initial value", initial), ("final value", final))
+    ]
+    return Matrix(
+        name=name,
+        symbol=half,
+        matrix=unpack_symbolic(half, size),
+        size=size,
+        where=where,
+        unit=unit,
+        initial=ends[0],
+        final=ends[1],
+        lower=lower,
+        guess=guess,
+        covariance=covariance,
+        estimation=estimation,
+        labels=labels,
+        backward=backward,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -28,10 +28,11 @@ import casadi as ca
 import numpy as np
 
 from covocp.checks import as_expression, as_number, caller, density_matrix, find_name
-from covocp.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, Matrix, State
+from covocp.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, State, declare_matrix
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
-from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
+from covocp.expansion import expand, measurement_slope
+from covocp.matrices import pack_symbolic
 from covocp.riccati import inverse
 
 if TYPE_CHECKING:
@@ -98,10 +99,10 @@ def derive(problem: Problem) -> Problem:
     if not any(matrix.estimation for matrix in derived.matrices):
         derived.estimation_covariance()
     _check_free_names(derived)
-    expansion = _expand(derived, expected)
+    expansion = expand(derived, expected)
     E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
     size = E.shape[0]
-    jacobian, density = _measured(derived, size)
+    jacobian, density = measurement_slope(derived, size)
     innovation = E @ jacobian.T  # K U
     information = innovation @ _inverse(density) @ innovation.T if jacobian.shape[0] else ca.MX(size, size)
     if expected.gain is None:
@@ -246,69 +247,6 @@ def _check_free_names(problem: Problem) -> None:
             )
 
 
-def _expand(problem: Problem, expected: Expected) -> Expansion:
-    """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
-    entries: list[Any] = [*problem.states, *problem.unknowns]
-    _check_rates(problem)
-    augmented = [entry.symbol for entry in entries]
-    controls = [entry.symbol for entry in problem.controls]
-    count = sum(entry.size for entry in problem.unknowns)
-    rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
-    noises = [problem.rates[s.name].noise for s in problem.states]
-    noise = ca.diagcat(
-        *(ca.MX(s.size, s.size) if q is None else q for s, q in zip(problem.states, noises, strict=True)),
-        ca.MX(count, count),
-    )
-    by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
-    at_end = _slope(expected.terminal, augmented).T
-    weight = _weight_matrix(expected.terminal_weight, entries, "terminal weight")
-    end = _slope(at_end, augmented) + (0 if weight is None else weight)
-    _check_terminal_weights(problem, end)
-    return Expansion(
-        F=_slope(rates, augmented),
-        G=_slope(rates, controls),
-        A=_slope(by_state, augmented),
-        B=_control_weights(problem, expected, _slope(by_control, controls)),
-        N=_slope(by_state, controls),
-        Q=noise,
-        end=end,
-        running=expected.running,
-        terminal=expected.terminal,
-        gain=ca.MX(),
-    )
-
-
-def _check_rates(problem: Problem) -> None:
-    for state in problem.states:
-        if state.name not in problem.rates:
-            raise ProblemError(
-                describe(
-                    f"'{state.name}' has no dynamics (declared at {state.where}).",
-                    expected=f"dynamics({state.name}, rate)",
-                    received="none",
-                    remedy="give its rate; 0 for a constant",
-                )
-            )
-
-
-def _slope(expression: Any, symbols: list[Any]) -> Any:
-    """Jacobian by several symbols, side by side.
-
-    An interpolation table expands to scalar operations and its derivative does not, so that of its expansion is taken.
-    """
-    slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
-    own = ca.symvar(expression)
-    try:
-        ca.Function("slope", own, [slope]).expand()
-    except RuntimeError:
-        try:
-            expression = ca.Function("expression", own, [expression]).expand()(*own)
-        except RuntimeError:  # nor does the expression: the statement is in matrix operations
-            return slope
-        slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
-    return slope
-
-
 def _trace(a: Any, b: Any) -> Any:
     """tr(a b)."""
     return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
@@ -322,116 +260,16 @@ def _inverse(density: Any) -> Any:
     return ca.Function("inverse", [entries], [ca.inv(entries)])(density)
 
 
-def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
-    """One matrix over some entries from weights by name, a number or a matrix; None without weights."""
-    if weights is None:
-        return None
-    if isinstance(weights, Mapping):
-        return ca.diagcat(*(weights.get(e.name, ca.MX(e.size, e.size)) for e in entries))
-    return density_matrix("minimize_expected", what, weights, sum(e.size for e in entries))
-
-
-def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> Any:
-    """B: the given weights, L_uu where none is given [Schmidt 6.6]; every control needs one."""
-    given = expected.control_weight
-    if given is None:
-        weights = curvature
-    elif not isinstance(given, Mapping):
-        weights = _weight_matrix(given, problem.controls, "control weight")
-    else:
-        rows = []
-        for a in problem.controls:
-            blocks = []
-            for b in problem.controls:
-                block = ca.jacobian(ca.gradient(expected.running, a.symbol), b.symbol)
-                replaced = a.name in given or b.name in given
-                blocks.append((given[a.name] if a is b else ca.MX(a.size, b.size)) if replaced else block)
-            rows.append(ca.horzcat(*blocks))
-        weights = ca.vertcat(*rows)
-    names = [e.name if e.size == 1 else f"{e.name}[{i}]" for e in problem.controls for i in range(e.size)]
-    constant = not ca.symvar(weights)  # constants that CasADi has not folded among them
-    numbers = ca.evalf(weights).full() if constant else None
-    for i, name in enumerate(names):
-        if not weights.sparsity().has_nz(i, i) or (numbers is not None and numbers[i, i] == 0):
-            raise ProblemError(
-                describe(
-                    f"The control '{name}' has no weight: the second derivative of the running cost by it is zero.",
-                    expected="a positive weight of its deviations, or the feedback gain would be infinite",
-                    received=f"running = {expected.running}",
-                    remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
-                )
-            )
-    if numbers is not None and np.linalg.eigvalsh(numbers)[0] <= 0:
-        raise ProblemError(
-            describe(
-                f"The weight of the controls {', '.join(names)} is not positive definite.",
-                expected="a minimum of the running cost by the controls, or control_weight= in its place",
-                received=f"second derivatives {numbers.tolist()}",
-                remedy="give control_weight={...} to minimize_expected(), or correct the running cost",
-            )
-        )
-    return ca.sparsify(ca.evalf(weights)) if constant else weights
-
-
-def _check_terminal_weights(problem: Problem, end: Any) -> None:
-    """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
-    offset = 0
-    for state in problem.states:
-        free = [True] * state.size
-        if state.final.is_constant():
-            free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()
-        for i in range(state.size):
-            if not free[i] and not end.sparsity().has_nz(offset + i, offset + i):
-                raise ProblemError(
-                    describe(
-                        f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
-                        expected="a weight of its deviation at the end: only the nominal meets a terminal condition "
-                        "exactly, the actual system scatters around it",
-                        received=f"final value of {state.name}, no terminal cost or weight of it",
-                        remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
-                        "to scatter",
-                    )
-                )
-        offset += state.size
-
-
-def _measured(problem: Problem, size: int) -> tuple[Any, Any]:
-    """M and U of all measurements."""
-    entries: list[Any] = [*problem.states, *problem.unknowns]
-    augmented = [entry.symbol for entry in entries]
-    if not problem.measurements:
-        return ca.MX(0, size), ca.MX(0, 0)
-    value = ca.vertcat(*(m.expression for m in problem.measurements))
-    return _slope(value, augmented), ca.diagcat(*(m.noise for m in problem.measurements))
-
-
 def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansion]:
     """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
     labels = augmented_names([*problem.states, *problem.unknowns])
-    size = len(labels)
-    half = ca.MX.sym(FEEDBACK, half_length(size))
-    S = unpack_symbolic(half, size)
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
     weight = _inverse(expansion.B)
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
-    problem.matrices.append(
-        Matrix(
-            name=FEEDBACK,
-            symbol=half,
-            matrix=S,
-            size=size,
-            where="minimize_expected()",
-            unit="",
-            initial=None,
-            final=None,
-            lower=None,
-            guess=None,
-            covariance=False,
-            estimation=False,
-            labels=labels,
-            backward=Backward(end=expansion.end, form=form),
-        )
-    )
+    backward = Backward(end=expansion.end, form=form)
+    feedback = declare_matrix(FEEDBACK, labels=labels, where="minimize_expected()", backward=backward)
+    problem.matrices.append(feedback)
+    S = feedback.matrix
     return S, replace(expansion, gain=weight @ (G.T @ S + N.T))
 
 
@@ -439,8 +277,6 @@ def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, informati
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
     labels = augmented_names([*problem.states, *problem.unknowns])
     size, rows = len(labels), sum(control.size for control in problem.controls)
-    half = ca.MX.sym(ESTIMATE, half_length(size))
-    X = unpack_symbolic(half, size)
     pattern, low, high, guess = _gain_entries(gain, (rows, size))
     where = np.flatnonzero(pattern.ravel(order="F"))
     symbol = ca.MX.sym(GAIN, where.size)
@@ -466,24 +302,16 @@ def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, informati
         problem.rates[GAIN] = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
     else:
         problem.controls.append(Control(**common))
-    closed = expansion.F - expansion.G @ C
-    problem.matrices.append(
-        Matrix(
-            name=ESTIMATE,
-            symbol=half,
-            matrix=X,
-            size=size,
-            where="minimize_expected()",
-            unit="",
-            initial=ca.MX(ca.DM.zeros(half_length(size), 1)),
-            final=None,
-            lower=0.0,
-            guess=None,
-            covariance=True,
-            estimation=False,
-            labels=labels,
-        )
+    estimate = declare_matrix(
+        ESTIMATE,
+        labels=labels,
+        where="minimize_expected()",
+        initial=np.zeros((size, size)),
+        lower=0.0,
+        covariance=True,
     )
+    problem.matrices.append(estimate)
+    X, closed = estimate.matrix, expansion.F - expansion.G @ C
     rate = closed @ X + X @ closed.T + information
     problem.rates[ESTIMATE] = Dynamics(rate=pack_symbolic(rate), noise=None, where="minimize_expected()")
     return X, replace(expansion, gain=C)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from covocp.checks import check_dynamics
 from covocp.declarations import Constraint, Matrix, Place
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
@@ -106,16 +107,8 @@ def _all(*groups: Iterable[Any]) -> list[Any]:
 
 def _check_complete(problem: Problem) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
-    for entry in _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None)):
-        if entry.name not in problem.rates:
-            raise ProblemError(
-                describe(
-                    f"'{entry.name}' has no dynamics (declared at {entry.where}).",
-                    expected=f"dynamics({entry.name}, rate)",
-                    received="none",
-                    remedy="give its rate; 0 for a constant",
-                )
-            )
+    moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
+    check_dynamics(moving, problem.rates)
     if not problem.states:
         raise ProblemError(
             describe(

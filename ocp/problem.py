@@ -10,6 +10,7 @@ import numpy as np
 from covocp.checks import (
     as_expression,
     as_number,
+    bound_columns,
     caller,
     check_bounds,
     check_constrains,
@@ -27,7 +28,6 @@ from covocp.checks import (
     find_name,
     is_symbolic,
     scale_column,
-    symmetric_data,
 )
 from covocp.declarations import (
     Constraint,
@@ -44,12 +44,13 @@ from covocp.declarations import (
     Place,
     State,
     Unknown,
+    declare_matrix,
 )
 from covocp.errors import ProblemError, describe
 from covocp.estimation import EstimationCovariance, augmented_names
 from covocp.expected import derive, expected_cost
 from covocp.freeze import freeze
-from covocp.matrices import half_length, pack_symbolic, unpack_symbolic
+from covocp.matrices import pack_symbolic
 from covocp.statement import Statement
 
 
@@ -131,10 +132,7 @@ class Problem:
                 inf in data, variance not positive semidefinite.
         """
         size = self._declare(name, shape)
-        low, high = (
-            column(name, "lower bound", lower, size, inf=True),
-            column(name, "upper bound", upper, size, inf=True),
-        )
+        low, high = bound_columns(name, lower, upper, size)
         check_bounds(name, low, high)
         free = np.full(size, np.nan)
         for what, value in (("initial", initial), ("final", final)):
@@ -223,10 +221,7 @@ class Problem:
             ProblemError: name used twice, shapes that do not fit, bounds crossed.
         """
         size = self._declare(name, shape)
-        low, high = (
-            column(name, "lower bound", lower, size, inf=True),
-            column(name, "upper bound", upper, size, inf=True),
-        )
+        low, high = bound_columns(name, lower, upper, size)
         check_bounds(name, low, high)
         declaration = Control(
             name=name,
@@ -273,12 +268,21 @@ class Problem:
         """
         size = self._declare(name, size)
         lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
-        covariance = lower is not None and lower >= 0
         if lower is not None and initial is not None and not is_symbolic(initial):
             diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
             check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
-        labels = tuple(str(i) for i in range(size))
-        declaration = self._add_matrix(name, size, initial, final, lower, guess, covariance, False, labels, unit)
+        declaration = declare_matrix(
+            name,
+            labels=tuple(str(i) for i in range(size)),
+            where=caller(),
+            unit=unit,
+            initial=initial,
+            final=final,
+            lower=lower,
+            guess=guess,
+            covariance=lower is not None and lower >= 0,
+        )
+        self.matrices.append(declaration)
         return declaration.matrix
 
     def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
@@ -307,12 +311,14 @@ class Problem:
                     remedy="call estimation_covariance() after the last state() and unknown()",
                 )
             )
-        size = self._declare("E", len(labels))
+        self._declare("E", len(labels))
         if initial is None:
             initial = ca.diagcat(*(entry.variance for entry in entries))
-        return EstimationCovariance(
-            entries, self._add_matrix("E", size, initial, None, 0.0, None, True, True, labels, "")
+        declaration = declare_matrix(
+            "E", labels=labels, where=caller(), initial=initial, lower=0.0, covariance=True, estimation=True
         )
+        self.matrices.append(declaration)
+        return EstimationCovariance(entries, declaration)
 
     def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
@@ -466,10 +472,7 @@ class Problem:
         constants = [q.symbol for q in self.parameters] + [q.symbol for q in self.unknowns] + [self._time]
         check_constrains(label, value, constants)
         size = self._declare(label, value.shape[0])
-        low, high = (
-            column(label, "lower bound", lower, size, inf=True),
-            column(label, "upper bound", upper, size, inf=True),
-        )
+        low, high = bound_columns(label, lower, upper, size)
         check_limits(label, low, high)
         self.constraints.append(Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller()))
 
@@ -493,40 +496,3 @@ class Problem:
     def _declared(self) -> list[Any]:
         symbols: list[Any] = [*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices]
         return [*symbols, *self.measurements, *self.constraints]
-
-    def _add_matrix(
-        self,
-        name: str,
-        size: int,
-        initial: Any,
-        final: Any,
-        lower: float | None,
-        guess: Any,
-        covariance: bool,
-        estimation: bool,
-        labels: tuple[str, ...],
-        unit: str,
-    ) -> Matrix:
-        """Declare a matrix state; constant initial values are checked."""
-        half = ca.MX.sym(name, half_length(size))
-        ends = [
-            None if value is None else symmetric_data(name, what, value, size, semidefinite=covariance)
-            for what, value in (("initial value", initial), ("final value", final))
-        ]
-        declaration = Matrix(
-            name=name,
-            symbol=half,
-            matrix=unpack_symbolic(half, size),
-            size=size,
-            where=caller(),
-            unit=unit,
-            initial=ends[0],
-            final=ends[1],
-            lower=lower,
-            guess=guess,
-            covariance=covariance,
-            estimation=estimation,
-            labels=labels,
-        )
-        self.matrices.append(declaration)
-        return declaration
