@@ -204,12 +204,12 @@ def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.
 def _export(arguments: argparse.Namespace) -> int:
     """covocp export MODEL DIR."""
     from covocp.export import export_c
-    from covocp.export.folder import check_folder
+    from covocp.export.exporting import check_settings
 
-    check_folder(arguments.directory, arguments.overwrite)
-    what = find_model(arguments.model).build(arguments.set)
     settings: dict[str, Any] = {"name": arguments.name, "precision": arguments.precision}
     settings |= {"overwrite": arguments.overwrite, "period": arguments.period}
+    check_settings(arguments.directory, **settings)
+    what = find_model(arguments.model).build(arguments.set)
     code = 0
     if arguments.solver:
         shared, _ = _options(arguments.option, ())

@@ -8,6 +8,7 @@ import tempfile
 import warnings
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -25,6 +26,18 @@ STEP = 0.1
 TRANSITION = np.array([[1.0, STEP], [0.0, 1.0]])
 NOISE = np.array([[STEP**3 / 3, STEP**2 / 2], [STEP**2 / 2, STEP]])
 H, R = np.eye(2), np.diag([0.2, 1.0])
+# A damped swing seen by three rows, two of them correlated, one of which sees the control.
+SWING = SimpleNamespace(
+    F=np.array([[0.0, 1.0], [-1.0, -0.4]]),
+    G=np.array([0.0, 1.0]),
+    Q=np.diag([0.0, 0.2]),
+    P0=np.diag([0.3, 0.5]),
+    M=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]]),
+    H=np.array([0.2, 0.0, 0.0]),
+    U=np.array([[0.2, 0.09, 0.0], [0.09, 0.1, 0.0], [0.0, 0.0, 0.4]]),
+    control=0.3,
+    period=0.05,
+)
 
 
 @lru_cache
@@ -45,6 +58,20 @@ def open_lag(control: str = "linear") -> co.Solution:
 def mars() -> co.Solution:
     """Mars entry with constant lift-to-drag ratio, and its feedback."""
     return co.evaluate(mars_entry.problem(), nominal=mars_entry.reference())
+
+
+@lru_cache
+def swing(unit: float = 1.0) -> co.Solution:
+    """The swing; unit: of what is measured."""
+    s = SWING
+    ocp = co.Problem(duration=2.0, name="swing")
+    x = ocp.state("x", 2, initial=np.zeros(2), variance=np.diag(s.P0))
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.DM(s.F) @ x + ca.DM(s.G) * u, noise=np.diag(s.Q))
+    ocp.measurement("pair", unit * (x + ca.DM(s.H[:2]) * u), noise=unit**2 * s.U[:2, :2])
+    ocp.measurement("difference", unit * (x[0] - x[1]), noise=unit**2 * s.U[2, 2])
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: np.array([2.0, 1.0])})
+    return co.evaluate(ocp, nominal={"u": s.control})
 
 
 def filter_functions() -> list[ca.Function]:
@@ -88,8 +115,9 @@ def package(name: str) -> CPackage:
         "lag_sampled": lambda p: export_c(lag(), p, period=0.01),
         "lag_single": lambda p: export_c(lag(), p, precision="single"),
         "mars": lambda p: export_c(mars(), p),
-        "mars_sampled": lambda p: export_c(mars(), p, period=5.0),
+        "mars_sampled": lambda p: export_c(mars(), p, period=0.915),
         "mars_single": lambda p: export_c(mars(), p, precision="single", limits="bounds"),
+        "swing": lambda p: export_c(swing(), p, period=SWING.period),
         "history": lambda p: export_c(open_lag(), p),
         "steps": lambda p: export_c(open_lag("constant"), p),
         "filters": lambda p: export_c(filter_functions(), p),

@@ -262,12 +262,37 @@ def test_export_of_a_failed_solve_writes_nothing(capsys, tmp_path):
         (["--period", "0.1"], "those of a controller"),
         (["--solver", "--period", "0.1"], "no option 'period' for a problem"),
         (["--solver", "--option", "colour=3"], "no option 'colour'"),
+        (["--period", "-1"], "not a positive number"),
+        (["--period", "nan"], "not a positive number"),
     ],
 )
 def test_wrong_exports_are_refused(capsys, tmp_path, arguments, words):
     outcome = run(capsys, "export", "noisy_integrator", tmp_path / "out", "--intervals", "10", *arguments)
     assert_refused(outcome, words)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("model", "folder", "words"),
+    [
+        ("nonsense", "out", "There is no model 'nonsense'"),
+        ("noisy_integrator:closed", "out", "has no problem 'closed'"),
+        ("noisy_integrator", "missing/out", "make that folder first"),
+        ("noisy_integrator", "class", "cannot be the name of a C package"),
+        ("noisy_integrator", ".", "--overwrite"),
+    ],
+)
+def test_wrong_exports_are_refused_before_anything_is_solved(capsys, tmp_path, monkeypatch, model, folder, words):
+    monkeypatch.setattr(co, "solve", None)
+    assert_refused(run(capsys, "export", model, tmp_path / folder), words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_period_that_does_not_fit_is_refused(capsys, tmp_path):
+    arguments = ["--intervals", 80, "--quiet", "--period", "100"]
+    outcome = run(capsys, "export", "unknown_lag:steering", tmp_path / "lag", *arguments)
+    assert_refused(outcome, "1 to 200000 periods within 10 s")
+    assert not list(tmp_path.iterdir())
 
 
 # --- wrong input ------------------------------------------------------------------------------------------------------

@@ -127,7 +127,8 @@ def _refused(laws: tuple[Law, ...], words: str, where: str = "") -> ExportError:
     remedy = next(
         (text for key, text in REMEDIES.items() if key in words), "write it with CasADi nodes that have C code"
     )
-    inside = f", in its function '{where}'" if where and not where.endswith("_core") else ""
+    own = where.endswith("_core") or where in {law.name for law in laws}
+    inside = f", in its function '{where}'" if where and not own else ""
     return ExportError(
         describe(
             "This cannot be written as C code: " + ", ".join(f"'{law.name}'" for law in laws) + f"{inside}.",

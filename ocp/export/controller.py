@@ -57,11 +57,11 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     predicted = _predict(design, y, held, [tables.at(t) for t in middle], middle, h)
     now = tables.at(clock.time)
     corrected, C, L, missing = _corrected(design, predicted, (held, measured, h), now, clock.time)
-    good = ca.sum1(ca.fabs(corrected)) <= LARGEST  # false for NaN, which mmax leaves out
+    feedback = C @ corrected
+    good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
-    acting = ca.if_else(good, valid, 0.0)
     nominal = now.u[:m]
-    moved = nominal - C @ ca.if_else(acting, estimate, 0.0)
+    moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
     conditions = [
         *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
         (missing, "MEASUREMENT_MISSING"),
@@ -93,6 +93,11 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     )
 
 
+def finite(estimate: Any, feedback: Any) -> Any:
+    """Whether an estimate and the control that follows from it may be used; false for NaN, which mmax leaves out."""
+    return ca.sum1(ca.fabs(estimate)) + ca.sum1(ca.fabs(feedback)) <= LARGEST
+
+
 def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
     n, m, r = design.sizes
@@ -118,7 +123,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
         "nominal_state": "the nominal at that time",
         "nominal_control": "the nominal at that time",
         "feedback_gain": "C",
-        "filter_gain": "L of the last step; zero where no correction was made or a row of the measurement left out",
+        "filter_gain": "L of the last step; zero for rows that were left out",
         "index": "of the last sample",
         "status": "of the last step",
     }

@@ -15,6 +15,7 @@ import casadi as ca
 from covocp.errors import ExportError, describe, warn_user
 from covocp.export.building import Sources
 from covocp.export.casadi_code import Generated, Sizes, generate
+from covocp.export.collisions import check_identifiers
 from covocp.export.controller import controller_law
 from covocp.export.design import design_of
 from covocp.export.folder import check_folder, write_folder
@@ -23,7 +24,7 @@ from covocp.export.header import header
 from covocp.export.history import history
 from covocp.export.laws import Law, stacked_size
 from covocp.export.linking import Linking
-from covocp.export.names import check_name, identifier
+from covocp.export.names import check_name, package_name
 from covocp.export.package import CPackage
 from covocp.export.readme import cmake_lists, readme
 from covocp.export.sampled import sampled_law
@@ -96,9 +97,7 @@ def export_c(
         ExportError: something has no C code, a name, a precision or a folder is not possible.
         ProblemError: options of the mesh that mean nothing.
     """
-    _check_choice("precision", precision, tuple(PRECISIONS))
-    target = check_folder(directory, overwrite)
-    package = check_name(identifier(target.name, set(), "law") if name is None else name)
+    target, package = check_settings(directory, name=name, precision=precision, overwrite=overwrite, period=period)
     allowed = TOLERANCES[precision] if tolerance is None else _positive("tolerance", tolerance)
     given = {"period": period, "limits": limits, "ranges": ranges, "units": units}
     given |= {"feedback": None if feedback is True else feedback, "method": None if method == "sqpmethod" else method}
@@ -111,8 +110,32 @@ def export_c(
     else:
         _check_options("functions", {**given, **options}, ("ranges", "units"))
         content = _functions(what, ranges or {}, units or {}, allowed)
+    check_identifiers(package, content.laws)
     generated = generate(package, content.laws, precision)
     return _written(package, target, precision, content, generated, tolerance)
+
+
+def check_settings(
+    directory: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    precision: str = "double",
+    overwrite: bool = False,
+    period: float | None = None,
+) -> tuple[Path, str]:
+    """What can be checked of the arguments of `export_c` before anything is solved.
+
+    Returns:
+        The folder, the name of the package.
+
+    Raises:
+        ExportError: one of them is not possible.
+    """
+    _check_choice("precision", precision, tuple(PRECISIONS))
+    if period is not None:
+        _positive("period", period)
+    target = check_folder(directory, overwrite)
+    return target, package_name(target.name) if name is None else check_name(name)
 
 
 def _written(

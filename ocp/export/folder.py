@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -23,14 +24,21 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
     """
     try:
         target = Path(directory).absolute()
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            target.lstat()
     except TypeError as error:
         raise _refused(repr(directory), "the name of a folder", type(directory).__name__, "give a name") from error
+    except (OSError, ValueError) as error:  # too long, a null byte, a parent that may not be looked into
+        raise _refused(repr(directory)[:60], "a folder that can be made", str(error)[:200], "choose another") from error
     parent = target.parent
     if target.exists() or target.is_symlink():
         whole = target.is_dir() and not target.is_symlink()
         if not overwrite:
             raise _refused(
-                target.name, "a folder that does not exist yet", str(target), "choose another, or overwrite=True"
+                target.name,
+                "a folder that does not exist yet",
+                str(target),
+                "choose another, or overwrite=True (in the shell --overwrite)",
             )
         if not whole or (any(target.iterdir()) and not (target / MARK).is_file()):
             raise _refused(

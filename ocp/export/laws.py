@@ -26,7 +26,7 @@ STATUSES = {
     "TIME_AFTER": "the time is after the end: values of the end",
     "TIME_BACKWARDS": "the time is before that of the last step: nominal control, the estimate stays",
     "TIME_NOT_FINITE": "the time is NaN or infinite: values of the last valid time",
-    "ESTIMATE_LOST": "the new estimate was not finite: nominal control, the old estimate stays",
+    "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
     "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
     "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",

@@ -26,8 +26,15 @@ stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wc
 main casadi all clean help install package test edit_cache rebuild_cache
 """
 RESERVED = frozenset(_RESERVED.split())
-# Macros of the standard library; and what the generated functions use themselves, whose other names end in "_".
-TAKEN = frozenset(("NULL", "NAN", "INFINITY", "EOF", "I", "self", "point", "workspace", "status"))
+# Macros of the usual headers, which a user may include before that of the package; and what the generated functions use
+# themselves, whose other names end in "_".
+_TAKEN = """
+NULL NAN INFINITY EOF HUGE_VAL I complex imaginary errno assert stdin stdout stderr unix linux near far
+isnan isinf isfinite isnormal signbit fpclassify
+M_E M_LOG2E M_LOG10E M_LN2 M_LN10 M_PI M_PI_2 M_PI_4 M_1_PI M_2_PI M_2_SQRTPI M_SQRT2 M_SQRT1_2
+self point workspace status memcpy all_finite
+"""
+TAKEN = frozenset(_TAKEN.split())
 
 
 def check_name(name: Any) -> str:
@@ -37,8 +44,8 @@ def check_name(name: Any) -> str:
         ExportError: it is not.
     """
     reason = ""
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        reason = "letters, digits and underscores, a letter first"
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name):
+        reason = "letters, digits and underscores: a letter first, underscores neither at the end nor side by side"
     elif name in KEYWORDS:
         reason = "a name that is no keyword of C or C++"
     elif name.lower() in RESERVED:
@@ -55,6 +62,15 @@ def check_name(name: Any) -> str:
             remedy="give another one by name=, such as 'lag_controller'",
         )
     )
+
+
+def package_name(folder: str) -> str:
+    """The name of a package that is named like its folder.
+
+    Raises:
+        ExportError: it would be a keyword, or has another meaning.
+    """
+    return check_name(re.sub("_+", "_", identifier(folder, set(), "law")).strip("_"))
 
 
 def identifier(text: str, taken: set[str], what: str = "value") -> str:

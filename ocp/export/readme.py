@@ -6,13 +6,16 @@ from collections.abc import Mapping
 
 from covocp.export.c_text import code, described
 from covocp.export.casadi_code import EXCEPTIONS, GCC_EXCEPTIONS
-from covocp.export.header import signature
+from covocp.export.header import signature, struct_name
 from covocp.export.laws import CODES, STATUSES, Law
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.13)
 project({name} LANGUAGES C)
 
+if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
+    set(CMAKE_BUILD_TYPE Release)
+endif()
 set(CMAKE_C_STANDARD 99)
 set(CMAKE_C_STANDARD_REQUIRED ON)
 set(CMAKE_C_EXTENSIONS OFF)
@@ -68,6 +71,12 @@ def readme(
     parts = [
         f"# {name}",
         "\n".join(title),
+    flags = "-std=c99 -O2 -Wall -Wextra -pedantic"
+    shell = (
+        ""
+        if linking
+        else f"With a C compiler:\n\n```sh\ncc {flags} -o selftest main.c {objects} -lm && ./selftest\n```\n\n"
+    )
         "| file | what it is |\n|---|---|\n"
         f"| `{name}.h` | what you include: types, sizes, status codes, functions (C99 and C++) |\n"
         f"| `{name}.c` | checks arguments, keeps the state, calls the functions of the next file |\n"
@@ -75,10 +84,10 @@ def readme(
         "| `main.c` | self-test: reference vectors written by Python; returns 0 where C agrees with them |\n"
         "| `CMakeLists.txt` | library and self-test |",
         "## Build",
-        "With CMake:\n\n```sh\ncmake -S . -B build && cmake --build build && ctest --test-dir build\n```",
-        "Without, as a line of a Makefile:\n\n```make\n"
+        "With CMake:\n\n```sh\ncmake -S . -B build && cmake --build build && (cd build && ctest)\n```",
+        f"{shell}As a line of a Makefile:\n\n```make\n"
         f"selftest: main.c {objects} {name}.h\n"
-        f"\t$(CC) -std=c99 -O2 -Wall -Wextra -pedantic -o $@ main.c {objects}{_link_line(linking)} -lm\n```",
+        f"\t$(CC) {flags} -o $@ main.c {objects}{_link_line(linking)} -lm\n```",
         *([linking] if linking else []),
         "The sources compile without warnings; `"
         f"{name}_casadi.c` switches off {warnings} for itself, because all of its functions have the same arguments. "
@@ -116,7 +125,7 @@ def _function(name: str, law: Law) -> str:
     rows = [f"| `{port.name}` | {role} | {described(port) or '-'} |" for port, role in listed if port.name != "status"]
     lines.append("| name | | what it is |\n|---|---|---|\n" + "\n".join(rows))
     if law.kind == "controller":
-        lines.append(f"`{name}_init(&controller)` comes before the first step.")
+        lines.append(_use(name, law))
     return "\n\n".join(lines)
 
 
@@ -128,6 +137,21 @@ def _statuses(name: str, laws: tuple[Law, ...]) -> str:
 
 def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int]) -> str:
     where = {law.name: "workspace of the caller" if law.kind == "solver" else "stack" for law in laws}
+def _use(name: str, law: Law) -> str:
+    """How a controller is called."""
+    sizes = {port.name: port.size for port in (*law.inputs, *law.outputs)}
+    declared = {key: f"{key}[{sizes[key]}]" if sizes[key] > 1 else key for key in ("measurement", "control")}
+    address = "control" if sizes["control"] > 1 else "&control"
+    return f"""```c
+{struct_name(name, law)} controller; /* keeps the estimate; one for each plant */
+{name}_real {declared["measurement"]}, {declared["control"]}, time;
+int status;
+{name}_init(&controller); /* once, at time zero: controller.control is the first control */
+/* at each measurement: */
+status = {name}_step(&controller, measurement, time, {address});
+```"""
+
+
     rows = [f"| `{name}_{law}` | {size} | {where[law]} |" for law, size in work_bytes.items()]
     return (
         "These functions allocate nothing. Arrays that a call works in, in bytes on a machine of 64 bits; the frames "

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ExportError, describe
-from covocp.export.controller import SCALAR_SIZE, STATUSES, field_ports, first_fields, points, solved
+from covocp.export.controller import SCALAR_SIZE, STATUSES, field_ports, finite, first_fields, points, solved
 from covocp.export.design import Design, clipped
 from covocp.export.history import History
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
@@ -78,12 +78,13 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
     samples = discretised(design, tables, period)
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
-    clock = tables.clock(time, last * period)
+    begun = ca.fmax(last, 0.0)  # a struct that was never set must not lead out of the tables
+    clock = tables.clock(time, begun * period)
     wanted = ca.fmin(ca.fmax(ca.floor(clock.time / period + 0.5), 0.0), float(samples.count))
-    backwards = wanted < last
+    backwards = wanted < begun
     valid = ca.if_else(backwards, 0.0, clock.within)
-    ahead = ca.if_else(valid, wanted > last, 0.0)
-    index = ca.if_else(valid, last + ahead, wanted)
+    ahead = ca.if_else(valid, wanted > begun, 0.0)
+    index = ca.if_else(valid, begun + ahead, wanted)
     more = ca.if_else(ahead, wanted > index, 0.0)
     at = samples.at(index)
     present = ca.fabs(measured) <= LARGEST
@@ -92,14 +93,15 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
     residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
     L = _gain_of_rows(at, present, missing) * ca.logic_and(ahead, ca.logic_not(more))
     corrected = before + L @ ca.if_else(present, residual, 0.0)
-    good = ca.sum1(ca.fabs(corrected)) <= LARGEST  # false for NaN, which mmax leaves out
+    feedback = at["C"] @ corrected
+    good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
-    moved = at["u"] - at["C"] @ ca.if_else(ca.if_else(good, valid, 0.0), estimate, 0.0)
+    moved = at["u"] - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
     conditions = [
         *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
         (missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
-    kept = ca.if_else(valid, index, last)
+    kept = ca.if_else(valid, index, begun)
     fields = {
         "time": kept * period,
         "estimate": estimate,
