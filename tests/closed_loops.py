@@ -120,6 +120,41 @@ def nominal(system, control, duration, *, breaks: Sequence[float] = ()):
     ]
 
 
+def expansion(system, x, u):
+    """F, G, M, A, B, N."""
+    return (*(function(x, u) for function in (system.F, system.G, system.M)), *system.weights(x, u))
+
+
+def nominal_and_filter(system, control, ends):
+    """x and E of the design as one function of t, forward (2.5-3)."""
+    n, U_inverse = system.start.size, np.linalg.inv(system.U)
+
+    def rate(t, z):
+        x, E, u = z[:n], z[n:].reshape(n, n), as_vector(control, t)
+        F, M = system.F(x, u), system.M(x, u)
+        E_rate = F @ E + E @ F.T + system.Q(x, u) - E @ M.T @ U_inverse @ M @ E
+        return np.concatenate([system.rate(x, u), E_rate.ravel()])
+
+    first = np.concatenate([system.start, system.variance.ravel()])
+    square = np.outer(system.scale, system.scale)
+    return integrate(rate, first, ends, ABSOLUTE * np.concatenate([system.scale, square.ravel()]))[0]
+
+
+def cost_to_go(system, control, ends, forward):
+    """S of the design as a function of t, backward along the nominal (6.3-20)."""
+    n = system.start.size
+
+    def rate(t, z):
+        S = z.reshape(n, n)
+        F, G, _, A, B, N = expansion(system, forward(t)[:n], as_vector(control, t))
+        H = G.T @ S + N.T
+        return (-F.T @ S - S @ F + H.T @ np.linalg.solve(B, H) - A).ravel()
+
+    square = np.outer(system.scale, system.scale)
+    tolerance = ABSOLUTE * max(float(np.abs(system.end * square).max()), 1e-300) / square
+    return integrate(rate, system.end.ravel(), ends[::-1], tolerance.ravel())[0]
+
+
 def closed_loop(
     system: System,
     control: Callable,
@@ -147,37 +182,15 @@ def closed_loop(
     actual = truth or system
     ends = [0.0, *breaks, duration]
     square = np.outer(system.scale, system.scale)
-    U_inverse = np.linalg.inv(system.U)
-
-    def at(t, x):
-        """F, G, M, A, B, N."""
-        u = as_vector(control, t)
-        return (*(function(x, u) for function in (system.F, system.G, system.M)), *system.weights(x, u))
-
-    # The nominal and the design's filter, forward (2.5-3).
-    def design(t, z):
-        x, E, u = z[:n], z[n:].reshape(n, n), as_vector(control, t)
-        F, M = system.F(x, u), system.M(x, u)
-        rate = F @ E + E @ F.T + system.Q(x, u) - E @ M.T @ U_inverse @ M @ E
-        return np.concatenate([system.rate(x, u), rate.ravel()])
-
-    first = np.concatenate([system.start, system.variance.ravel()])
-    forward, _ = integrate(design, first, ends, ABSOLUTE * np.concatenate([system.scale, square.ravel()]))
-
-    # The design's feedback, backward (6.3-20).
-    def riccati(t, z):
-        S = z.reshape(n, n)
-        F, G, _, A, B, N = at(t, forward(t)[:n])
-        H = G.T @ S + N.T
-        return (-F.T @ S - S @ F + H.T @ np.linalg.solve(B, H) - A).ravel()
-
     size = max(float(np.abs(system.end * square).max()), 1e-300)
-    backward, _ = integrate(riccati, system.end.ravel(), ends[::-1], (ABSOLUTE * size / square).ravel())
+    U_inverse = np.linalg.inv(system.U)
+    forward = nominal_and_filter(system, control, ends)
+    backward = cost_to_go(system, control, ends, forward)
 
     def gains(t):
         """K and C."""
         x, E, S = forward(t)[:n], forward(t)[n:].reshape(n, n), backward(t).reshape(n, n)
-        _, G, M, _, B, N = at(t, x)
+        _, G, M, _, B, N = expansion(system, x, as_vector(control, t))
         K = E @ M.T @ U_inverse if filter is None else np.atleast_2d(filter(t))
         return K, np.linalg.solve(B, G.T @ S + N.T) if feedback is None else np.atleast_2d(feedback(t))
 
@@ -185,7 +198,7 @@ def closed_loop(
     def loop(t, z):
         E, X, Z = z[: 3 * n * n].reshape(3, n, n)
         x, S, u = forward(t)[:n], backward(t).reshape(n, n), as_vector(control, t)
-        F, G, M, A, B, N = at(t, x)
+        F, G, M, A, B, N = expansion(system, x, u)
         Q, (K, C) = actual.Q(x, u), gains(t)
         noise, estimator, controller = K @ actual.U @ K.T, F - K @ M, F - G @ C
         dE = estimator @ E + E @ estimator.T + noise + Q
@@ -230,6 +243,11 @@ def closed_loop(
         equivalent=float(deterministic + equivalent + 0.5 * np.trace(S_start @ actual.variance)),
         innovations=float(deterministic + innovations + 0.5 * np.trace(system.end @ E)),
     )
+
+
+def lower(matrix):
+    """Half-vector: the columns of the lower triangle."""
+    return np.concatenate([matrix[j:, j] for j in range(matrix.shape[0])])
 
 
 def as_vector(control, t):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from hypothesis import settings
+from hypothesis import strategies as st
 
 # Property tests repeat.
 FIXED = settings(derandomize=True, deadline=None, database=None, max_examples=40)
+SEEDS = st.integers(0, 10**6)
 
 # Specification 3, part 2: double integrator, T = 0.5 s.
 T = 0.5

@@ -2,12 +2,12 @@
 
 import casadi as ca
 import numpy as np
+from problems import graded
 
 import covocp as co
 from covocp.models import unknown_lag
 
-# Graded towards the end, where the control of 6.12 has its boundary layer.
-GRADED = 1 - (1 - np.linspace(0.0, 1.0, 41)) ** 2
+GRADED = graded(40)
 
 
 def steered(variance=0.1, **options):

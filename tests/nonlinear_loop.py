@@ -151,11 +151,6 @@ def reference(truth=None, feedback=None):
     )
 
 
-def lower(matrix):
-    """Half-vector: the columns of the lower triangle."""
-    return np.concatenate([matrix[j:, j] for j in range(matrix.shape[0])])
-
-
 def random_point(seed):
     """x (with c), u, and positive definite E and S."""
     generator = np.random.default_rng(seed)

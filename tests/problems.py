@@ -54,6 +54,22 @@ def lag(weight=10.0, final=1.0, *, noise=1.0, guess=0.0, duration=10.0):
     return Lag(problem=ocp, x=x, b=b, u=u, E=E)
 
 
+def constrained_gain(constant):
+    """A closed loop whose gain is optimised: one number, or one at each time."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", initial=1.0, variance=1.0), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    gain = co.Gain(constant=constant, lower=0.0, upper=3.0)
+    ocp.minimize_expected(running=0.5 * (x**2 + u**2), gain=gain)
+    return ocp
+
+
+def graded(intervals):
+    """Nodes that are dense towards the end, where 6.12 has a boundary layer [specification, 9.1]."""
+    return 1 - (1 - np.linspace(0, 1, intervals + 1)) ** 2
+
+
 def solve(problem, **options):
     return co.solve(problem, **{"progress": False, **options})
 

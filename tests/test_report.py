@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from problems import constrained_gain, solve
 
 import covocp as co
 from covocp.models import free_time_integrator, mars_entry, mass_chain, unknown_lag
@@ -210,13 +211,7 @@ def test_the_room_to_the_bounds_is_counted_in_root_mean_squares():
 
 
 def test_a_constant_gain_is_one_number():
-    problem = co.Problem(duration=2.0)
-    x, u = problem.state("x", initial=1.0, variance=1.0), problem.control("u")
-    problem.dynamics(x, -x + u, noise=0.1)
-    problem.measurement("m", x, noise=0.1)
-    gain = co.Gain(constant=True, lower=0.0, upper=3.0)
-    problem.minimize_expected(running=0.5 * (x**2 + u**2), gain=gain)
-    solution = co.solve(problem, intervals=20, progress=False)
+    solution = solve(constrained_gain(True), intervals=20)
     text = str(solution)
     assert numbers_after(block_of(text, "gain C, constant"), "u, x") == pytest.approx(
         [solution.gains["C"][0, 0, 0]], rel=1e-4

@@ -8,14 +8,12 @@ import pytest
 from compiled import compile_function
 from hypothesis import given
 from hypothesis import strategies as st
-from linear_systems import FIXED, GAMMA, NOISE, PHI, T, definite
+from linear_systems import FIXED, GAMMA, NOISE, PHI, SEEDS, T, definite
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 from covocp import ProblemError
 from covocp.blocks import kalman
-
-SEEDS = st.integers(0, 10**6)
 
 
 def random_rate(seed, size, count):

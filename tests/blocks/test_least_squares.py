@@ -8,12 +8,10 @@ import pytest
 from compiled import compile_function
 from hypothesis import given
 from hypothesis import strategies as st
-from linear_systems import FIXED, definite
+from linear_systems import FIXED, SEEDS, definite
 
 from covocp import ProblemError
 from covocp.blocks import kalman
-
-SEEDS = st.integers(0, 10**6)
 
 
 def samples(seed, count, size, outputs):

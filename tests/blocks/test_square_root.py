@@ -10,12 +10,10 @@ import pytest
 from compiled import compile_function
 from hypothesis import given
 from hypothesis import strategies as st
-from linear_systems import FIXED, GAMMA, NOISE, PHI, definite, least_squares, random_filter
+from linear_systems import FIXED, GAMMA, NOISE, PHI, SEEDS, definite, least_squares, random_filter
 
 from covocp import ProblemError
 from covocp.blocks import kalman
-
-SEEDS = st.integers(0, 10**6)
 
 
 @FIXED

@@ -17,6 +17,7 @@ from linear_systems import (
     PHI,
     PRINTED,
     R_V,
+    SEEDS,
     H,
     definite,
     least_squares,
@@ -27,7 +28,6 @@ from covocp import ProblemError
 from covocp.blocks import kalman
 
 FORMS = ("joseph", "standard", "sequential", "information")
-SEEDS = st.integers(0, 10**6)
 
 
 def symbols(kind, size, count):

@@ -10,7 +10,7 @@ import casadi as ca
 import closed_loops
 import numpy as np
 import pytest
-from closed_loops import closed_loop, mars, mars_in_density, piecewise_linear
+from closed_loops import closed_loop, lower, mars, mars_in_density, piecewise_linear
 from refusals import refused
 from scipy.integrate import cumulative_simpson, solve_ivp
 
@@ -46,10 +46,6 @@ def values(problem, expression, x, u):
     symbols = [entry.symbol for entry in problem.states]
     function = ca.Function("f", [*symbols, problem.controls[0].symbol], [expression])
     return function(*(ca.DM(row).T for row in x.T), ca.DM(np.ravel(u)).T).full().ravel()
-
-
-def lower(matrix):
-    return np.concatenate([matrix[j:, j] for j in range(matrix.shape[0])])
 
 
 # --- the specification, by the reference integrator -------------------------------------------------------------------

@@ -7,13 +7,13 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from problems import solve
+from problems import graded, solve
 
 import covocp as co
 from covocp.models import mars_entry, unknown_lag
 
 RADIUS = 11.0951e6  # ft
-GRADED = 1 - (1 - np.linspace(0, 1, 241)) ** 2  # 6.12 has a boundary layer at T
+GRADED = graded(240)
 
 
 @cache
@@ -99,7 +99,7 @@ def test_the_best_input_for_identification_is_a_bad_nominal(weight):
 @pytest.mark.parametrize("start", [-3.0, 2.0, lambda s: 10 * np.sin(9 * s)])
 def test_minimum_of_6_12_is_unique(start):
     """From several starts."""
-    grid = 1 - (1 - np.linspace(0, 1, 41)) ** 2
+    grid = graded(40)
     found = solve(unknown_lag.steering(), grid=grid, guess={"u": start})
     assert found.cost == pytest.approx(2.027146, abs=5e-6)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from closed_loops import lower
 
 import covocp as co
 from covocp.models import (
@@ -18,11 +19,6 @@ from covocp.models import (
     unknown_gain,
     unknown_lag,
 )
-
-
-def lower(matrix):
-    """Entries (i, j), i >= j, column by column."""
-    return np.concatenate([matrix[j:, j] for j in range(matrix.shape[0])])
 
 
 def covariance(size, generator):

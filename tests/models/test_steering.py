@@ -11,7 +11,7 @@ from functools import cache
 import closed_loops
 import numpy as np
 import pytest
-from closed_loops import closed_loop, lag, least_energy, piecewise_linear, with_statistics
+from closed_loops import closed_loop, lag, least_energy, lower, piecewise_linear, with_statistics
 
 import covocp as co
 from covocp.models import unknown_lag
@@ -118,10 +118,6 @@ def test_slopes_by_hand_are_derivatives(make):
 
 
 # --- the model --------------------------------------------------------------------------------------------------------
-
-
-def lower(matrix):
-    return np.concatenate([matrix[j:, j] for j in range(matrix.shape[0])])
 
 
 def test_statement_has_the_equations_of_the_thesis():

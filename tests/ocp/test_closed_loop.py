@@ -11,7 +11,7 @@ import nonlinear_loop as loop
 import numpy as np
 import pytest
 from nonlinear_loop import CONTROLS, NODES, NOMINAL, slopes
-from problems import order, solve
+from problems import graded, order, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -313,7 +313,7 @@ def test_terminal_costate_of_a_solution(formulation, method):
 
 def test_nothing_is_known_exactly_in_theory_and_nearly_in_practice():
     """The lag with Z, (E-1) = (E-20) and the conserved variance in the printed record of a solution."""
-    grid = 1 - (1 - np.linspace(0, 1, 41)) ** 2  # a boundary layer at T
+    grid = graded(40)
     solution = solve(unknown_lag.steering(), grid=grid)
     o = solution.optimality
     assert 0 < o.cost_identity < 1e-5

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from figures import panels
 from loops import steered
 from matplotlib.figure import Figure
 
@@ -13,10 +14,6 @@ from covocp.simulation.runs import simulate
 @pytest.fixture(scope="module")
 def sample():
     return simulate(steered(0.1), 300, 1, step=0.1, store=21, paths=5, progress=False)
-
-
-def panels(figure):
-    return {axes.get_ylabel(): axes for axes in figure.axes if axes.get_visible()}
 
 
 def lines(axes, colour):

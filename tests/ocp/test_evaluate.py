@@ -8,14 +8,13 @@ import casadi as ca
 import closed_loops
 import numpy as np
 import pytest
-from problems import lag, solve
+from problems import graded, lag, solve
 from refusals import refused
 
 import covocp as co
 from covocp.models import noisy_integrator, unknown_lag
 
-# 6.12 has a boundary layer at T.
-GRADED = 1 - (1 - np.linspace(0, 1, 161)) ** 2
+GRADED = graded(160)
 
 
 @cache
@@ -33,7 +32,7 @@ def classical():
 
 def test_classical_design_of_6_12_from_its_control():
     """The row of quadratic synthesis: along its control in closed form, by chords, and solved for."""
-    control, grid = closed_loops.least_energy(), 1 - (1 - np.linspace(0, 1, 641)) ** 2
+    control, grid = closed_loops.least_energy(), graded(640)
     found = co.evaluate(unknown_lag.steering(), nominal={"u": lambda s: control(10 * s)}, grid=grid)
     loop, u = found.loop, found["u"]
     chords = np.sum(np.diff(found.t) * (u[1:] ** 2 + u[1:] * u[:-1] + u[:-1] ** 2)) / 6

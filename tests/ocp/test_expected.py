@@ -8,7 +8,8 @@ import casadi as ca
 import nonlinear_loop as loop
 import numpy as np
 import pytest
-from nonlinear_loop import lower, random_point, slopes
+from closed_loops import lower
+from nonlinear_loop import random_point, slopes
 from problems import solve
 
 import covocp as co

@@ -9,14 +9,14 @@ import closed_loops
 import nonlinear_loop as loop
 import numpy as np
 import pytest
-from problems import solve
+from problems import graded, solve
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import covocp as co
 from covocp.models import unknown_lag
 
-GRID = 1 - (1 - np.linspace(0, 1, 41)) ** 2
+GRID = graded(40)
 
 
 def steering(gain):

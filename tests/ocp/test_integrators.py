@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import casadi as ca
 import numpy as np
+import problems
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_continuous_are
-from scipy.stats import linregress
 
 import covocp as co
 from covocp.integrators import full_interval, hermite, nominal_interval
@@ -83,10 +83,6 @@ def covariances(statement, intervals, step, E0, **options):
     return unpack(nodes[:, 1:], len(E0))
 
 
-def slope(counts, errors):
-    return -linregress(np.log(counts), np.log(errors)).slope
-
-
 @pytest.mark.parametrize("size", [2, 4, 8])
 @pytest.mark.parametrize(("step", "order"), [("gauss", 4), ("rk4", 4), ("strang", 2)])
 def test_order_of_the_covariance_steps(size, step, order):
@@ -95,7 +91,7 @@ def test_order_of_the_covariance_steps(size, step, order):
     statement = statement_of(system, E0, duration)
     counts = [40, 80, 160, 320]
     errors = [np.abs(covariances(statement, n, step, E0)[-1] - exact).max() for n in counts]
-    assert slope(counts, errors) == pytest.approx(order, abs=0.3)
+    assert problems.order(counts, errors) == pytest.approx(order, abs=0.3)
     assert errors[-1] < {4: 2e-7, 2: 2e-4}[order] * np.abs(exact).max()
 
 
@@ -186,7 +182,7 @@ def test_without_measurement_against_the_matrix_exponential(step, order):
     statement = statement_of(Constant(F, G, 0 * F), E0, T)
     counts = [10, 20, 40, 80]
     errors = [np.abs(covariances(statement, n, step, E0)[-1] - exact).max() for n in counts]
-    assert slope(counts, errors) == pytest.approx(order, abs=0.3)
+    assert problems.order(counts, errors) == pytest.approx(order, abs=0.3)
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -288,7 +284,7 @@ def test_order_of_the_nominal_and_its_cost():
         ends, _, cost = interval([1.0, 0.0], *columns)
         found = np.append(np.asarray(ends.full())[:, -1], np.sum(cost.full()))
         errors.append(np.abs(found - exact).max())
-    assert slope(counts, errors) == pytest.approx(4, abs=0.3)
+    assert problems.order(counts, errors) == pytest.approx(4, abs=0.3)
     assert errors[-1] < 1e-7
 
 
@@ -322,7 +318,7 @@ def test_order_of_a_running_cost_on_the_covariance(step, order):
     for n in counts:
         u = np.linspace(1.0, -1.0, n + 1)[None, :]
         errors.append(abs(run(statement, n, step, [0.0, 1.0, 0.0, 5.0], u=u, substeps=2, parameters=[1.0])[1] - exact))
-    assert slope(counts, errors) == pytest.approx(order, abs=0.35)
+    assert problems.order(counts, errors) == pytest.approx(order, abs=0.35)
 
 
 def test_hermite_is_exact_for_cubics():

@@ -8,13 +8,13 @@ import casadi as ca
 import nonlinear_loop as loop
 import numpy as np
 import pytest
-from problems import lag, solve
+from problems import graded, lag, solve
 from refusals import refused
 
 import covocp as co
 from covocp.models import mars_entry, unknown_lag
 
-GRID = 1 - (1 - np.linspace(0, 1, 61)) ** 2
+GRID = graded(60)
 
 
 @cache

@@ -15,6 +15,7 @@ import closed_loops
 import numpy as np
 import pytest
 from closed_loops import System, closed_loop, lag, nominal, piecewise_linear
+from problems import graded
 from scipy.stats import linregress
 
 import covocp as co
@@ -172,11 +173,6 @@ def test_predictions_are_first_order() -> None:
 
 
 # --- first-order lag, section 6.12 ------------------------------------------------------------------------------------
-
-
-def graded(intervals: int) -> np.ndarray:
-    """Nodes for the boundary layer at T [specification, 9.1]."""
-    return 1 - (1 - np.linspace(0, 1, intervals + 1)) ** 2
 
 
 def solve(problem: co.Problem, **options: Any) -> co.Solution:
