@@ -29,6 +29,11 @@ def is_symbolic(value: Any) -> bool:
     return isinstance(value, ca.MX)
 
 
+def is_whole(value: Any, least: int = 1) -> bool:
+    """Whether the value is a whole number (no truth value) and not below the least one."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
+
+
 def check_kind(value: Any, kind: type, remedy: str) -> None:
     """A value must be of a kind, such as a Problem or a Solution.
 
@@ -234,7 +239,7 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
 
 def check_size(name: str, size: Any) -> int:
     """The shape of a symbol must be a positive whole number."""
-    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
+    if not is_whole(size):
         raise ProblemError(
             describe(
                 f"The shape of '{name}' is not a number of components.",

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
-from covocp.errors import ProblemError, describe
 from covocp.matrices import pack, pack_symbolic, unpack_symbolic
 from covocp.simulation.vectorised import Columns, padded, vectorise
 
@@ -112,7 +111,7 @@ def simulate_law(
     """
     start = np.asarray(initial, dtype=float).ravel()
     if start.size != plant.size1_in(0):
-        raise _wrong("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
+        raise values.wrong_argument("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
     _check_numbers({"samples": (samples, 2), "runs": (1 if runs is None else runs, 1)}, duration=duration, step=step)
     times = np.linspace(0.0, float(duration), int(samples))
     loop = _Loop(plant=plant, law=law, observer=observer, running=running, size=start.size)
@@ -295,7 +294,9 @@ def _noisy(
     """Runs with noise that is held over each step, all at once; `state` has a column for each run."""
     rate, control = loop.functions()
     if not isinstance(rate, ca.Function) or not isinstance(control, ca.Function):
-        raise _wrong("law", "casadi.Functions, also in the filter, for runs with noise", "a Python function")
+        raise values.wrong_argument(
+            "law", "casadi.Functions, also in the filter, for runs with noise", "a Python function"
+        )
     runs = state.shape[1]
     steps = int(np.ceil(times[1] / step))
     h = float(times[1]) / steps
@@ -367,10 +368,10 @@ def _check_numbers(counts: dict[str, tuple[int, int]], **times: float) -> None:
     """Counts that are whole and not below their least value, times that are positive."""
     for name, (count, least) in counts.items():
         if isinstance(count, bool) or int(count) != count or count < least:
-            raise _wrong(name, f"a whole number, {least} or more", repr(count))
+            raise values.wrong_argument(name, f"a whole number, {least} or more", repr(count))
     for name, seconds in times.items():
         if not 0.0 < seconds < np.inf:
-            raise _wrong(name, "a positive time [s]", repr(seconds))
+            raise values.wrong_argument(name, "a positive time [s]", repr(seconds))
 
 
 def _root(name: str, density: ArrayLike, size: int) -> Array:
@@ -378,9 +379,3 @@ def _root(name: str, density: ArrayLike, size: int) -> Array:
     given = np.asarray(density, dtype=float)
     full = values.numeric(name, values.weight(name, given * np.eye(size) if given.ndim == 0 else given, size))
     return root(full)
-
-
-def _wrong(name: str, expected: str, received: str) -> ProblemError:
-    return ProblemError(
-        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}")
-    )

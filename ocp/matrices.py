@@ -110,8 +110,3 @@ def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERAN
         return False
     values = np.linalg.eigvalsh(full)
     return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
-
-
-def block_diagonal(blocks: list[Any]) -> Any:
-    """Block-diagonal matrix of symbolic or numeric blocks (an empty list gives a 0 x 0 matrix)."""
-    return ca.diagcat(*blocks) if blocks else ca.DM(0, 0)

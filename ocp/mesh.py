@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from covocp.checks import as_number
+from covocp.checks import as_number, is_whole
 from covocp.errors import ProblemError, describe
 from covocp.integrators import LINEAR_SOLVER, Step
 from covocp.matrices import Array
@@ -207,7 +207,7 @@ def _bounded_matrices(statement: Statement) -> list[str]:
 
 
 def _whole(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+    if not is_whole(value):
         raise ProblemError(
             describe(
                 f"The option '{name}' must be a positive whole number.",

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from covocp.checks import check_kind
+from covocp.checks import check_kind, is_whole
 from covocp.densities import impossible_density
 from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe, warn_user
 from covocp.evaluate import evaluate_controls, evaluation_mesh
@@ -225,7 +225,7 @@ class Solver:
                 )
             )
         for name, number, least in (("starts", starts, 0), ("seed", seed, 0)):
-            if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
+            if not is_whole(number, least):
                 raise ProblemError(
                     describe(
                         f"The option '{name}' is not a whole number.",

@@ -14,7 +14,7 @@ import numpy as np
 
 from covocp.accuracy import mesh_error
 from covocp.along import filter_gain, rates_along
-from covocp.checks import as_number
+from covocp.checks import as_number, is_whole
 from covocp.closed_loop import ClosedLoop, close_loop
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
@@ -434,7 +434,7 @@ class Solution:
         Returns:
             Violation by name, in the unit of the constraint; only those that are violated.
         """
-        if isinstance(points, bool) or not isinstance(points, (int, np.integer)) or points < 1:
+        if not is_whole(points):
             raise ProblemError(
                 describe(
                     "check_path needs a number of parts of each interval.",

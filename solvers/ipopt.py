@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_positive
+from covocp.checks import check_positive, is_whole
 from covocp.errors import ProblemError, describe
 from covocp.extremal import Extremal, Guess, Outcome
 from covocp.guess import choose_scales, quadrature_weights, stiffness
@@ -120,8 +120,7 @@ def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: An
     """Refuse options that mean nothing, or nothing to the plugin."""
     if tolerance is not None:
         check_positive("tolerance", tolerance)
-    whole = isinstance(max_iterations, (int, np.integer)) and not isinstance(max_iterations, bool)
-    if max_iterations is not None and not (whole and max_iterations >= 0):
+    if max_iterations is not None and not is_whole(max_iterations, 0):
         raise _option_error("max_iterations", "a number of iterations: 0, 1, 2, ...", max_iterations)
     if hessian not in ("auto", "exact", "limited-memory"):
         raise _option_error("hessian", "'auto', 'exact' or 'limited-memory'", hessian)

@@ -12,8 +12,7 @@ import casadi as ca
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.blocks.updates import Form, Missing, updating
-from covocp.blocks.values import is_symbolic, weight
-from covocp.errors import ProblemError, describe
+from covocp.blocks.values import is_symbolic, weight, wrong_argument
 
 
 def extended(
@@ -191,7 +190,7 @@ class _Model:
         size, controls = _check_function("f", f, (1, 2))
         _check_shape("f", f.size_out(0), (size, 1))
         if _check_function("h", h, (1,))[0] != size:
-            raise _unfit("h", f"a function of {size} states, as f is", f"{h}")
+            raise wrong_argument("h", f"a function of {size} states, as f is", f"{h}")
         count = h.size1_out(0)
         _check_shape("h", h.size_out(0), (count, 1))
         self.arguments = f.n_in()
@@ -219,12 +218,12 @@ def _density(name: str, value: Any, size: int, model: ca.Function, *, definite: 
     """A covariance as a function of the arguments of f or h."""
     if isinstance(value, ca.Function):
         if [value.size_in(i) for i in range(value.n_in())] != [model.size_in(i) for i in range(model.n_in())]:
-            raise _unfit(name, f"a function of the arguments of {model}", f"{value}")
+            raise wrong_argument(name, f"a function of the arguments of {model}", f"{value}")
         _check_shape(name, value.size_out(0), (size, size))
         return value
     numbers = weight(name, value, size, definite=definite)
     if is_symbolic(numbers):
-        raise _unfit(name, "numbers, or a casadi.Function", f"an expression, {numbers}"[:80])
+        raise wrong_argument(name, "numbers, or a casadi.Function", f"an expression, {numbers}"[:80])
     inputs = [ca.SX.sym(f"i{i}", *model.size_in(i)) for i in range(model.n_in())]
     return ca.Function(name, inputs, [ca.SX(numbers)])
 
@@ -237,18 +236,12 @@ def _check_function(name: str, function: Any, counts: tuple[int, ...]) -> tuple[
     """
     wanted = "a casadi.Function of " + " or ".join(("x", "(x, u)")[count - 1] for count in counts)
     if not isinstance(function, ca.Function):
-        raise _unfit(name, wanted, f"{type(function).__name__}")
+        raise wrong_argument(name, wanted, f"{type(function).__name__}")
     if function.n_in() not in counts or any(function.size2_in(i) != 1 for i in range(function.n_in())):
-        raise _unfit(name, f"{wanted}, columns", f"{function}")
+        raise wrong_argument(name, f"{wanted}, columns", f"{function}")
     return function.size1_in(0), function.size1_in(1) if function.n_in() == 2 else 0
 
 
 def _check_shape(name: str, received: tuple[int, int], wanted: tuple[int, int]) -> None:
     if tuple(received) != wanted:
-        raise _unfit(name, "values of shape {} x {}".format(*wanted), "{} x {}".format(*received))
-
-
-def _unfit(name: str, expected: str, received: str) -> ProblemError:
-    return ProblemError(
-        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}")
-    )
+        raise wrong_argument(name, "values of shape {} x {}".format(*wanted), "{} x {}".format(*received))

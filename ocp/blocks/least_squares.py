@@ -148,14 +148,8 @@ def _forgetting(value: Any) -> Any:
     """A number in (0, 1] or an expression."""
     result = values.matrix("forgetting", value, (1, 1))
     if not values.is_symbolic(result) and not 0.0 < float(result) <= 1.0:
-        raise ProblemError(
-            describe(
-                "The argument 'forgetting' does not fit.",
-                expected="a number in (0, 1]",
-                received=f"{float(result):g}",
-                remedy="1 forgets nothing, 0.98 about all that is older than 50 samples",
-            )
-        )
+        remedy = "1 forgets nothing, 0.98 about all that is older than 50 samples"
+        raise values.wrong_argument("forgetting", "a number in (0, 1]", f"{float(result):g}", remedy)
     return result
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
-from covocp.blocks.values import numeric, square, symmetrised, weight
+from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 from covocp.errors import ProblemError, describe
 
 Array = NDArray[np.float64]
@@ -79,14 +79,8 @@ def lyapunov_certificate(
 
 def _symmetric(numbers: Array) -> Array:
     if np.abs(numbers - numbers.T).max(initial=0.0) > 1e-9 * np.abs(numbers).max(initial=0.0):
-        raise ProblemError(
-            describe(
-                "The argument 'matrix' does not fit.",
-                expected="a symmetric matrix",
-                received=f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}",
-                remedy="V = x'matrix x has a symmetric one",
-            )
-        )
+        difference = f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}"
+        raise wrong_argument("matrix", "a symmetric matrix", difference, "V = x'matrix x has a symmetric one")
     return np.asarray(symmetrised(numbers))
 
 

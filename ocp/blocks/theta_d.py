@@ -31,7 +31,7 @@ from covocp.blocks.theta_d_tuning import Convergence as Convergence
 from covocp.blocks.theta_d_tuning import choose as choose
 from covocp.blocks.theta_d_tuning import convergence as convergence
 from covocp.blocks.theta_d_tuning import radius as radius
-from covocp.errors import ProblemError, describe
+from covocp.checks import is_whole
 
 Array = NDArray[np.float64]
 
@@ -289,10 +289,12 @@ def _polynomials(
 def _corrections(options: _Options) -> int:
     """Number of corrections, N."""
     terms = options.terms
-    if isinstance(terms, bool) or not isinstance(terms, (int, np.integer)) or terms < 1:
-        raise _wrong("terms", "a positive whole number", repr(terms), "give 1 for the linear law, 3 for the paper's")
+    if not is_whole(terms):
+        raise values.wrong_argument(
+            "terms", "a positive whole number", repr(terms), "give 1 for the linear law, 3 for the paper's"
+        )
     if options.form not in FORMS:
-        raise _wrong("form", "one of " + ", ".join(FORMS), repr(options.form), "correct the name")
+        raise values.wrong_argument("form", "one of " + ", ".join(FORMS), repr(options.form), "correct the name")
     return int(terms) - 1
 
 
@@ -300,13 +302,11 @@ def _each(name: str, options: _Options, count: int) -> Array:
     """k or l of each correction."""
     given = values.numeric(name, values.matrix(name, getattr(options, name))).ravel()
     if given.size not in (1, count):
-        raise _wrong(name, f"a number or {count}, one for each correction", f"{given.size} numbers", f"correct {name}")
+        raise values.wrong_argument(
+            name, f"a number or {count}, one for each correction", f"{given.size} numbers", f"correct {name}"
+        )
     if name == "l" and np.any(given < 0.0):
-        raise _wrong(name, "numbers that are not negative", f"{given.min():g}", "with l < 0 the factors grow for ever")
+        raise values.wrong_argument(
+            name, "numbers that are not negative", f"{given.min():g}", "with l < 0 the factors grow for ever"
+        )
     return np.array(np.broadcast_to(given, (count,)))
-
-
-def _wrong(name: str, expected: str, received: str, remedy: str) -> ProblemError:
-    return ProblemError(
-        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=remedy)
-    )

@@ -17,7 +17,8 @@ from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
 from covocp.blocks.factorisation import as_states, dependence
-from covocp.errors import ProblemError, describe, warn_user
+from covocp.checks import is_whole
+from covocp.errors import warn_user
 
 Array = NDArray[np.float64]
 
@@ -187,7 +188,7 @@ def choose(
     samples = as_states(states, size)
     instants = values.numeric("times", values.matrix("times", times)).ravel()
     if instants.size != len(samples):
-        raise _wrong("times", f"{len(samples)} numbers, one for each state", f"{instants.size} numbers")
+        raise values.wrong_argument("times", f"{len(samples)} numbers, one for each state", f"{instants.size} numbers")
     riccati = sdre.solution(x, A0, A, B, Q, R)
     wanted = np.array([_largest(riccati(sample)) for sample in samples])
     state, rest = dependence(x, A, size)
@@ -228,8 +229,8 @@ def _guesses(count: int, starts: int, span: float, seed: int) -> Array:
 def _count(terms: int, starts: int) -> int:
     """Number of corrections of a fit."""
     for name, value, least in (("terms", terms, 2), ("starts", starts, 1)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise _wrong(name, f"a whole number, {least} or more", repr(value))
+        if not is_whole(value, least):
+            raise values.wrong_argument(name, f"a whole number, {least} or more", repr(value))
     return int(terms) - 1
 
 
@@ -245,7 +246,9 @@ def _matrices(state: Any, rest: Any, samples: Array) -> list[Array]:
     matrices = [np.asarray(evaluate(sample).full()) for sample in samples]
     for sample, matrix in zip(samples, matrices, strict=True):
         if not np.isfinite(matrix).all():
-            raise _wrong("A", "finite entries at every state", f"NaN or inf at x = {np.array2string(sample)}")
+            raise values.wrong_argument(
+                "A", "finite entries at every state", f"NaN or inf at x = {np.array2string(sample)}"
+            )
     return matrices
 
 
@@ -327,9 +330,3 @@ def _bounds(begin: series.Start) -> Any:
         return float(limit / (2.0 * kappa * size)) if size > 0.0 else np.inf
 
     return guaranteed
-
-
-def _wrong(name: str, expected: str, received: str) -> ProblemError:
-    return ProblemError(
-        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}")
-    )

@@ -42,15 +42,17 @@ def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, 
         try:
             numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
         except (TypeError, ValueError) as error:
-            raise _wrong(name, "numbers or a CasADi expression", f"{type(value).__name__}: {value!r}"[:100]) from error
+            raise wrong_argument(
+                name, "numbers or a CasADi expression", f"{type(value).__name__}: {value!r}"[:100]
+            ) from error
         if numbers.ndim > 2:
-            raise _wrong(name, "a matrix", f"an array of {numbers.ndim} dimensions")
+            raise wrong_argument(name, "a matrix", f"an array of {numbers.ndim} dimensions")
         if not np.isfinite(numbers).all():
-            raise _wrong(name, "finite numbers", "NaN or inf")
+            raise wrong_argument(name, "finite numbers", "NaN or inf")
         result = ca.DM(numbers)
     if any(wanted is not None and wanted != have for wanted, have in zip(shape, result.shape, strict=True)):
         wanted = " x ".join("n" if size is None else str(size) for size in shape)
-        raise _wrong(name, f"shape {wanted}", " x ".join(str(size) for size in result.shape))
+        raise wrong_argument(name, f"shape {wanted}", " x ".join(str(size) for size in result.shape))
     return result
 
 
@@ -62,7 +64,7 @@ def square(name: str, value: Any, size: int | None = None) -> Any:
     """
     result = matrix(name, value, (size, size))
     if result.shape[0] != result.shape[1]:
-        raise _wrong(name, "a square matrix", " x ".join(str(size) for size in result.shape))
+        raise wrong_argument(name, "a square matrix", " x ".join(str(size) for size in result.shape))
     return result
 
 
@@ -79,12 +81,12 @@ def weight(name: str, value: Any, size: int | None = None, *, definite: bool = F
     single = getattr(value, "dtype", None) == np.float32
     tolerance = (SINGLE_ROUNDOFF if single else ROUNDOFF) * float(np.abs(numbers).max(initial=0.0))
     if np.abs(numbers - numbers.T).max(initial=0.0) > tolerance:
-        raise _wrong(name, "a symmetric matrix", f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}")
+        raise wrong_argument(name, "a symmetric matrix", f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}")
     if numbers.size:
         smallest = float(np.linalg.eigvalsh(numbers)[0])
         if smallest < -tolerance or (definite and smallest <= 0.0):
             kind = "positive definite" if definite else "positive semidefinite"
-            raise _wrong(name, f"a {kind} matrix", f"a smallest eigenvalue of {smallest:.3g}")
+            raise wrong_argument(name, f"a {kind} matrix", f"a smallest eigenvalue of {smallest:.3g}")
     return result
 
 
@@ -95,7 +97,7 @@ def numeric(name: str, value: Any) -> NDArray[np.float64]:
         ProblemError: it is an expression.
     """
     if is_symbolic(value):
-        raise _wrong(name, "numbers: this is solved by iteration", f"an expression, {str(value)[:60]}")
+        raise wrong_argument(name, "numbers: this is solved by iteration", f"an expression, {str(value)[:60]}")
     return np.asarray(value.full())
 
 
@@ -115,7 +117,13 @@ def symmetrised(value: Any) -> Any:
     return 0.5 * (value + value.T)
 
 
-def _wrong(name: str, expected: str, received: str) -> ProblemError:
+def wrong_argument(name: str, expected: str, received: str, remedy: str = "") -> ProblemError:
+    """The error of an argument that does not fit."""
     return ProblemError(
-        describe(f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=f"correct {name}")
+        describe(
+            f"The argument '{name}' does not fit.",
+            expected=expected,
+            received=received,
+            remedy=remedy or f"correct {name}",
+        )
     )

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from covocp.matrices import (
-    block_diagonal,
     half_indices,
     half_length,
     is_semidefinite,
@@ -143,9 +142,3 @@ def test_roundoff_is_forgiven_but_not_more():
 
 def test_one_indefinite_matrix_among_many():
     assert not is_semidefinite(np.stack([np.eye(2), np.diag([1.0, -0.1]), np.eye(2)]))
-
-
-def test_block_diagonal():
-    x = ca.SX.sym("x", 2, 2)
-    assert block_diagonal([x, ca.DM(1.0)]).shape == (3, 3)
-    assert block_diagonal([]).shape == (0, 0)
