@@ -67,16 +67,16 @@ def readme(
         linking: what has to be linked besides, a paragraph.
     """
     objects = f"{name}.c {name}_casadi.c"
-    warnings = ", ".join(f"`{flag}`" for flag in (*EXCEPTIONS, *GCC_EXCEPTIONS))
-    parts = [
-        f"# {name}",
-        "\n".join(title),
     flags = "-std=c99 -O2 -Wall -Wextra -pedantic"
     shell = (
         ""
         if linking
         else f"With a C compiler:\n\n```sh\ncc {flags} -o selftest main.c {objects} -lm && ./selftest\n```\n\n"
     )
+    warnings = ", ".join(f"`{flag}`" for flag in (*EXCEPTIONS, *GCC_EXCEPTIONS))
+    parts = [
+        f"# {name}",
+        "\n".join(title),
         "| file | what it is |\n|---|---|\n"
         f"| `{name}.h` | what you include: types, sizes, status codes, functions (C99 and C++) |\n"
         f"| `{name}.c` | checks arguments, keeps the state, calls the functions of the next file |\n"
@@ -129,14 +129,6 @@ def _function(name: str, law: Law) -> str:
     return "\n\n".join(lines)
 
 
-def _statuses(name: str, laws: tuple[Law, ...]) -> str:
-    known = sorted({status for law in laws for status in law.statuses}, key=CODES.__getitem__)
-    rows = [f"| {CODES[status]} | `{code(name, status)}` | {STATUSES[status]} |" for status in known]
-    return "| code | constant | meaning |\n|---|---|---|\n" + "\n".join(rows)
-
-
-def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int]) -> str:
-    where = {law.name: "workspace of the caller" if law.kind == "solver" else "stack" for law in laws}
 def _use(name: str, law: Law) -> str:
     """How a controller is called."""
     sizes = {port.name: port.size for port in (*law.inputs, *law.outputs)}
@@ -152,6 +144,14 @@ status = {name}_step(&controller, measurement, time, {address});
 ```"""
 
 
+def _statuses(name: str, laws: tuple[Law, ...]) -> str:
+    known = sorted({status for law in laws for status in law.statuses}, key=CODES.__getitem__)
+    rows = [f"| {CODES[status]} | `{code(name, status)}` | {STATUSES[status]} |" for status in known]
+    return "| code | constant | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int]) -> str:
+    where = {law.name: "workspace of the caller" if law.kind == "solver" else "stack" for law in laws}
     rows = [f"| `{name}_{law}` | {size} | {where[law]} |" for law, size in work_bytes.items()]
     return (
         "These functions allocate nothing. Arrays that a call works in, in bytes on a machine of 64 bits; the frames "
