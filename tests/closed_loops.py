@@ -155,6 +155,26 @@ def cost_to_go(system, control, ends, forward):
     return integrate(rate, system.end.ravel(), ends[::-1], tolerance.ravel())[0]
 
 
+def loop_rates(system, actual, x, S, u, K, C, E, X, Z):
+    """Rates of E, Xhat and Z with the true statistics (A-13 .. A-15), and the integrands of the costs."""
+    F, G, M, A, B, N = expansion(system, x, u)
+    Q, noise = actual.Q(x, u), K @ actual.U @ K.T
+    estimator, controller = F - K @ M, F - G @ C
+    dE = estimator @ E + E @ estimator.T + noise + Q
+    dX = controller @ X + X @ controller.T - K @ M @ Z - (K @ M @ Z).T + noise
+    dZ = estimator @ Z + Z @ controller.T - E @ M.T @ K.T + noise
+    fed = np.trace(B @ C @ X @ C.T)
+    cross = -2 * np.trace(N @ C @ X) + 2 * np.trace(N @ C @ Z.T)
+    integrands = [
+        system.running(x, u),
+        0.5 * fed,
+        0.5 * (np.trace(A @ (E + X - Z - Z.T)) + cross),
+        0.5 * (np.trace(S @ Q) + np.trace(C.T @ B @ C @ E)),
+        0.5 * (np.trace(A @ E) + np.trace(S @ noise)),
+    ]
+    return np.concatenate([dE.ravel(), dX.ravel(), dZ.ravel(), integrands])
+
+
 def closed_loop(
     system: System,
     control: Callable,
@@ -194,26 +214,9 @@ def closed_loop(
         K = E @ M.T @ U_inverse if filter is None else np.atleast_2d(filter(t))
         return K, np.linalg.solve(B, G.T @ S + N.T) if feedback is None else np.atleast_2d(feedback(t))
 
-    # The loop with its true statistics, forward (A-13 .. A-15), and the integrands of the costs.
     def loop(t, z):
-        E, X, Z = z[: 3 * n * n].reshape(3, n, n)
         x, S, u = forward(t)[:n], backward(t).reshape(n, n), as_vector(control, t)
-        F, G, M, A, B, N = expansion(system, x, u)
-        Q, (K, C) = actual.Q(x, u), gains(t)
-        noise, estimator, controller = K @ actual.U @ K.T, F - K @ M, F - G @ C
-        dE = estimator @ E + E @ estimator.T + noise + Q
-        dX = controller @ X + X @ controller.T - K @ M @ Z - (K @ M @ Z).T + noise
-        dZ = estimator @ Z + Z @ controller.T - E @ M.T @ K.T + noise
-        fed = np.trace(B @ C @ X @ C.T)
-        cross = -2 * np.trace(N @ C @ X) + 2 * np.trace(N @ C @ Z.T)
-        integrands = [
-            system.running(x, u),
-            0.5 * fed,
-            0.5 * (np.trace(A @ (E + X - Z - Z.T)) + cross),
-            0.5 * (np.trace(S @ Q) + np.trace(C.T @ B @ C @ E)),
-            0.5 * (np.trace(A @ E) + np.trace(S @ noise)),
-        ]
-        return np.concatenate([dE.ravel(), dX.ravel(), dZ.ravel(), integrands])
+        return loop_rates(system, actual, x, S, u, *gains(t), *z[: 3 * n * n].reshape(3, n, n))
 
     first = np.concatenate([actual.variance.ravel(), np.zeros(2 * n * n + 5)])
     tolerance = ABSOLUTE * np.concatenate([np.tile(square.ravel(), 3), np.full(5, size)])
