@@ -10,6 +10,7 @@ from exports import package
 
 import covocp as co
 from covocp.export import export_c
+from covocp.export.laws import span
 
 pytestmark = pytest.mark.needs_cc
 PROGRAM = """\
@@ -97,6 +98,23 @@ def test_no_nonsense_leads_to_a_crash_or_a_control_that_is_no_number(name, tmp_p
     done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert all(int(count) > 0 for count in done.stdout.split())  # every status was seen
+
+
+@pytest.mark.parametrize("period", [None, 0.05])
+def test_a_control_that_overflows_is_the_nominal_one(period, tmp_path):
+    """Gains of 1e12 in floats: an estimate below the largest one would give an infinite control."""
+    ocp = co.Problem(duration=2.0, name="tiny")
+    x, u = ocp.state("x", initial=0.0, variance=0.1), ocp.control("u", unit="pN")
+    ocp.dynamics(x, -x + 1e-12 * u, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize_expected(running=0.5e-24 * u**2, terminal_weight={x: 2.0})
+    solution = co.evaluate(ocp, nominal={"u": 3e11})
+    controller = export_c(solution, tmp_path / "tiny", precision="single", period=period).python().step
+    controller.step(0.0, 1.9)
+    controller._values[span(controller.law.outputs, "estimate")] = 9e29
+    control = controller.step(np.nan, 1.95)
+    assert controller.status == "ESTIMATE_LOST"
+    assert control[0] == pytest.approx(3e11, rel=1e-6)
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
