@@ -32,8 +32,9 @@ Step = Literal["gauss", "strang", "rk4"]
 # Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
-# With equilibration LAPACK's interface prints every matrix that has a zero row.
-SOLVER_OPTIONS: dict[str, dict[str, Any]] = {"lapacklu": {"equilibration": False}}
+# With equilibration LAPACK's interface prints every matrix that has a zero row; the QR's bound below which a pivot counts
+# as zero, 1e-12, would depend on the units.
+SOLVER_OPTIONS: dict[str, dict[str, Any]] = {"lapacklu": {"equilibration": False}, "qr": {"eps": 1e-300}}
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
 
@@ -55,8 +56,19 @@ def interval_symbols(statement: Statement, symbolic: Any) -> tuple[Any, ...]:
 
 
 def linear_solve(matrix: Any, right: Any, solver: str) -> Any:
-    """matrix^-1 right; where the matrix is singular the evaluation fails, without a word on the terminal."""
-    return ca.solve(matrix, right, solver, SOLVER_OPTIONS.get(solver, {}))
+    """matrix^-1 right; where the matrix is singular the evaluation fails, without a word on the terminal.
+
+    CasADi's QR does not exchange rows, so it loses what rows of different units differ by (Mars entry in feet and
+    radians: 11 digits of the cost). So they are divided by their norms, on which the result and its slope do not
+    depend, and one step of refinement restores the rest (Higham, BIT 31, 1991).
+    """
+    options = SOLVER_OPTIONS.get(solver, {})
+    if solver != COMPILED_SOLVER:
+        return ca.solve(matrix, right, solver, options)
+    inverse_norms = ca.diag(ca.stop_diff(1 / ca.sum2(ca.fabs(matrix)), 1))
+    matrix, right = inverse_norms @ matrix, inverse_norms @ right
+    first = ca.solve(matrix, right, solver, options)
+    return first + ca.solve(matrix, right - matrix @ first, solver, options)
 
 
 def _slopes(statement: Statement, count: int) -> dict[str, Any]:
