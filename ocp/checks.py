@@ -63,6 +63,8 @@ def as_number(name: str, what: str, value: Any) -> Array:
             )
         )
     try:
+        if value is None or _no_numbers(value):
+            raise TypeError("numpy would read words and truths as numbers, and None as NaN")
         return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
     except (TypeError, ValueError) as error:
         raise ProblemError(
@@ -73,6 +75,13 @@ def as_number(name: str, what: str, value: Any) -> Array:
                 remedy=f"check the {what} of '{name}'",
             )
         ) from error
+
+
+def _no_numbers(value: Any) -> bool:
+    """Whether a value holds words or truths; None among the entries of a list is NaN."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_no_numbers, value))
+    return isinstance(value, (str, bool, np.bool_)) or (isinstance(value, np.ndarray) and value.dtype.kind == "b")
 
 
 def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:
@@ -209,13 +218,13 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
 
 
 def check_bounds(name: str, lower: Array, upper: Array) -> None:
-    """Bounds must not cross."""
-    for i in np.flatnonzero(lower > upper):
+    """Bounds must not cross, nor leave nothing but infinity."""
+    for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf)):
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
             describe(
-                f"The bounds of {entry} cross.",
-                expected="lower <= upper",
+                f"The bounds of {entry} cross." if lower[i] > upper[i] else f"The bounds of {entry} leave no number.",
+                expected="lower <= upper, lower < inf, upper > -inf",
                 received=f"lower = {lower[i]:g}, upper = {upper[i]:g}",
                 remedy="exchange or correct them",
             )
@@ -253,7 +262,7 @@ def check_size(name: str, size: Any) -> int:
 
 def check_positive(name: str, value: Any, unit: str = "") -> float:
     """A positive finite number."""
-    number = as_number(name, "value", value)
+    number = np.full(1, np.nan) if value is None else as_number(name, "value", value)
     if number.size != 1 or not math.isfinite(float(number.reshape(()))) or float(number.reshape(())) <= 0:
         raise ProblemError(
             describe(
@@ -382,8 +391,8 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
 def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
     """The value as an expression of the given shape (a scalar zero fits every shape)."""
     try:
-        if isinstance(value, ca.SX):
-            raise TypeError("symbols of another kind")
+        if value is None or isinstance(value, ca.SX) or _no_numbers(value):
+            raise TypeError("symbols of another kind, words, or nothing")
         expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
     except (TypeError, ValueError, NotImplementedError) as error:
         raise ProblemError(

@@ -24,8 +24,8 @@ def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
 class EstimationCovariance:
     """The covariance of the estimation error of the augmented state (states, then unknowns).
 
-    `E[a, b]` is the block between two symbols, names, or expressions of them (to first order, by their Jacobians);
-    `E.matrix` is the whole symmetric matrix.
+    `E[a, b]` is the block between two symbols, names (also of components, "x[0]"), or expressions of them (to first
+    order, by their Jacobians); `E.matrix` is the whole symmetric matrix.
     """
 
     def __init__(self, entries: Sequence[Entry], declaration: Matrix) -> None:
@@ -67,6 +67,9 @@ class EstimationCovariance:
 
     def _rows(self, key: Any) -> Any:
         """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
+        if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
+            row = self.labels.index(key)
+            return slice(row, row + 1)
         offset, jacobians = 0, []
         for entry in self._entries:
             span = slice(offset, offset + entry.size)

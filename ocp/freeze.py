@@ -147,6 +147,25 @@ def _check_complete(problem: Problem) -> None:
             )
         )
     _check_symbols(problem)
+    _check_measurements(problem)
+
+
+def _check_measurements(problem: Problem) -> None:
+    """An instrument reads the actual system: what it shows, and its noise, know no covariance."""
+    matrices = {entry.symbol.__hash__(): entry.name for entry in problem.matrices}
+    for measurement in problem.measurements:
+        for what, value in (("", measurement.expression), ("noise density of ", measurement.noise)):
+            for symbol in ca.symvar(value):
+                if symbol.__hash__() in matrices:
+                    raise ProblemError(
+                        describe(
+                            f"The {what}measurement '{measurement.name}' contains the matrix "
+                            f"'{matrices[symbol.__hash__()]}' (declared at {measurement.where}).",
+                            expected="states, unknowns, controls, parameters and time",
+                            received=str(value)[:200],
+                            remedy="measure what the actual system shows; matrices go into costs and constraints",
+                        )
+                    )
 
 
 def _check_symbols(problem: Problem) -> None:

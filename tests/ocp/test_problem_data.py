@@ -228,6 +228,43 @@ def test_negative_scale():
     empty().state("x", initial=0, scale=-1)
 
 
+@wrong("bounds of 'u' leave no number", "lower = inf")
+def test_lower_bound_of_infinity():
+    empty().control("u", lower=np.inf)
+
+
+@wrong("bounds of component 1 of 'y' leave no number", "upper = -inf")
+def test_upper_bound_of_minus_infinity():
+    empty().state("y", 2, initial=0, upper=[1, -np.inf])
+
+
+# --- no numbers -------------------------------------------------------------------------------------------------------
+
+
+@wrong("value of 'k'", "not a number", "None")
+def test_parameter_that_is_missing():
+    empty().parameter("k", None)
+
+
+@wrong("variance of 'y'", "not a number", "True")
+def test_truth_for_a_number():
+    empty().state("y", 2, initial=0, variance=[1, True])
+
+
+@wrong("rate of 'x'", "not an expression", "None")
+def test_rate_that_is_missing():
+    ocp = empty()
+    ocp.dynamics(ocp.state("x", initial=0), None)
+
+
+def test_none_among_final_values_is_free():
+    ocp = empty()
+    x, u = ocp.state("x", 2, initial=0, final=[None, 1]), ocp.control("u", 2)
+    ocp.dynamics(x, u)
+    ocp.minimize(ca.sumsqr(u))
+    assert np.abs(solve(ocp)["x"][-1] - [0, 1]).max() < 1e-12
+
+
 # --- NaN and inf ------------------------------------------------------------------------------------------------------
 
 
@@ -320,6 +357,16 @@ def test_duration_that_is_nan():
 @wrong("'duration'", "not a number", "'ten'")
 def test_duration_in_words():
     co.Problem("ten")
+
+
+@wrong("'duration'", "not a number", "'10'")
+def test_duration_as_text():
+    co.Problem("10")
+
+
+@wrong("'duration'", "> 0 s", "None", "Free(guess)")
+def test_duration_that_is_missing():
+    co.Problem(None)
 
 
 @wrong("not ordered", "lower <= guess <= upper", "lower = 2, guess = 1, upper = 3")
