@@ -41,7 +41,7 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
 
     Args:
         statement: the problem.
-        given: values by name.
+        given: values by name or symbol.
         base: the others; None: as they were declared.
 
     Raises:
@@ -53,18 +53,19 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
         raise ProblemError(
             describe(
                 "The parameters are not given by name.",
-                expected="a dict of name to value",
+                expected="a dict of name or symbol to value",
                 received=repr(given)[:100],
                 remedy="write parameters={'name': value}",
             )
         )
-    for name, value in given.items():
-        if name not in blocks:
+    for key, value in given.items():
+        name = name_of(key, statement.symbols, tuple(blocks), missing_ok=True)
+        if not name:
             raise ProblemError(
                 describe(
-                    f"There is no parameter '{name}'.",
+                    f"There is no parameter '{key}'.",
                     expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
-                    received=repr(name),
+                    received=repr(key)[:100],
                     remedy="declare it by Problem.parameter",
                 )
             )

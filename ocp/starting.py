@@ -15,7 +15,7 @@ from covocp.lookup import name_of
 from covocp.matrices import Array, pack
 from covocp.mesh import Mesh
 from covocp.solution import Solution
-from covocp.statement import Statement
+from covocp.statement import Block, Statement
 from covocp.trajectory import Multipliers, Trajectory
 
 
@@ -23,7 +23,8 @@ def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) 
     """A guess on a mesh from what the user gave.
 
     Raises:
-        ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess.
+        ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess, or a solution
+            without any symbol of this problem.
     """
     if guess is None:
         return Guess(trajectory=first_guess(statement, mesh, parameters))
@@ -65,6 +66,7 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, starts: 
 
 def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
+    _check_common(statement, solution)
     duration = solution.duration if statement.duration.free else statement.duration.guess
     own = solution.mesh
     same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
@@ -102,6 +104,29 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
         warm=True,
     )
+
+
+def _check_common(statement: Statement, solution: Solution) -> None:
+    """A solution that says nothing about this problem is a mistake, not a guess.
+
+    Raises:
+        ProblemError: no state, control or matrix of the same name and size.
+    """
+
+    def of(blocks: tuple[Block, ...]) -> set[tuple[str, str, int]]:
+        return {(b.kind, b.name, b.size) for b in blocks if b.kind in ("state", "control", "matrix")}
+
+    own, given = of(statement.blocks), of(solution.blocks)
+    if not own & given:
+        words = [", ".join(f"{kind} {name} ({size})" for kind, name, size in sorted(side)) for side in (own, given)]
+        raise ProblemError(
+            describe(
+                f"The solution of '{solution.name}' is no guess: it has nothing in common with this problem.",
+                expected=f"some of {words[0]}",
+                received=words[1],
+                remedy="give a solution of a problem with the same names and sizes, or a dict of name to guess",
+            )
+        )
 
 
 def _resample(values: Array, old: Array, new: Array) -> Array:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from problems import solve
-from refusals import empty, lag, uncertain, wrong
+from refusals import empty, lag, refused, simple, uncertain, wrong
 
 import covocp as co
 
@@ -134,6 +135,15 @@ def test_guess_of_another_kind():
     solve(lag()[0], guess=3)
 
 
+def test_guess_that_is_the_solution_of_another_problem():
+    other = empty()
+    y, v = other.state("y", 2, initial=0, final=1), other.control("v", 2)
+    other.dynamics(y, v)
+    other.minimize(v.T @ v)
+    found = solve(other, intervals=5)
+    refused(lambda: solve(lag()[0], guess=found), "nothing in common", "state x (1)", "state y (2)")
+
+
 @wrong("guess of 'u'", "shape (7, 3)")
 def test_shape_of_a_guess_given_to_solve():
     solve(lag()[0], guess={"u": np.zeros((7, 3))})
@@ -185,3 +195,18 @@ def test_measurement_noise_by_a_parameter():
 @wrong("initial value of 'E'", "negative", "-1")
 def test_variance_by_a_parameter():
     co.Solver(uncertain(), intervals=10).solve({"v": -1.0}, progress=False)
+
+
+def test_parameters_by_name_and_by_symbol():
+    ocp, x, u = simple()
+    k = ocp.parameter("k", 1.0)
+    ocp.subject_to(x - k, lower=0.0, at="final")
+    solver = co.Solver(ocp, intervals=10)
+    by_name, by_symbol = (solver.solve({key: 2.0}, progress=False) for key in ("k", k))
+    assert by_name.cost == by_symbol.cost == pytest.approx(4.0, rel=1e-6)  # u = k
+
+
+@wrong("no parameter 'x'", "one of v, r")
+def test_a_state_for_a_parameter():
+    ocp = uncertain()
+    co.Solver(ocp, intervals=10).solve({ocp.states[0].symbol: 1.0}, progress=False)
