@@ -9,6 +9,9 @@ from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
 from covocp.shooting import refined_run
 
+# Costs below this count as zero: a tracking cost whose optimum is zero is known to roundoff only, and no share of it.
+NO_COST = 1e-12
+
 
 def mesh_error(extremal: Extremal, running: float) -> float:
     """Relative change of the cost by halving the integration steps, to first order.
@@ -21,7 +24,7 @@ def mesh_error(extremal: Extremal, running: float) -> float:
         running: its running cost.
 
     Returns:
-        |change| / |cost|; nan where the run is not finite.
+        |change| / max(|cost|, NO_COST); nan where the run is not finite.
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     jumps, refined, last = refined_run(st, mesh, t, extremal.parameters)
@@ -32,7 +35,7 @@ def mesh_error(extremal: Extremal, running: float) -> float:
     change = float(np.sum(weights * jumps)) + refined - running
     change += _at_the_end(extremal, last) - _at_the_end(extremal, t.e[-1])
     cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    return abs(change) / max(abs(cost), float(np.finfo(float).tiny)) if change else 0.0
+    return abs(change) / max(abs(cost), NO_COST)
 
 
 def _at_the_end(extremal: Extremal, matrices: Array) -> float:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.accuracy import NO_COST
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.mesh import Options
 from covocp.methods import METHODS, Solver, check_problem
@@ -259,7 +260,7 @@ def _entries(row: Row, best: float) -> list[str]:
     solution = row.solution
     if solution is None:
         return ["-", "-", "-", "-", "-", "-", "-", seconds]
-    gap = (solution.cost - best) / max(abs(best), float(np.finfo(float).tiny))
+    gap = (solution.cost - best) / max(abs(best), NO_COST)
     slope, costates = None, None
     with suppress(CovocpError, RuntimeError, ArithmeticError, ValueError):
         slope, costates = solution.optimality.stationarity, solution.optimality.costate_difference

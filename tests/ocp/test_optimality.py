@@ -175,3 +175,16 @@ def test_cost_is_the_sum_of_its_terms():
     assert solution.cost_terms["terminal"] == pytest.approx(10 * E22, rel=1e-10)
     assert solution.cost_terms["running"] == pytest.approx(energy, rel=1e-10)
     assert solution.cost == pytest.approx(LAG_COSTS[1.0, 10.0], rel=1e-6)
+
+
+def test_a_cost_of_zero_is_no_coarse_mesh():
+    """A decay followed exactly costs nothing; roundoff is no share of that."""
+    ocp = co.Problem(duration=1.0)
+    x = ocp.state("x", initial=None)
+    ocp.dynamics(x, -x)
+    ocp.minimize(terminal=(x - 1.0) ** 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", co.CovocpWarning)
+        solution = co.solve(ocp, intervals=20, progress=False)
+    assert solution["x"][0] == pytest.approx(np.e, rel=1e-6)
+    assert solution.mesh_error < 1e-8
