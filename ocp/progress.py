@@ -50,6 +50,11 @@ class Progress:
             signal.signal(signal.SIGINT, self._previous)
             self._previous = None
 
+    @property
+    def shown(self) -> bool:
+        """Whether somebody watches."""
+        return self._show
+
     def update(self, iteration: int, cost: float, violation: float) -> None:
         """Report an iteration: its number, its cost, the largest violation of a constraint (scaled)."""
         if self._status is not None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -47,7 +50,8 @@ MESSAGES = {
     "Solve_Succeeded": "solved",
     "Solved_To_Acceptable_Level": "solved to the acceptable level only: the tolerance asked for was not reached",
     "Infeasible_Problem_Detected": "converged to a point of local infeasibility: the constraints may contradict",
-    "Maximum_Iterations_Exceeded": "stopped at the largest number of iterations: start closer, or allow more",
+    "Maximum_Iterations_Exceeded": "stopped at the largest number of iterations: start closer, or allow more "
+    "(max_iterations=)",
     "Restoration_Failed": "the restoration of feasibility failed: the constraints may contradict, or start elsewhere",
     "User_Requested_Stop": "interrupted by the user",
     "Diverging_Iterates": "the iterates diverge: the cost may be unbounded below; add bounds",
@@ -77,7 +81,7 @@ def prepare(
         hessian: of Ipopt: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or
             "limited-memory".
         plugin: name of a CasADi NLP plugin, such as "ipopt", "sqpmethod" or "fatrop"; another one than Ipopt takes its
-            own settings by plugin_options.
+            own settings by plugin_options, and shows its own iterations where there is a terminal.
         plugin_options: passed to CasADi's nlpsol as they are.
         compile: whether the functions of the NLP are compiled by the C compiler of the machine.
 
@@ -174,7 +178,8 @@ class ShootingSolver:
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
         begin = time.perf_counter()
-        nlp, solver = self._build(parameters, guess)
+        with self._hushed(progress):
+            nlp, solver = self._build(parameters, guess)
         bounds = nlp.bounds(parameters)
         w0 = np.clip(nlp.pack(guess.trajectory), bounds["lbx"], bounds["ubx"])
         scale = self._cost_scale(solver, w0, parameters)
@@ -186,7 +191,8 @@ class ShootingSolver:
         if self._monitor is not None:
             self._monitor.attach(progress, scale, bounds)
         try:
-            result = solver(**arguments)
+            with self._hushed(progress):
+                result = solver(**arguments)
         except RuntimeError as error:  # a plugin that gives up by raising; its last iterate is lost, the start is not
             result = {"x": ca.DM(w0), "lam_x": ca.DM.zeros(w0.size), "lam_g": ca.DM.zeros(bounds["lbg"].size)}
             reason = str(error).strip().splitlines()[-1]
@@ -202,6 +208,15 @@ class ShootingSolver:
             "hessian": "limited-memory" if self._limited else "exact",
         }
         return self._outcome(nlp, w, scale * lam_x, scale * lam_g, parameters, bool(stats["success"]), counts)
+
+    @contextmanager
+    def _hushed(self, progress: Progress) -> Iterator[None]:
+        """Other plugins than Ipopt print their iterations, each by options of its own: only where somebody watches."""
+        if self._plugin == "ipopt" or progress.shown:
+            yield
+            return
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+            yield
 
     def _outcome(
         self, nlp: NLP, w: Array, lam_x: Array, lam_g: Array, parameters: Array, success: bool, stats: dict[str, Any]

@@ -311,6 +311,13 @@ def test_another_plugin(eliminated, capfd):
     capfd.readouterr()
 
 
+@pytest.mark.parametrize("plugin", ["sqpmethod", "fatrop"])
+def test_another_plugin_is_silent_where_nobody_watches(plugin, capfd):
+    found = solve(noisy_integrator.problem(1.0, 0.0), plugin=plugin, intervals=20)
+    assert found.cost == pytest.approx(23 / 24, rel=1e-5)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_hessian_can_be_chosen():
     exact = solve(lag().problem, hessian="exact", covariances="eliminated", intervals=20)
     limited = solve(lag().problem, hessian="limited-memory", covariances="states", intervals=20)
