@@ -329,18 +329,23 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     return ""
 
 
+def _counted(number: int, what: str) -> str:
+    """A number of things in words."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def _effort(solution: Solution) -> str:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
-        f"{mesh.intervals} intervals",
+        _counted(mesh.intervals, "interval"),
         f"controls piecewise {mesh.control}",
-        f"{mesh.substeps} integration step{'s' if mesh.substeps > 1 else ''} an interval",
-        f"{len(mesh.segments)} shooting segment{'s' if len(mesh.segments) > 1 else ''}",
+        _counted(mesh.substeps, "integration step") + " an interval",
+        _counted(len(mesh.segments), "shooting segment"),
     ]
     if any(b.kind == "matrix" for b in solution.blocks):
         words.append(f"matrices {'eliminated' if mesh.eliminated else 'as states'}, step '{mesh.step}'")
-    effort = [f"{stats['iterations']} iterations"] if stats.get("iterations", -1) >= 0 else []
+    effort = [_counted(stats["iterations"], "iteration")] if stats.get("iterations", -1) >= 0 else []
     if (seconds := solution_seconds(stats)) is not None:
         effort.append(f"{seconds:.3g} s")
     if stats.get("left_saddle"):

@@ -100,10 +100,10 @@ class Solution:
     augmented: tuple[str, ...]
     targets: Array
     constraints: Mapping[str, tuple[str, ...]]
-    loop: ClosedLoop | None = field(default=None, repr=False)
-    statement: Statement | None = field(default=None, repr=False)
-    stored_costates: Costates | None = field(default=None, repr=False)
-    stored_optimality: Optimality | None = field(default=None, repr=False)
+    loop: ClosedLoop | None = None
+    statement: Statement | None = None
+    stored_costates: Costates | None = None
+    stored_optimality: Optimality | None = None
 
     @staticmethod
     def of(outcome: Outcome, method: str) -> Solution:
@@ -456,6 +456,10 @@ class Solution:
     def to_xarray(self) -> Any:
         """The solution as an xarray.Dataset; see `covocp.storage.to_xarray`."""
         return _later("storage").to_xarray(self)
+
+    def __repr__(self) -> str:
+        """One line: what a console shows of a solution that nobody prints is no page of numbers."""
+        return f"<{type(self).__name__} of '{self.name}' by {self.method}: {self.status}, cost {self.cost:.8g}>"
 
     def __str__(self) -> str:
         """The summary that print shows."""

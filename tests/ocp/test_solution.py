@@ -250,3 +250,11 @@ def test_summary(data):
     assert data.solution.converged
     assert data.solution.method == "ipopt"
     assert data.solution.stats["iterations"] > 0
+
+
+def test_a_console_shows_one_line():
+    """Also of a solution with hundreds of numbers; print shows the page."""
+    text = repr(Data().solution)
+    assert "vectors" in text
+    assert "solved" in text
+    assert len(text) < 120
