@@ -36,6 +36,9 @@ TARGET: dict[str, Any] = {
 }
 BAND = 0.13  # opacity
 NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
+# Curves that change by less than this share of their size are drawn as constants: what is left is a solver's tolerance.
+CONSTANT = 1e-5
+CONSTANT_RANGE = 0.05  # of the value, on both sides
 PANEL = (3.3, 2.15)  # width, height in inches
 LONGEST_LINE = 26  # characters along the height of a panel
 SINGLE = (4.8, 3.2)  # of a panel alone
@@ -285,6 +288,10 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
         axes.axhline(bound, zorder=1, **BOUND)
     axes.set_ylabel(_plain(_folded(panel.label)))
     axes.margins(x=0)
+    low, high = axes.dataLim.intervaly
+    size = max(abs(low), abs(high))
+    if 0 < high - low < CONSTANT * size:
+        axes.set_ylim(low - CONSTANT_RANGE * size, high + CONSTANT_RANGE * size)
     if grouped and panel.legend:
         _entry_legend(axes, panel, count)
 
