@@ -392,3 +392,9 @@ def test_other_problems_of_a_model_and_none_as_a_value() -> None:
     assert find_model("mars_entry").build(["regularization=none"]).expected is not None
     with pytest.raises(co.ProblemError, match="unknown_lag:steering"):
         find_model("unknown_lag:steer")
+
+
+def test_the_package_runs_as_a_module():
+    """Where the script is not on the path."""
+    run = subprocess.run([sys.executable, "-m", "covocp", "list"], capture_output=True, text=True, check=True)
+    assert "unknown_lag" in run.stdout
