@@ -32,8 +32,8 @@ Step = Literal["gauss", "strang", "rk4"]
 # Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
-# With equilibration LAPACK's interface prints every matrix that has a zero row; the QR's bound below which a pivot counts
-# as zero, 1e-12, would depend on the units.
+# With equilibration LAPACK's interface prints every matrix that has a zero row. By default a pivot of the QR's is zero
+# below 1e-12, whatever the units.
 SOLVER_OPTIONS: dict[str, dict[str, Any]] = {"lapacklu": {"equilibration": False}, "qr": {"eps": 1e-300}}
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
