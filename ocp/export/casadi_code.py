@@ -14,6 +14,7 @@ import casadi as ca
 
 from covocp.errors import ExportError, describe
 from covocp.export.laws import Law
+from covocp.export.reentrant import reentrant, shares_memory
 
 # What the generated functions do that -Wall -Wextra warns about: all of them have the same arguments.
 EXCEPTIONS = ("-Wunused-parameter", "-Wunused-variable", "-Wunused-but-set-variable", "-Wunused-function")
@@ -54,10 +55,17 @@ class Sizes:
 
 @dataclass(frozen=True, kw_only=True)
 class Generated:
-    """C code of all laws: the file, and the work arrays by name of the law."""
+    """C code of all laws.
+
+    Attributes:
+        source: the file.
+        sizes: the work arrays by name of the law.
+        alone: whether a call needs static memory, so that only one may run at a time.
+    """
 
     source: str
     sizes: dict[str, Sizes]
+    alone: bool
 
 
 def core_name(package: str, law: Law) -> str:
@@ -90,6 +98,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
         source = (Path(folder) / f"{package}_casadi.c").read_text(encoding="utf-8")
         header = (Path(folder) / f"{package}_casadi.h").read_text(encoding="utf-8")
     _check(source, laws)
+    source = reentrant(source)
     if precision == "single":  # so that sqrt, sin, ... of a float are computed as floats
         source = source.replace("#include <math.h>", "#include <tgmath.h>", 1)
     pragmas, gcc = (
@@ -98,7 +107,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
     )
     sizes = {law.name: _sizes(header, core_name(package, law)) for law in laws}
     introduction = INTRODUCTION.format(name=package, pragmas=pragmas, gcc=gcc)
-    return Generated(source=introduction + source, sizes=sizes)
+    return Generated(source=introduction + source, sizes=sizes, alone=shares_memory(source))
 
 
 def _renamed(function: ca.Function, name: str) -> ca.Function:

@@ -150,12 +150,14 @@ def _written(
     work = {law.name: _work_bytes(law, sizes[law.name], precision) for law in laws}
     linking = content.linking
     files = {
-        f"{package}.h": header(package, about, laws, sizes, real),
+        f"{package}.h": header(package, about, laws, generated, real),
         f"{package}.c": source(package, laws, sizes),
         f"{package}_casadi.c": generated.source,
         "main.c": self_test(package, laws, precision, tolerance),
         "CMakeLists.txt": cmake_lists(package, precision, linking.cmake(package) if linking else ""),
-        "README.md": readme(package, about, laws, work, precision, linking.words if linking else ""),
+        "README.md": readme(
+            package, about, laws, work, precision, linking.words if linking else "", alone=generated.alone
+        ),
     }
     mark = {"name": package, "covocp": version, "casadi": casadi, "date": date, "precision": precision}
     write_folder(target, files, {**mark, "laws": [law.name for law in laws]})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from covocp.export.c_text import code, comment, constant, described, real, size_names, status_lines
-from covocp.export.casadi_code import Sizes
+from covocp.export.casadi_code import Generated, Sizes
 from covocp.export.laws import Law, Port, stacked_size
 
 STRUCTS = {"sample": "point", "controller": "controller", "solver": "workspace"}
@@ -14,14 +14,14 @@ def struct_name(package: str, law: Law) -> str:
     return f"{package}_{STRUCTS[law.kind]}"
 
 
-def header(package: str, title: tuple[str, ...], laws: tuple[Law, ...], sizes: dict[str, Sizes], real: str) -> str:
+def header(package: str, title: tuple[str, ...], laws: tuple[Law, ...], generated: Generated, real: str) -> str:
     """The text of the header.
 
     Args:
         package: name of the package.
         title: lines of the first comment.
         laws: that the package has.
-        sizes: of CasADi's work arrays, by law.
+        generated: code of the laws, for their work arrays.
         real: "double" or "float".
     """
     guard = constant(package, "h")
@@ -32,7 +32,7 @@ def header(package: str, title: tuple[str, ...], laws: tuple[Law, ...], sizes: d
         '#ifdef __cplusplus\nextern "C" {\n#endif',
         f"/* Every real number of this package. */\ntypedef {real} {package}_real;",
         "/* What the functions return. */\n" + "\n".join(status_lines(package, statuses)),
-        *(_declared(package, law, sizes[law.name]) for law in laws),
+        *(_declared(package, law, generated) for law in laws),
         "#ifdef __cplusplus\n}\n#endif",
         f"#endif /* {guard} */",
     ]
@@ -68,7 +68,7 @@ def signature(package: str, law: Law) -> str:
     return f"int {package}_{law.name}(\n    " + ",\n    ".join(listed) + ")"
 
 
-def _declared(package: str, law: Law, sizes: Sizes) -> str:
+def _declared(package: str, law: Law, generated: Generated) -> str:
     """Sizes, type and prototype of a law."""
     ports = {port.name: port for port in (*law.inputs, *law.outputs)}
     defined = []
@@ -82,7 +82,7 @@ def _declared(package: str, law: Law, sizes: Sizes) -> str:
     if law.kind in ("sample", "controller"):
         parts.append(_fields(package, law))
     if law.kind == "solver":
-        parts.append(_workspace(package, law, sizes))
+        parts.append(_workspace(package, law, generated.sizes[law.name]))
     if law.kind == "controller":
         parts.append(
             "/* Sets the struct to the start of the nominal, the estimate to the mean. */\n"
@@ -95,11 +95,11 @@ def _declared(package: str, law: Law, sizes: Sizes) -> str:
             f"extern const {package}_real {package}_guess[{guess}];\n"
             f"extern const int {package}_workspace_bytes;"
         )
-    parts.append(comment(_explained(package, law)) + f"\n{signature(package, law)};")
+    parts.append(comment(_explained(package, law, generated.alone)) + f"\n{signature(package, law)};")
     return "\n\n".join(parts)
 
 
-def _explained(package: str, law: Law) -> list[str]:
+def _explained(package: str, law: Law, alone: bool) -> list[str]:
     """The comment of a function: what it does, its parameters, what it returns."""
     lines = [*law.about, ""]
     lines += [f"{port.name}: {described(port)}".rstrip(": ") for port in law.arguments]
@@ -111,7 +111,10 @@ def _explained(package: str, law: Law) -> list[str]:
     if law.kind == "sample":
         lines.append("point (result): see there")
     if law.kind == "solver":
-        lines.append("workspace: any, of the caller. guess may be NULL: that of the export. One call at a time.")
+        at_once = (
+            "one call at a time, whatever its workspace" if alone else "of calls at the same time each has its own"
+        )
+        lines.append(f"workspace: any, of the caller; {at_once}. guess may be NULL: that of the export.")
     return [*lines, "Returns: " + ", ".join(code(package, name) for name in law.statuses) + "."]
 
 

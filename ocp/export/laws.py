@@ -30,7 +30,7 @@ STATUSES = {
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
     "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
     "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",
-    "FAILED": "the evaluation failed: the results were not written",
+    "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
 }
 CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite; it is finite in single precision.

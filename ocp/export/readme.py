@@ -55,6 +55,8 @@ def readme(
     work_bytes: Mapping[str, int],
     precision: str,
     linking: str = "",
+    *,
+    alone: bool = False,
 ) -> str:
     """The text of README.md.
 
@@ -65,6 +67,7 @@ def readme(
         work_bytes: memory that each law works in.
         precision: "double" or "single".
         linking: what has to be linked besides, a paragraph.
+        alone: whether only one call of a solver may run at a time.
     """
     objects = f"{name}.c {name}_casadi.c"
     flags = "-std=c99 -O2 -Wall -Wextra -pedantic"
@@ -97,7 +100,7 @@ def readme(
         "## Status codes",
         _statuses(name, laws),
         "## Memory",
-        _memory(name, laws, work_bytes),
+        _memory(name, laws, work_bytes, bool(linking), alone),
     ]
     if precision == "single":
         parts.append(
@@ -150,11 +153,18 @@ def _statuses(name: str, laws: tuple[Law, ...]) -> str:
     return "| code | constant | meaning |\n|---|---|---|\n" + "\n".join(rows)
 
 
-def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int]) -> str:
+def _memory(name: str, laws: tuple[Law, ...], work_bytes: Mapping[str, int], linked: bool, alone: bool) -> str:
+    """What the functions work in, and which of them may run at the same time."""
+    allocated = "allocate nothing" + (" but in the library they are linked with" if linked else "")
+    at_once = (
+        "The generated code keeps static memory: only one call may run at a time."
+        if alone
+        else "Calls whose structs, workspaces and results are different ones may run at the same time."
+    )
     where = {law.name: "workspace of the caller" if law.kind == "solver" else "stack" for law in laws}
     rows = [f"| `{name}_{law}` | {size} | {where[law]} |" for law, size in work_bytes.items()]
     return (
-        "These functions allocate nothing. Arrays that a call works in, in bytes on a machine of 64 bits; the frames "
-        "of the functions it calls come on top, some hundred bytes to a few times these arrays: `-fstack-usage` lists "
-        "them.\n\n| function | bytes | where |\n|---|---|---|\n" + "\n".join(rows)
+        f"These functions {allocated}. {at_once} Arrays that a call works in, in bytes on a machine of 64 bits; the "
+        "frames of the functions it calls come on top, some hundred bytes to a few times these arrays: "
+        "`-fstack-usage` lists them.\n\n| function | bytes | where |\n|---|---|---|\n" + "\n".join(rows)
     )

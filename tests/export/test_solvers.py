@@ -1,8 +1,5 @@
 """The exported solver: the costs of `solve`, from other starts, for other parameters and durations."""
 
-from pathlib import Path
-
-import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, PLANNER, STRICT, package
@@ -79,14 +76,6 @@ def test_a_plan_is_the_guess_of_the_next():
     assert second["cost"] == pytest.approx(planner(initial_x=0.25)["cost"], rel=1e-8)
 
 
-@pytest.mark.parametrize(("name", "value"), [("initial_x", np.nan), ("b", np.inf), ("duration", np.nan)])
-def test_arguments_that_are_not_finite_return_the_plan_of_the_export(name, value):
-    planner = package("planner").python()
-    plan = planner(**{name: value})
-    assert planner.status == "ARGUMENT_NOT_FINITE"
-    np.testing.assert_array_equal(plan["u"], planner()["u"])
-
-
 def test_a_problem_without_a_solution_is_not_called_solved():
     """Bounds on the control that do not let the state arrive in the time that is left."""
     ocp = co.Problem(duration=2.0)
@@ -133,19 +122,6 @@ def test_constant_controls_and_a_closed_loop():
     assert plan["cost"] != pytest.approx(solution.cost, rel=1e-6)
 
 
-def test_ipopt_is_linked_where_it_is_asked_for():
-    header = Path(ca.__file__).parent / "include" / "coin-or" / "IpStdCInterface.h"
-    if not header.is_file():
-        pytest.skip("this CasADi comes without the headers of Ipopt")
-    made = export_c(unknown_lag.problem(weight=10.0), FOLDER / "by_ipopt", **PLANNER, method="ipopt")
-    assert "-lipopt" in (made.directory / "README.md").read_text()
-    assert "PLUGIN_LIBRARIES ipopt" in (made.directory / "CMakeLists.txt").read_text()
-    made.build(flags=["-O1"])
-    plan = made.python()(initial_x=0.4)
-    assert plan["cost"] == pytest.approx(package("planner").python()(initial_x=0.4)["cost"], rel=1e-8)
-    assert made.python().status == "OK"
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -155,7 +131,7 @@ def test_ipopt_is_linked_where_it_is_asked_for():
         ({"period": 0.1}, "no option 'period' for a problem"),
         ({"colour": 3}, "no option 'colour' for a problem"),
         ({"plugin_options": {"no_such_option": 1}}, "refuses the problem or its settings"),
-        ({"plugin_options": {"max_iter": 0}}, "does not solve"),
+        ({"plugin_options": {"max_iter": 0}}, r"NOT_CONVERGED at its own solution, infeasibility .*\n.*method='ipopt'"),
         ({"intervals": 0}, "intervals"),
     ],
 )

@@ -1,0 +1,114 @@
+"""Calls of the exported solver: through linked plugins, at the same time, with arguments that mean nothing."""
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from exports import FOLDER, PLANNER, package
+
+import covocp as co
+from covocp.export import export_c, linking
+from covocp.models import brachistochrone, unknown_lag
+
+# The meshes are coarse.
+pytestmark = [pytest.mark.needs_cc, pytest.mark.filterwarnings("ignore::covocp.CovocpWarning")]
+
+PLUGINS = {"ipopt": "-lipopt", "fatrop": "-lfatrop -lblasfeo"}
+TIGHT = {"ipopt": {"tol": 1e-11, "bound_relax_factor": 0.0}}
+
+
+def by_plugin(method, name):
+    return export_c(unknown_lag.problem(weight=10.0), FOLDER / name, **PLANNER, method=method)
+
+
+@pytest.mark.parametrize("method", PLUGINS)
+def test_plugins_are_linked_and_reach_the_same_cost(method):
+    made = by_plugin(method, f"by_{method}")
+    readme, header = (made.directory / "README.md").read_text(), (made.directory / f"by_{method}.h").read_text()
+    assert f"LIBRARIES = {PLUGINS[method]}" in readme
+    assert "only one call may run at a time" in readme
+    assert "one call at a time, whatever its workspace" in header
+    assert (
+        f"PLUGIN_LIBRARIES {' '.join(PLUGINS[method].replace('-l', '').split())}"
+        in (made.directory / "CMakeLists.txt").read_text()
+    )
+    made.build(flags=["-O0"])
+    planner = made.python()
+    for arguments in ({}, {"initial_x": 0.4}):
+        plan, own = planner(**arguments), package("planner").python()(**arguments)
+        assert planner.status == "OK"
+        assert plan["cost"] == pytest.approx(own["cost"], rel=1e-8)
+    assert made.check().ok
+
+
+@pytest.mark.parametrize("method", PLUGINS)
+def test_a_plugin_that_is_not_there_is_an_error_that_says_so(method, tmp_path, monkeypatch):
+    """On a machine without the wheel's headers and libraries: what is missing, and where to read what is needed."""
+    made = by_plugin(method, f"without_{method}")
+    monkeypatch.setattr(linking, "_wheel", lambda: tmp_path)
+    include = re.escape(linking.PLUGINS[method].header)
+    with pytest.raises(co.ExportError, match=f"(?s)could not be compiled.*({include}|-l{method}).*what is linked"):
+        made.build(tool="cc", flags=["-nostdinc++"])
+
+
+def test_fatrop_keeps_bounds_that_it_would_widen():
+    """Brachistochrone: bounds of the control and of the free duration."""
+    made = export_c(brachistochrone.problem(), FOLDER / "fatrop_bounds", intervals=10, substeps=2, method="fatrop")
+    solution = co.solve(brachistochrone.problem(), intervals=10, substeps=2, progress=False, plugin_options=TIGHT)
+    assert made.reference()()["cost"] == pytest.approx(solution.cost, rel=1e-8)
+
+
+def test_self_contained_solvers_may_run_at_the_same_time():
+    """Bit for bit what they plan one after the other; nothing static is written to."""
+    made = package("planner")
+    source = (made.directory / "planner_casadi.c").read_text()
+    assert not re.search(r"= casadi_f\d+_checkout\(\)|^ *casadi_f\d+_release\(|^static struct", source, re.MULTILINE)
+    assert "of calls at the same time each has its own" in (made.directory / "planner.h").read_text()
+    starts = np.linspace(-0.4, 0.4, 8)
+
+    def plans(planner):
+        return [planner(initial_x=x)["variables"] for x in starts for _ in range(4)]
+
+    expected = plans(made.python())
+    with ThreadPoolExecutor(4) as threads:
+        for found in threads.map(plans, [made.python() for _ in range(4)]):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_arguments_that_are_not_finite_return_the_plan_of_the_export():
+    planner, ports = package("planner").python(), package("planner").laws[0].arguments
+    usual = planner()
+    defaults = package("planner").laws[0].defaults
+    places = np.cumsum([0, *(port.size for port in ports)])
+    for port, (first, last) in zip(ports, pairwise(places), strict=True):
+        for value in (np.nan, np.inf, -np.inf):
+            argument = defaults[first:last].copy()
+            argument[-1] = value
+            plan = planner(**{port.name: argument.reshape(port.shape)})
+            assert planner.status == "ARGUMENT_NOT_FINITE"
+            for result, entry in plan.items():
+                np.testing.assert_array_equal(entry, usual[result])
+
+
+@pytest.mark.parametrize("arguments", [{"initial_x": 1e200}, {"weight": 1e300}, {"b": 1e10}, {"duration": 1e300}])
+def test_arguments_that_overflow_return_the_plan_of_the_export(arguments):
+    planner = package("planner").python()
+    usual, plan = planner(), planner(**arguments)
+    assert planner.status == "FAILED"
+    np.testing.assert_array_equal(plan["u"], usual["u"])
+
+
+def test_a_plan_backwards_in_time_is_none():
+    """x' = u, J = x(T) + integral of u^2/2 = 1 - T/2, here zero: stationary for every T, but a plan for T > 0 only."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", initial=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=0.5 * u**2, terminal=x)
+    planner = export_c(ocp, FOLDER / "backwards", intervals=4, substeps=1).reference()
+    assert planner(duration=3.0)["cost"] == pytest.approx(1.0 - 3.0 / 2.0, rel=1e-9)
+    assert planner.status == "OK"
+    for duration in (0.0, -0.5):
+        planner(duration=duration)
+        assert planner.status != "OK"
