@@ -129,7 +129,7 @@ def problem(
     u = ocp.control("u", unit="m/s^2")
     ocp.dynamics(r, v)
     ocp.dynamics(v, u, noise=process_noise)
-    ocp.measurement("y", r, noise=measurement_noise)
+    ocp.measurement("y", r, noise=measurement_noise, unit="m")
     ocp.estimation_covariance()
     ocp.minimize_expected(running=STATE_WEIGHT[0] * r**2 + STATE_WEIGHT[1] * v**2 + CONTROL_WEIGHT * u**2)
     return ocp

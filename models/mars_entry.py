@@ -369,7 +369,7 @@ def _entry(
     along, across, angle = -drag, drag * u, theta - gamma
     sine, cosine = ca.sin(angle), ca.cos(angle)
     inertial = ca.vertcat(cosine * along + sine * across, cosine * across - sine * along)
-    ocp.measurement("accelerometers", inertial, noise=ACCELEROMETER_NOISE)
+    ocp.measurement("accelerometers", inertial, noise=ACCELEROMETER_NOISE, unit="ft/s^2")
     ocp.estimation_covariance()
     running: Any = 0.0
     if regularization is not None:

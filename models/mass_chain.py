@@ -81,7 +81,7 @@ def problem(masses: int = 1, weight: float = 20.0) -> co.Problem:
     first = ca.DM(np.eye(m)[:, :1])
     ocp.dynamics(y, v)
     ocp.dynamics(v, first @ u - differences.T @ force, noise=PROCESS_NOISE)
-    ocp.measurement("position", y[m - 1], noise=MEASUREMENT_NOISE)
+    ocp.measurement("position", y[m - 1], noise=MEASUREMENT_NOISE, unit="m")
     E = ocp.estimation_covariance()
     ocp.minimize(running=0.5 * u**2, terminal=terminal_weight * (E[k, k] + E[d, d]))
     return ocp

@@ -195,6 +195,7 @@ class Measurement:
     name: str
     expression: ca.MX
     noise: ca.MX
+    unit: str
     where: str
 
 

@@ -75,7 +75,7 @@ def freeze(problem: Problem) -> Statement:
         loop=_loop(problem, stacked),
         riccati=riccati,
         measurement=measurement,
-        measurement_names=tuple(m.name for m in problem.measurements),
+        measurements=_measured(problem),
         path=_conditions(problem, stacked, "path"),
         start=_conditions(problem, stacked, "initial"),
         end=_conditions(problem, stacked, "final"),
@@ -371,6 +371,16 @@ def _blocks(problem: Problem) -> tuple[Block, ...]:
         if kind == "parameter":
             parameters = offset
     return tuple(blocks)
+
+
+def _measured(problem: Problem) -> tuple[Block, ...]:
+    """Where each measurement lies."""
+    sizes = [m.expression.shape[0] for m in problem.measurements]
+    offsets = np.cumsum([0, *sizes]).tolist()
+    return tuple(
+        Block(name=m.name, kind="measurement", size=size, offset=offset, unit=m.unit)
+        for m, size, offset in zip(problem.measurements, sizes, offsets, strict=False)
+    )
 
 
 def _duration(problem: Problem) -> Duration:

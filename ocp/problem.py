@@ -364,13 +364,14 @@ class Problem:
         self.rates[name] = Dynamics(rate=value, noise=density, where=caller())
         self._frozen = None
 
-    def measurement(self, name: str, expression: Any, noise: Any) -> None:
+    def measurement(self, name: str, expression: Any, noise: Any, *, unit: str = "") -> None:
         """Add a continuous measurement m = expression + v with white noise v.
 
         Args:
             name: unique name.
             expression: of states, unknowns, controls and time, shape (m, 1).
             noise: power spectral density of v: scalar, vector (diagonal) or matrix (correlated), positive definite.
+            unit: for exported code.
 
         Raises:
             ProblemError: name used twice, density singular, negative or of the wrong size.
@@ -380,7 +381,7 @@ class Problem:
         density = density_matrix(name, "noise density", noise, size)
         if density.is_constant():
             check_density(name, "noise density", ca.evalf(density).full(), definite=True)
-        self.measurements.append(Measurement(name=name, expression=value, noise=density, where=caller()))
+        self.measurements.append(Measurement(name=name, expression=value, noise=density, unit=unit, where=caller()))
 
     def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].

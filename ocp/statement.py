@@ -21,7 +21,7 @@ import numpy as np
 
 from covocp.matrices import Array, half_indices, half_length
 
-Kind = Literal["state", "control", "matrix", "unknown", "parameter"]
+Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
 
 INPUTS = ("state", "control", "matrices", "time", "duration", "parameters")
 
@@ -121,6 +121,7 @@ class Statement:
             V = F E + E F' + Q - E W E, or None where the rate has not this form.
         measurement: (state, control, time, duration, parameters) -> measured values, H = their Jacobian by the
             augmented state, noise density; None without measurements.
+        measurements: where each of them lies among the measured values.
         expression: a user's expression -> function of the six inputs.
     """
 
@@ -136,7 +137,7 @@ class Statement:
     loop: Loop | None
     riccati: tuple[ca.Function | None, ...]
     measurement: ca.Function | None
-    measurement_names: tuple[str, ...]
+    measurements: tuple[Block, ...]
     path: Conditions
     start: Conditions
     end: Conditions
@@ -153,6 +154,11 @@ class Statement:
     running_uses_matrices: bool
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
+
+    @property
+    def measurement_names(self) -> tuple[str, ...]:
+        """The user's names of the measurements."""
+        return tuple(block.name for block in self.measurements)
 
     def of_kind(self, kind: Kind) -> tuple[Block, ...]:
         """The blocks of one kind, in the order of their declaration."""

@@ -102,12 +102,16 @@ def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
     n, m, r = design.sizes
     sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1}
-    names = ", ".join(design.statement.measurement_names)
-    about = {"measurement": names, "time": "of the measurement"}
-    units = {"time": "s"}
-    return tuple(
-        Port(name=name, rows=rows, about=about.get(name, ""), unit=units.get(name, "")) for name, rows in sizes.items()
-    )
+    ports = {name: Port(name=name, rows=rows) for name, rows in sizes.items()}
+    ports["measurement"] = measurement_port(design)
+    ports["time"] = Port(name="time", unit="s", about="of the measurement")
+    return tuple(ports.values())
+
+
+def measurement_port(design: Design) -> Port:
+    """The port of what is measured."""
+    rows = entry_names(design.statement.measurements)
+    return Port(name="measurement", rows=design.sizes[2], entries=with_units(design.statement, rows))
 
 
 def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
@@ -144,7 +148,8 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
 
 def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
     """Names of entries with the units of their symbols."""
-    units = {name: block.unit for block in statement.blocks for name in entry_names((block,))}
+    blocks = (*statement.blocks, *statement.measurements)
+    units = {name: block.unit for block in blocks for name in entry_names((block,))}
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 

@@ -22,7 +22,16 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ExportError, describe
-from covocp.export.controller import SCALAR_SIZE, STATUSES, field_ports, finite, first_fields, points, solved
+from covocp.export.controller import (
+    SCALAR_SIZE,
+    STATUSES,
+    field_ports,
+    finite,
+    first_fields,
+    measurement_port,
+    points,
+    solved,
+)
 from covocp.export.design import Design, clipped
 from covocp.export.history import History
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
@@ -288,12 +297,12 @@ def gauss_step(H: tuple[Array, Array], z: Array, f: tuple[Array, Array]) -> Arra
 
 def _ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs."""
-    n, m, r = design.sizes
+    n, m, _ = design.sizes
     return (
         Port(name="estimate", rows=n),
         Port(name="last"),
         Port(name="held", rows=m),
-        Port(name="measurement", rows=r, about=", ".join(design.statement.measurement_names)),
+        measurement_port(design),
         Port(name="time", unit="s", about="of the measurement"),
     )
 

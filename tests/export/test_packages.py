@@ -61,7 +61,11 @@ def test_the_header_says_what_everything_is():
     ):  # fmt: skip
         assert words in text, words
     mars = (package("mars").directory / "mars.h").read_text()
-    for unit in ("[ft] state 'h'", "(h [ft], theta [rad], v [ft/s], gamma [rad], log_density [ln(slug/ft^3)])"):
+    for unit in (
+        "[ft] state 'h'",
+        "(h [ft], theta [rad], v [ft/s], gamma [rad], log_density [ln(slug/ft^3)])",
+        "measurement:  (accelerometers[0] [ft/s^2], accelerometers[1] [ft/s^2])",
+    ):
         assert unit in mars
     assert (
         "#define LAG_SAMPLED_PERIOD 0.01 /* [s] */" in (package("lag_sampled").directory / "lag_sampled.h").read_text()
