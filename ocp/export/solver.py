@@ -37,6 +37,8 @@ WIDENED = 1e-8
 MAX_ITERATIONS = 200
 # Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
 ROUNDING, APART = 1e-6, 1e-2
+# Distance and multiplier of a bound that is not reached at the solution of the export.
+UNREACHED = 1e-5
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory, as for Ipopt.
 STRETCH = 10.0
 TOLERANCE = 1e-8
@@ -56,12 +58,21 @@ ABOUT = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Task:
-    """What the core is made of."""
+    """What the core is made of.
+
+    Attributes:
+        made: the problem and the arguments of its solver.
+        nlp: its transcription.
+        solution: of the export.
+        scale: of the cost.
+        multipliers: of the solution in units of the NLP, of the variables and of the constraints.
+    """
 
     made: Replannable
     nlp: NLP
     solution: Solution
     scale: float
+    multipliers: tuple[Array, Array]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -146,7 +157,25 @@ def _task(problem: Problem, options: dict[str, Any]) -> _Task:
         weights = quadrature_weights(mesh)
         scales = replace(scales, x=STRETCH * scales.x, u=scales.u * np.sqrt(weights.mean() / weights)[:, None])
     nlp = transcribe(statement, mesh, scales)
-    return _Task(made=made, nlp=nlp, solution=solution, scale=_cost_scale(nlp, solution))
+    scale = _cost_scale(nlp, solution)
+    multipliers = _multipliers(nlp, solution, scale)
+    return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers)
+
+
+def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Array]:
+    """Multipliers of the solution: those of constraints, then those of bounds that are reached, by stationarity.
+
+    Small ones, as an interior-point method leaves them at all bounds, would each cost the QP solver an iteration.
+    """
+    costates, p = solution.costates, np.append(nlp.statement.values, scale)
+    _, constraints = nlp.pack_multipliers(solution.multipliers, (costates.state, costates.matrices))
+    weights, bounds, w = constraints / scale, nlp.bounds(nlp.statement.values), nlp.pack(solution.trajectory)
+    weights[np.abs(weights) < UNREACHED] = 0.0
+    given = ca.MX.sym("given", nlp.g.shape[0])
+    slope = ca.Function("slope", [nlp.w, nlp.p, given], [ca.gradient(nlp.f + ca.dot(given, nlp.g), nlp.w)])
+    left = -np.asarray(ca.densify(slope(w, p, weights)).full()).ravel()
+    reached = ((w > bounds["ubx"] - UNREACHED) & (left > 0.0)) | ((w < bounds["lbx"] + UNREACHED) & (left < 0.0))
+    return np.where(reached & (np.abs(left) > UNREACHED), left, 0.0), weights
 
 
 def _cost_scale(nlp: NLP, solution: Solution) -> float:
@@ -210,7 +239,9 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     p = ca.vertcat(ca.MX(0, 1), *stacked(entries, symbols, task.names))
     bounds = _bounds(task, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
-    result = solver(x0=start, p=ca.vertcat(p, task.scale), **(_narrowed(bounds) if method == "fatrop" else bounds))
+    given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
+    given |= {"p": ca.vertcat(p, task.scale), **(_narrowed(bounds) if method == "fatrop" else bounds)}
+    result = solver(**given)
     evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
     residuals = _residuals(task, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
     outputs = _results(task, result["x"], evaluated, residuals)
