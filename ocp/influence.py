@@ -46,6 +46,7 @@ from covocp.integrators import (
 from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.shooting import common_columns, matrices_along
+from covocp.slope_terms import slope_sizes, slope_terms
 from covocp.statement import Statement
 
 # Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.
@@ -97,6 +98,7 @@ class Sweeps:
     backward: ca.Function
     quadrature: ca.Function
     curvature: ca.Function
+    terms: ca.Function
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +167,7 @@ def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
         backward=backward.mapaccum("backward", n),
         quadrature=quadrature.map(n),
         curvature=curvature.map(n + 1),
+        terms=slope_terms(statement).map(n + 1),
     )
 
 
@@ -441,18 +444,31 @@ def control_curvature(sweeps: Sweeps, run: Run, u: Array, columns: Array, ell: A
     """H_uu at the nodes, (N + 1, nu, nu), with the costates p + R l, P + R_E l."""
     st, n = sweeps.statement, sweeps.mesh.intervals
     costates = columns[:, :, 0] + columns[:, :, 1:] @ ell
-    controls = controls_at_nodes(u, n)
-    values = sweeps.curvature(
-        run.z[:, : st.nx].T,
-        controls.T,
-        run.z[:, st.nx :].T,
+    values = sweeps.curvature(*_at_nodes(sweeps, run, u, costates, parameters))
+    return np.asarray(values.full()).reshape(st.nu, n + 1, st.nu).transpose(1, 0, 2)
+
+
+def control_sizes(sweeps: Sweeps, run: Run, columns: Array, ell: Array, parameters: Array) -> Array:
+    """Sizes of H_u at the nodes, (N + 1, nu), where p, P and every R l count apart."""
+    costates = np.abs(columns[:, :, 0]) + np.abs(columns[:, :, 1:]) @ np.abs(ell)
+    terms = np.asarray(sweeps.terms(*_at_nodes(sweeps, run, run.u, costates, parameters)).full()).T
+    curvature = control_curvature(sweeps, run, run.u, columns, ell, parameters)
+    return slope_sizes(terms, curvature, controls_at_nodes(run.u, sweeps.mesh.intervals))
+
+
+def _at_nodes(sweeps: Sweeps, run: Run, u: Array, costates: Array, parameters: Array) -> tuple[Array, ...]:
+    """The arguments of the Hamiltonian at the nodes, a column each."""
+    nx, n = sweeps.statement.nx, sweeps.mesh.intervals
+    return (
+        run.z[:, :nx].T,
+        controls_at_nodes(u, n).T,
+        run.z[:, nx:].T,
         (sweeps.mesh.nodes * run.duration)[None, :],
         np.full((1, n + 1), run.duration),
         np.tile(parameters[:, None], (1, n + 1)),
-        costates[:, : st.nx].T,
-        costates[:, st.nx :].T,
+        costates[:, :nx].T,
+        costates[:, nx:].T,
     )
-    return np.asarray(values.full()).reshape(st.nu, n + 1, st.nu).transpose(1, 0, 2)
 
 
 def controls_at_nodes(u: Array, intervals: int) -> Array:

@@ -25,6 +25,7 @@ from covocp.hamiltonian import (
     passage_end,
 )
 from covocp.matrices import Array
+from covocp.slope_terms import slope_sizes, slope_terms
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
@@ -38,7 +39,8 @@ class Optimality:
 
     Attributes:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
-            neighbourhood of a node), bounds' multipliers included; relative to the largest |L_u| + |p' f_u + P V_u|.
+            neighbourhood of a node), bounds' multipliers included; relative to the largest sum of the
+            absolute terms of H_u (or |H_uu| |u|, where more).
         control_slope: root mean square of H_u at the nodes with free controls; of the order of the square of the
             interval for piecewise-linear controls; same normalisation.
         costate_difference: largest difference between the costates of the multipliers and those integrated backward,
@@ -167,7 +169,7 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
 
 
 def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array, Array]:
-    """H_u (K, nu), H_uu (K, nu, nu), [H, sum of its absolute terms] (K, 2), |L_u| + |rest| (K, nu) at the nodes."""
+    """At the nodes H_u (K, nu), H_uu (K, nu, nu), [H, sum of its absolute terms] (K, 2), sizes of H_u (K, nu)."""
     st = extremal.statement
     make = hamiltonian(st)
 
@@ -176,18 +178,14 @@ def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array,
 
     function = make("along", select)
     h, slope, curvature = along(function, extremal, costates)
-    zero = Costates(state=np.zeros_like(costates.state), matrices=np.zeros_like(costates.matrices))
-    cost, cost_slope, _ = along(function, extremal, zero)
+    (size,) = along(slope_terms(st), extremal, costates)
+    curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
     values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
     terms = np.abs(costates.state * np.asarray(values[0].full()).T).sum(axis=1)
-    terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1) + np.abs(cost[:, 0])
-    count = slope.shape[0]
-    return (
-        slope,
-        curvature.reshape(count, st.nu, st.nu),
-        np.column_stack([h[:, 0], terms]),
-        np.abs(cost_slope) + np.abs(slope - cost_slope),
-    )
+    terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1)
+    terms = terms + np.abs(np.asarray(values[2].full()).ravel())
+    sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
+    return slope, curvature, np.column_stack([h[:, 0], terms]), sizes
 
 
 def _path_slopes(extremal: Extremal) -> Array:

@@ -18,6 +18,7 @@ from covocp.influence import (
     Slopes,
     Sweeps,
     control_curvature,
+    control_sizes,
     reweigh,
     sweep_backward,
     sweep_forward,
@@ -208,7 +209,10 @@ class Space:
         residual = linear.lagrangian(ell)
         left = np.where(active, 0.0, residual)
         count = self.controls
+        nodal = control_sizes(self.sweeps, iterate.run, linear.slopes.columns, ell, self.parameters)
+        weights = quadrature_weights(self.sweeps.mesh)[:, None] * iterate.run.duration
         sizes = (linear.sizes + np.abs(linear.rows).T @ np.abs(ell))[:count]
+        sizes = np.maximum(sizes, (weights * nodal[: weights.size]).ravel())
         norm = np.sqrt(np.sum(inverse[:count] * left[:count] ** 2))
         size = np.sqrt(np.sum(inverse[:count] * sizes**2))
         slope = float(norm / size) if size > 0 else 0.0

@@ -68,9 +68,9 @@ def prepare(
 
     The run has converged when
 
-    - sqrt(int |s H_u|^2 dt) <= tolerance sqrt(int |s (|L_u| + |h_u - L_u| + |H_u' l|)|^2 dt), s the magnitudes of the
-      controls (their `scale`), H_u projected on the controls' space and on the bounds, l the least-squares multiplier
-      in this metric;
+    - sqrt(int |s H_u|^2 dt) <= tolerance sqrt(int |s h|^2 dt), h the sum of the absolute terms of H_u (or
+      |H_uu| |u|, where more), s the magnitudes of the controls (their `scale`), H_u projected on the controls'
+      space and on the bounds, l the least-squares multiplier in this metric;
     - |dJ/dT| T and |dJ/dx_i(0)| s_i of a free duration and of free initial values <= tolerance (|k| + |int L dt|);
     - the violation of every inequality / its magnitude <= violation_tolerance, and |dz_j| / (magnitude of z_j) <= a
       thousandth of it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,7 @@ from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, solve
 
 import covocp as co
 from covocp.curvature import lanczos, smallest_curvature
-from covocp.models import bryson_denham, free_time_integrator, mass_chain, noisy_integrator
+from covocp.models import brachistochrone, bryson_denham, free_time_integrator, mass_chain, noisy_integrator
 
 FORMULATIONS = ("eliminated", "states")
 
@@ -188,3 +189,31 @@ def test_a_cost_of_zero_is_no_coarse_mesh():
         solution = co.solve(ocp, intervals=20, progress=False)
     assert solution["x"][0] == pytest.approx(np.e, rel=1e-6)
     assert solution.mesh_error < 1e-8
+
+
+@pytest.mark.parametrize("method", ["ipopt", "gradient"])
+@pytest.mark.parametrize("dynamics", ["one term", "decaying term", "terms of the costates"])
+def test_slope_has_a_size_without_a_running_cost(method, dynamics):
+    """H_u = p' f_u alone: it vanishes at the optimum, and is no measure of itself."""
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    if dynamics == "terms of the costates":  # u = 1
+        y = ocp.state("y", initial=0.0, final=1.0)
+        ocp.dynamics(y, u)
+        ocp.dynamics(x, u**2)
+        ocp.minimize(terminal=x)
+        cost = 1.0
+    else:  # u = 1/2
+        decay = 0.3 if dynamics == "decaying term" else 0.0
+        ocp.dynamics(x, u - u**2 - decay * x)
+        ocp.minimize(terminal=-x)
+        cost = -0.25 * (1 - np.exp(-decay)) / decay if decay else -0.25
+    solution = solve(ocp, method=method, intervals=20)
+    assert solution.cost == pytest.approx(cost, rel=1e-7)
+    assert solution.optimality.stationarity < 1e-5
+    off = replace(solution, trajectory=replace(solution.trajectory, u=1.1 * solution["u"][:, None]))
+    assert off.optimality.stationarity > 1e-2
+
+
+def test_minimum_time_by_the_gradient_method_is_stationary():
+    assert solve(brachistochrone.problem(), method="gradient", intervals=50).optimality.stationarity < 1e-5
