@@ -31,6 +31,9 @@ SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-4, 1e8
 CURVATURE_RATIO, CURVATURE_MEMORY = 0.8, 5
 # The multiplier's weight in the merit.
 MERIT_FACTOR = 2.0
+# What the bounds may leave of the change of the miss that a step owes: a share of the miss, or this in its scale.
+UNREACHED, UNREACHED_ANYWAY = 0.5, 1e-3
+REACHING_RAISE, REACHING_TRIALS = 16.0, 6
 # Terminal conditions are met better than inequalities: every step corrects them.
 TERMINAL_SHARE = 1e-3
 LARGEST_PASSES = 30
@@ -191,7 +194,7 @@ class Search:
         adaptive = self.settings.adaptive
         control.past = [*control.past[1 - MEMORY :], (current.cost, miss)]
         for _ in range(TRIALS if adaptive else 1):
-            step = self._step(current, linear, metric, active)
+            step = self._reaching_step(current, linear, metric, active)
             following = space.at(current.point + step.change)
             if not adaptive:
                 kept = following.run.finite and abs(following.cost) <= DIVERGED * (
@@ -217,6 +220,32 @@ class Search:
                 control.fraction /= 2
             control.weight = min(RAISE * control.weight, LARGEST_WEIGHT)
         return "no step lowers the cost as predicted: the slopes may be wrong at this mesh; use more intervals"
+
+    def _reaching_step(self, current: Iterate, linear: Linear, metric: Any, active: Array | None) -> Step:
+        """A step that the bounds leave most of what it owes the terminal conditions, with w raised as needed.
+
+        Where the cost pulls the controls and T onto their bounds nothing is left for the conditions, and the merit
+        would pay for the miss by the cost; the larger w, the less the cost pulls. Where no w helps, the bounds forbid
+        it.
+        """
+        control, settings = self.control, self.settings
+        step = self._step(current, linear, metric, active)
+        if not settings.adaptive or settings.variant == "chord":
+            return step
+        first, weight = step, control.weight
+        for _ in range(REACHING_TRIALS):
+            if self._reaches(current, linear, step):
+                return step
+            control.weight = min(REACHING_RAISE * control.weight, LARGEST_WEIGHT)
+            step = self._step(current, linear, metric, active)
+        control.weight = weight
+        return first
+
+    def _reaches(self, current: Iterate, linear: Linear, step: Step) -> bool:
+        """Whether a step changes the miss, to first order, about as it should."""
+        scale, miss = self.space.miss_scale, current.run.miss
+        left = np.abs(linear.rows @ step.change + self.control.fraction * miss) / scale
+        return not left.size or bool(left.max() <= max(UNREACHED * (np.abs(miss) / scale).max(), UNREACHED_ANYWAY))
 
     def _step(self, current: Iterate, linear: Linear, metric: Any, active: Array | None) -> Step:
         """Steps 5 and 6 of 4.2, or the chord step."""

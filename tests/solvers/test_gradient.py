@@ -192,6 +192,26 @@ def test_bounds_by_projection() -> None:
     assert solution.optimality.stationarity < 1e-8
 
 
+@pytest.mark.parametrize(("guess", "control_weight"), [(3.0, 0.0), (2.2, 0.0), (3.0, 0.01), (5.0, 0.1)])
+def test_terminal_conditions_against_saturated_controls(guess: float, control_weight: float) -> None:
+    """A mass moved by 1 m from rest to rest at least T + w int u^2, |u| <= 1: bang-bang with T = 2 s for w = 0.
+
+    The cost pulls T down so hard that saturated controls cannot meet the end. By H = 0 in the middle, where u = 0, the
+    control is saturated for t1 and then falls within s, s (1 - w) = 2 w t1, t1^2/2 + t1 s + s^2/3 = 1/2.
+    """
+    ocp = co.Problem(duration=co.Free(guess))
+    x = ocp.state("x", 2, initial=0.0, final=[1.0, 0.0])
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, ca.vertcat(x[1], u))
+    ocp.minimize(running=control_weight * u**2, terminal=ocp.duration)
+    solution = solve(ocp, intervals=100)
+    share = 2 * control_weight / (1 - control_weight)  # s / t1
+    t1 = np.sqrt(0.5 / (0.5 + share + share**2 / 3))
+    exact = 2 * t1 * (1 + share) + 2 * control_weight * t1 * (1 + share / 3)
+    assert solution.cost == pytest.approx(exact, rel=2e-4)  # the switch of a continuous control takes an interval
+    assert solution.stats["iterations"] < 20
+
+
 def test_penalty_against_the_arc_on_the_bound() -> None:
     # Weight 5: x = u = 0 until t1 = 1 - sqrt(2/5). The mesh adds an error of the order of h^2 (the corner of u).
     exact = noisy_integrator.exact(5.0)
