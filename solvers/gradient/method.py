@@ -61,7 +61,7 @@ def prepare(
     weight_factor: float = 1.0,
     fraction: float = 1.0,
     tolerance: float = 1e-6,
-    violation_tolerance: float = 1e-5,
+    violation_tolerance: float = 1e-6,
     max_iterations: int = 2000,
 ) -> GradientSolver:
     """Compile the sweeps of the gradient method.
@@ -73,7 +73,7 @@ def prepare(
       space and on the bounds, l the least-squares multiplier in this metric;
     - |dJ/dT| T and |dJ/dx_i(0)| s_i of a free duration and of free initial values <= tolerance (|k| + |int L dt|);
     - the violation of every inequality / its magnitude <= violation_tolerance, and |dz_j| / (magnitude of z_j) <= a
-      thousandth of it.
+      hundredth of it.
 
     Args:
         statement: the problem.

@@ -35,7 +35,7 @@ MERIT_FACTOR = 2.0
 UNREACHED, UNREACHED_ANYWAY = 0.5, 1e-3
 REACHING_RAISE, REACHING_TRIALS = 16.0, 6
 # Terminal conditions are met better than inequalities: every step corrects them.
-TERMINAL_SHARE = 1e-3
+TERMINAL_SHARE = 1e-2
 LARGEST_PASSES = 30
 # Iterations in which the miss must fall by a tenth while it is above its tolerance.
 PATIENCE = 100
