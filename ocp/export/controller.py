@@ -23,7 +23,7 @@ from covocp.export.design import Design, clipped
 from covocp.export.history import History, Nominal
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.trajectory import times
-from covocp.integrators import COMPILED_SOLVER, GAUSS_NODES
+from covocp.integrators import COMPILED_SOLVER, GAUSS_NODES, linear_solve
 from covocp.matrices import Array
 from covocp.statement import Statement, entry_names
 
@@ -167,7 +167,7 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Arr
 
 def solved(matrix: Any, right: Any) -> Any:
     """matrix^-1 right: written out in scalars where the expressions are SX, by QR factors otherwise."""
-    return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else ca.solve(matrix, right, COMPILED_SOLVER)
+    return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else linear_solve(matrix, right, COMPILED_SOLVER)
 
 
 def _predict(design: Design, y: Any, held: Any, nominal: list[Nominal], at: list[Any], h: Any) -> Any:

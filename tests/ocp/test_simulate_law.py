@@ -4,6 +4,7 @@ import concurrent.futures
 import multiprocessing
 import re
 
+import casadi as ca
 import numpy as np
 import pytest
 from exports import lag, package
@@ -122,6 +123,34 @@ def test_the_exported_controller_tends_to_the_filter_of_the_design():
     assert distances[0] < 0.1
     assert distances[1] / distances[0] == pytest.approx(0.5, abs=0.06)
     assert distances[2] / distances[1] == pytest.approx(0.5, abs=0.06)
+
+
+def chain(masses=5):
+    """Masses on springs of an unknown stiffness: more rows than a controller writes out in scalars."""
+    problem = co.Problem(duration=4.0, name="chain")
+    y = problem.state("y", masses, initial=0.0, variance=0.1)
+    v = problem.state("v", masses, initial=0.0, variance=0.1)
+    k, u = problem.unknown("k", mean=2.0, variance=0.1), problem.control("u")
+    stretch = ca.DM(np.eye(masses) - np.eye(masses, k=-1))
+    problem.dynamics(y, v)
+    problem.dynamics(v, ca.DM(np.eye(masses)[:, :1]) @ u - k * (stretch.T @ stretch @ y), noise=0.01)
+    problem.measurement("all", y, noise=0.1 * np.eye(masses))
+    problem.minimize_expected(running=0.5 * u**2, terminal_weight={y: 5.0, v: 5.0})
+    return co.solve(problem, intervals=40, progress=False)
+
+
+def test_a_controller_of_many_rows_tends_to_the_filter_of_the_design(tmp_path):
+    solution = chain()
+    options = {"runs": 64, "seed": 5, "step": 1 / 80, "store": 2, "progress": False}
+    continuous = simulate(solution, **options)
+    law = co.export_c(solution, tmp_path / "chain").python()
+    distances = []
+    for period in (1 / 10, 1 / 20, 1 / 40):
+        sampled = simulate(solution, law=law, period=period, **options)
+        distances.append(np.sqrt(np.mean((sampled.deviations - continuous.deviations) ** 2)))
+    assert distances[0] < 0.1 * np.sqrt(np.mean(continuous.deviations**2))
+    assert distances[1] / distances[0] == pytest.approx(0.5, abs=0.1)
+    assert distances[2] / distances[1] == pytest.approx(0.5, abs=0.1)
 
 
 def test_c_and_python_fly_the_same_runs():
