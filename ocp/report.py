@@ -73,6 +73,7 @@ def summary(solution: Solution) -> str:
         _gains(solution),
         *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix" and shown(block)),
         _optimality(solution),
+        _between_nodes(solution),
         _effort(solution),
     ]
     return "\n\n".join(part for part in parts if part)
@@ -327,6 +328,21 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM"
     return ""
+
+
+def _between_nodes(solution: Solution) -> str:
+    """What happens to path constraints where nobody asked: a sentence, empty where they hold."""
+    if solution.statement is None or not solution.converged:
+        return ""
+    found = solution.check_path()
+    if not found:
+        return ""
+    name = max(found, key=lambda key: found[key])
+    text = (
+        f"path constraints hold at the nodes; between them they are violated by up to {found[name]:.2g} ({name}): "
+        "more intervals make it less, check_path() lists all"
+    )
+    return wrapped(text)
 
 
 def _counted(number: int, what: str) -> str:

@@ -223,3 +223,16 @@ def test_a_loaded_closed_loop_prints_what_it_knows(steered, tmp_path):
     path = steered.save(tmp_path / "solution.npz")
     assert str(co.load(path)) == str(steered)
     assert str(co.load(path, unknown_lag.steering())) == str(steered)
+
+
+def test_what_path_constraints_do_between_the_nodes():
+    """A straight line from (0, 0) to (1, 1) passes the obstacle in its middle between two nodes."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", 2, initial=0, final=1), ocp.control("u", 2)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u.T @ u)
+    middle = x - 0.5
+    ocp.subject_to(0.01 - middle.T @ middle, name="obstacle")
+    solution = co.solve(ocp, intervals=5, progress=False)
+    assert "between them they are violated by up to 0.01 (obstacle)" in " ".join(str(solution).split())
+    assert "between them" not in str(co.solve(unknown_lag.problem(), intervals=50, progress=False))
