@@ -17,6 +17,10 @@ ELIMINATED_SEGMENTS = 10
 LARGEST_SUBSTEPS = 64
 # Entries of E and S up to which their step is written out in scalars where they are variables.
 SCALAR_ENTRIES = 12
+# Entries of covariances up to which a constraint on them along the path makes them variables. Chain of masses with a
+# bound on the variance of the stiffness, 50 intervals, seconds of the first solve as variables and eliminated:
+# 10 entries 0.42 and 0.71, 21 entries 0.92 and 1.26, 36 entries 5.4 and 1.5, 55 entries 9.7 and 2.3.
+PATH_ENTRIES = 21
 # h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
 STIFFNESS_PER_STEP = 1.0
 
@@ -163,7 +167,7 @@ def choose_step(statement: Statement, options: Options) -> Step:
 
 
 def _choose_eliminated(statement: Statement, options: Options) -> bool:
-    """Whether the matrices are eliminated: always where they can be and no path constraint needs them.
+    """Whether the matrices are eliminated: always where they can be and no path constraint on a few entries needs them.
 
     Eliminated is faster for every problem of benchmarks/formulations.py, down to a single scalar variance.
     """
@@ -188,7 +192,8 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         )
     if options.covariances != "auto":
         return options.covariances == "eliminated"
-    return obstacle is None and not statement.path.uses_matrices
+    few = statement.loop is not None or statement.ne <= PATH_ENTRIES
+    return obstacle is None and not (statement.path.uses_matrices and few)
 
 
 def _bounded_matrices(statement: Statement) -> list[str]:

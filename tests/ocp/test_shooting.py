@@ -464,3 +464,21 @@ def test_problem_without_control():
     ocp.minimize(terminal=(start - 1) ** 2 + x**2)
     solution = solve(ocp)
     assert solution["x"][0] == pytest.approx(1 / (1 + np.exp(-2)), rel=1e-7)
+
+
+def test_path_inequality_on_a_large_covariance():
+    """36 entries: eliminated, and the same minimum as with the entries as variables; the constraint binds."""
+    free = solve(mass_chain.problem(masses=3), intervals=50)
+    bound = ca.interpolant("bound", "linear", [free.t], 0.85 * free["E"][:, 6, 6])
+    solutions = {}
+    for formulation in ("auto", "states"):
+        problem = mass_chain.problem(masses=3)
+        (covariance,) = problem.matrices
+        stiffness = covariance.matrix[6, 6]
+        problem.subject_to(stiffness - bound(problem.time) - 0.25 * ca.exp(-0.4 * problem.time), name="stiffness")
+        solutions[formulation] = solve(problem, covariances=formulation, intervals=50)
+    auto = solutions["auto"]
+    assert auto.mesh.eliminated
+    assert auto.cost == pytest.approx(solutions["states"].cost, rel=1e-7)
+    assert auto.cost > free.cost * (1 + 1e-5)
+    assert auto.multipliers.path.max() > 1e-3
