@@ -78,10 +78,12 @@ def as_number(name: str, what: str, value: Any) -> Array:
 
 
 def _no_numbers(value: Any) -> bool:
-    """Whether a value holds words or truths; None among the entries of a list is NaN."""
+    """Whether a value is a truth or holds words; None in a list is NaN, arrays of truths are patterns of 0 and 1."""
     if isinstance(value, (list, tuple)):
-        return any(map(_no_numbers, value))
-    return isinstance(value, (str, bool, np.bool_)) or (isinstance(value, np.ndarray) and value.dtype.kind == "b")
+        return any(
+            isinstance(entry, str) or (isinstance(entry, (list, tuple)) and _no_numbers(entry)) for entry in value
+        )
+    return isinstance(value, (str, bool, np.bool_))
 
 
 def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:

@@ -248,7 +248,7 @@ def test_parameter_that_is_missing():
 
 @wrong("variance of 'y'", "not a number", "True")
 def test_truth_for_a_number():
-    empty().state("y", 2, initial=0, variance=[1, True])
+    empty().state("y", 2, initial=0, variance=True)
 
 
 @wrong("rate of 'x'", "not an expression", "None")
