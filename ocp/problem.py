@@ -16,6 +16,7 @@ from covocp.checks import (
     check_constrains,
     check_density,
     check_inside,
+    check_kind,
     check_limits,
     check_name,
     check_positive,
@@ -69,6 +70,7 @@ class Problem:
         """Start an empty problem."""
         if not isinstance(duration, Free):
             duration = check_positive("duration", duration, unit="s")
+        check_kind(name, str, "give name= in words")
         self.name = name
         self.free_duration: Free | None = duration if isinstance(duration, Free) else None
         self._time = ca.MX.sym("time")
@@ -85,6 +87,13 @@ class Problem:
         self.expected: Expected | None = None
         self.expansion: Expansion | None = None
         self._frozen: Statement | None = None
+
+    def __repr__(self) -> str:
+        """What is declared, by name."""
+        groups: tuple[Any, ...] = (self.states, self.unknowns, self.controls, self.matrices)
+        parts = zip(("states", "unknowns", "controls", "matrices"), groups, strict=True)
+        listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in parts if group)
+        return f"Problem('{self.name}'{listed})"
 
     @property
     def time(self) -> ca.MX:

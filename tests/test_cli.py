@@ -398,3 +398,8 @@ def test_the_package_runs_as_a_module():
     """Where the script is not on the path."""
     run = subprocess.run([sys.executable, "-m", "covocp", "list"], capture_output=True, text=True, check=True)
     assert "unknown_lag" in run.stdout
+
+
+def test_version(capsys, monkeypatch):
+    monkeypatch.setitem(vars(co), "__version__", "1.2.3")
+    assert run(capsys, "--version") == (0, "covocp 1.2.3\n", "")

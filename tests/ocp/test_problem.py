@@ -366,3 +366,13 @@ def test_a_name_of_an_entry_is_taken() -> None:
     problem.state("x", 2, initial=0.0)
     with pytest.raises(co.ProblemError, match=r"'x\[1\]' is used twice"):
         problem.state("x[1]", initial=0.0)
+
+
+def test_a_console_shows_what_is_declared():
+    problem = co.Problem(duration=1.0, name="cart")
+    problem.state("x", initial=0.0, variance=1.0)
+    problem.unknown("drag", mean=1.0, variance=0.1)
+    problem.control("u")
+    assert repr(problem) == "Problem('cart', states x, unknowns drag, controls u)"
+    with pytest.raises(co.ProblemError, match="name="):
+        co.Problem(duration=1.0, name=3)
