@@ -352,6 +352,22 @@ def check_name(name: Any, declared: list[Any]) -> None:
             )
 
 
+def check_first_cost(problem: Any, call: str) -> None:
+    """A problem has one cost, stated by `minimize` or by `minimize_expected`."""
+    former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
+    if former:
+        raise ProblemError(
+            describe(
+                "The cost is given twice.",
+                expected="one call of minimize() or minimize_expected()",
+                received=f"{call}() after {former}()",
+                remedy="add the terms up in one call"
+                if call == former
+                else "use one of the two: minimize_expected() stands in place of minimize()",
+            )
+        )
+
+
 def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
     """Everything that moves needs a rate."""
     for entry in entries:

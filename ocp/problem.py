@@ -15,6 +15,7 @@ from covocp.checks import (
     check_bounds,
     check_constrains,
     check_density,
+    check_first_cost,
     check_inside,
     check_kind,
     check_limits,
@@ -402,7 +403,7 @@ class Problem:
         Raises:
             ProblemError: not scalar, or given twice.
         """
-        self._check_first_cost()
+        check_first_cost(self, "minimize")
         self.cost = (
             as_expression("minimize", "running cost", running, (1, 1)),
             as_expression("minimize", "terminal cost", terminal, (1, 1)),
@@ -434,20 +435,9 @@ class Problem:
         Raises:
             ProblemError: not scalar, cost given twice, weights that do not fit or are negative.
         """
-        self._check_first_cost()
+        check_first_cost(self, "minimize_expected")
         self.expected = expected_cost(self, running, terminal, terminal_weight, control_weight, gain)
         self._frozen = None
-
-    def _check_first_cost(self) -> None:
-        if self.cost is not None or self.expected is not None:
-            raise ProblemError(
-                describe(
-                    "The cost is given twice.",
-                    expected="one call of minimize() or minimize_expected()",
-                    received="a second one",
-                    remedy="add the terms up in one call",
-                )
-            )
 
     def subject_to(
         self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None

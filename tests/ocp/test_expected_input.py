@@ -183,7 +183,8 @@ def test_one_cost_only(order):
     d = Declared()
     calls = (lambda: d.ocp.minimize(running=d.u**2), lambda: d.ocp.minimize_expected(running=d.u**2))
     calls[order[0]]()
-    refused(calls[order[1]], "cost is given twice", "minimize_expected()")
+    remedy = "add the terms up" if order[0] == order[1] else "use one of the two"
+    refused(calls[order[1]], "cost is given twice", "minimize_expected()", remedy)
 
 
 def test_the_actual_system_has_no_covariance():
