@@ -33,6 +33,7 @@ class Batch:
     estimate: the filter's estimate of it, (runs, n).
     cost: (runs,); NaN without an expected cost, and where the run left the domain.
     left: time at which the run left the domain [s], inf where it did not, (runs,).
+    unanswered: time at which the law of the run first gave no finite control [s], inf where it always did, (runs,).
     asked, outside: flags by run, (runs, m), (runs, bounded states and controls).
     asking: number of runs that ask for more control than there is at a stored time, (K, m).
     count, mean, product, cube, fourth: sums over the runs inside the domain, by group: (groups, K), then of y
@@ -45,6 +46,7 @@ class Batch:
     estimate: Array
     cost: Array
     left: Array
+    unanswered: Array
     asked: Any
     outside: Any
     asking: Array
@@ -110,7 +112,7 @@ class _Simulation:
         self.step.inputs[2][:] = self.own
         self.observe.inputs[1][:] = self.own
         self.laws = [own_copy(plan.flown.law) for _ in range(self.runs)] if plan.flown else []
-        self.left = np.full(width, np.inf)
+        self.left, self.unanswered = np.full(width, np.inf), np.full(width, np.inf)
         self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
         rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
         self.asking = np.zeros((times, plan.fed_back))
@@ -156,9 +158,10 @@ class _Simulation:
         measured, controls = z[spans["measured"]], self.plan.fed_back
         mean = measured / flown.period if number else np.full_like(measured, np.nan)
         for i in np.flatnonzero(np.isinf(self.left[: self.runs])).tolist():
-            result = stepped(
-                self.laws[i], mean[:, i].copy(), float(flown.times[number]), controls, flown.estimates * self.plan.size
-            )
+            time, estimates = float(flown.times[number]), flown.estimates * self.plan.size
+            result = stepped(self.laws[i], mean[:, i].copy(), time, controls, estimates, self.first + i)
+            if not np.isfinite(result[:controls]).all():
+                self.unanswered[i] = min(time, self.unanswered[i])
             z[spans["held"], i] = result[:controls]
             if flown.estimates:
                 z[spans["estimate"], i] = result[controls:]
@@ -223,6 +226,7 @@ class _Simulation:
             estimate=np.ascontiguousarray(y[:, n:]) if plan.estimates else np.full_like(y[:, n:], np.nan),
             cost=np.where(stayed, self._cost(), np.nan),
             left=self.left[:runs],
+            unanswered=self.unanswered[:runs],
             asked=flags[0],
             outside=flags[1],
             asking=self.asking,

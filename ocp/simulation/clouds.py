@@ -204,7 +204,8 @@ def _ellipse(covariance: Array, size: float, points: int = 121) -> Array:
 
 def _title(figure: Figure, sample: MonteCarlo, title: str | None) -> None:
     """Name of the problem, and below it the verdict where the prediction fails."""
-    text = title if title is not None else sample.name
+    flown = f", a law every {sample.period:.6g} s" if sample.filter == "law" else ""
+    text = title if title is not None else sample.name + flown
     verdict = sample.verdict
     lines = [line for line in (text, "" if verdict.holds else f"{verdict.headline}") if line]
     if lines:

@@ -56,6 +56,7 @@ class MonteCarlo:
         predicted_cost: linear prediction for what was simulated, NaN where there is none; design_cost: of the design.
         left: time at which a run left the domain [s], inf where it did not, (R,).
         domain: deviations at which it is left, (n,).
+        unanswered: time at which the law of a run first gave no finite control [s], inf where it always did, (R,).
         asked: whether a run asked for more control than there is at some instant, (R, m).
         asking: share of the runs that ask for more at each stored time, (K, m).
         limits: what counts as all the control there is, (lower, upper), (m,) each; limited: whether the actual control
@@ -95,6 +96,7 @@ class MonteCarlo:
     design_cost: float
     left: Array
     domain: Array
+    unanswered: Array
     asked: Any
     asking: Array
     limits: tuple[Array, Array]

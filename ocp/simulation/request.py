@@ -50,13 +50,13 @@ class Request:
         return [(first, min(first + width, int(self.runs))) for first in range(0, int(self.runs), width)]
 
 
-def wrong_argument(name: str, expected: str, received: Any) -> ProblemError:
+def wrong_argument(name: str, expected: str, received: Any, remedy: str | None = None) -> ProblemError:
     """An argument of `simulate` that means nothing."""
     return ProblemError(
         describe(
             f"The argument '{name}' of simulate() is wrong.",
             expected=expected,
-            received=repr(received)[:100],
-            remedy=f"correct {name}=",
+            received=(received if isinstance(received, str) else repr(received))[:200],
+            remedy=remedy or f"correct {name}=",
         )
     )

@@ -301,7 +301,7 @@ def _result(
 def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     """What the result has for each run, and the sums over them."""
     names = {"deviations": "deviation", "estimates": "estimate", "costs": "cost"}
-    names |= {name: name for name in ("left", "asked", "outside", "paths")}
+    names |= {name: name for name in ("left", "unanswered", "asked", "outside", "paths")}
     values = {name: np.concatenate([getattr(batch, own) for batch in batches]) for name, own in names.items()}
     values["numbers"] = np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches])
     values["asking"] = np.sum([batch.asking for batch in batches], axis=0) / values["numbers"].size

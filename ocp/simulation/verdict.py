@@ -52,7 +52,8 @@ class Verdict:
     left: share of the runs that left the domain. unstable: share that did, or ended more than `UNSTABLE` predicted
     deviations away. asked: share that asked for more control than there is. holds: whether the prediction is inside the
     band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain.
-    law: whether a law of the user's flew.
+    law: whether a law of the user's flew. unanswered: share of the runs in which it once gave no finite control; they
+    do not count as unstable.
     """
 
     deviations: tuple[Entry, ...]
@@ -64,6 +65,7 @@ class Verdict:
     fed_back: bool
     limited: bool
     law: bool = False
+    unanswered: float = 0.0
 
     @property
     def decisive(self) -> tuple[Entry, ...]:
@@ -82,13 +84,16 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it does not hold: of "unstable", "saturated"; where neither, "law" or "nonlinear"; () where it holds."""
+        """Why it does not hold: of "unanswered", "unstable", "saturated"; else "law" or "nonlinear"; () where it holds.
+
+        Control that a law was given, because there were no limits, explains nothing.
+        """
         if self.holds:
             return ()
-        found = []
-        if self.unstable >= NOTICEABLE or self.left > 0.0:
+        found = ["unanswered"] if self.unanswered else []
+        if self.unstable >= NOTICEABLE or self.left > self.unanswered:
             found.append("unstable")
-        if self.asked >= NOTICEABLE:
+        if self.asked >= NOTICEABLE and (self.limited or not self.law):
             found.append("saturated")
         return tuple(found) or ("law" if self.law else "nonlinear",)
 
@@ -114,10 +119,12 @@ class Verdict:
         return text
 
     def _because(self, reason: str) -> str:
+        if reason == "unanswered":
+            return f"in {_percent(self.unanswered)} of the runs the law once gave no finite control"
         if reason == "unstable":
             words = f"{_percent(self.unstable)} of the runs are unstable"
             gone = f" ({_percent(self.left)} left the domain)" if self.left else ""
-            return words + gone + ", linear gains do not hold them"
+            return words + gone + (", the law does" if self.law else ", linear gains do") + " not hold them"
         if reason == "saturated":
             most = f", {_percent(self.most_asking)} at one instant" if self.most_asking else ""
             cut = "" if self.limited else " (which they were given)"
@@ -126,7 +133,7 @@ class Verdict:
             return (
                 "no run is unstable or short of control, so this law is not the filter and feedback of the design, is "
                 "stepped too rarely, or the system is too nonlinear for this spread"
-            )
+            ) + (f" ({_percent(self.asked)} asked for more control than the nominal has)" if self.asked else "")
         return "no run is unstable or short of control, so the system is too nonlinear for this spread"
 
 
@@ -137,7 +144,8 @@ def judge(sample: MonteCarlo) -> Verdict:
     states = min(states, n - sum(b.size for b in sample.blocks if b.kind == "unknown"))
     predicted, errors = (np.sqrt(np.diagonal(v[-1]).clip(0.0)) for v in (sample.predicted, sample.predicted_error))
     distance = np.abs(sample.deviations[:, :states]) > UNSTABLE * predicted[:states]
-    unstable = (distance & (predicted[:states] > 0)).any(axis=1) | ~stayed
+    answered = np.isinf(sample.unanswered)
+    unstable = ((distance & (predicted[:states] > 0)).any(axis=1) | ~stayed) & answered
     return Verdict(
         deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
         errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level)
@@ -150,6 +158,7 @@ def judge(sample: MonteCarlo) -> Verdict:
         fed_back=sample.fed_back,
         limited=sample.limited,
         law=sample.filter == "law",
+        unanswered=float(1.0 - answered.mean()),
     )
 
 

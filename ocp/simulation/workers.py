@@ -9,6 +9,7 @@ from typing import Any
 
 from covocp.errors import ProblemError, describe
 from covocp.simulation.batches import Batch, StoppedError, run_batch
+from covocp.simulation.flown import LawFailedError
 from covocp.simulation.plan import Plan
 
 # Seconds between two looks at the interrupt while an executor works.
@@ -62,13 +63,18 @@ def _here(
     plan: Plan, ranges: list[tuple[int, int]], stop: Callable[[], bool], report: Callable[[Batch], None]
 ) -> Harvest:
     done: list[Batch] = []
+    failures: list[Failure] = []
     try:
         for first, last in ranges:
-            done.append(run_batch(plan, first, last, stop))
-            report(done[-1])
+            try:
+                done.append(run_batch(plan, first, last, stop))
+            except LawFailedError as error:
+                failures.append(Failure(first=first, last=last, reason=_reason(error)))
+            else:
+                report(done[-1])
     except (StoppedError, KeyboardInterrupt):
         return Harvest(batches=tuple(done), failures=(), interrupted=True)
-    return Harvest(batches=tuple(done), failures=(), interrupted=False)
+    return Harvest(batches=tuple(done), failures=tuple(failures), interrupted=False)
 
 
 def _elsewhere(
@@ -138,4 +144,6 @@ def _reason(error: BaseException | None) -> str:
     if error is None:
         return "cancelled"
     lines = [line for line in str(error).splitlines() if line.strip()]
+    if isinstance(error, LawFailedError):
+        return lines[0].strip()
     return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__

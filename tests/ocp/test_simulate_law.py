@@ -3,12 +3,13 @@
 import concurrent.futures
 import multiprocessing
 import re
+import threading
 
 import casadi as ca
 import numpy as np
 import pytest
 from exports import lag, package
-from loops import open_loop, steered
+from loops import linear_quadratic, open_loop, steered
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
@@ -224,6 +225,37 @@ def test_a_run_whose_law_fails_leaves_the_domain(design):
     sample = simulate(design, 64, 1, law=Lost(), period=PERIOD, step=0.05, progress=False)
     assert sample.left_share == 1.0
     assert (sample.left >= 1.0).all()
+    assert (sample.unanswered == 1.5).all()  # the first step after 1 s
+    assert sample.verdict.reasons == ("unanswered",)
+    assert "in 100 % of the runs the law once gave no finite control" in str(sample.verdict)
+
+
+def test_a_law_that_raises_in_flight_loses_its_batch_only(design):
+    class Breaking(Proportional):
+        def step(self, measurement, time):
+            if measurement[0] > 2.2:
+                raise ZeroDivisionError("no inverse")
+            return super().step(measurement, time)
+
+    options = {"law": Breaking(), "period": PERIOD, "step": 0.05, "batch": 64, "progress": False}
+    with pytest.warns(co.CovocpWarning, match=r"the law failed in run \d+ at [\d.]+ s: ZeroDivisionError: no inverse"):
+        sample = simulate(design, 640, 1, **options)
+    assert 0 < sample.runs < 640
+    assert sum(failure.last - failure.first for failure in sample.failed) == 640 - sample.runs
+    Breaking.step = lambda self, measurement, time: 0.0 if time == 0 else 1 / 0
+    with pytest.raises(co.SolveError, match="every task failed"):
+        simulate(design, 64, 1, **options)
+
+
+def test_control_that_was_given_is_no_reason():
+    design = co.solve(linear_quadratic(), intervals=40, progress=False)  # bounds of 4
+    law = Answers(lambda measurement: -6.0 * np.nan_to_num(measurement))
+    options = {"law": law, "period": 0.05, "step": 0.05, "progress": False}
+    given = simulate(design, 256, 1, **options)
+    assert given.asked_share > 0.5
+    assert given.verdict.reasons == ("law",)
+    assert "asked for more control than the nominal has" in str(given.verdict)
+    assert "saturated" in simulate(design, 256, 1, limits="bounds", **options).verdict.reasons
 
 
 class Wide(Proportional):
@@ -235,6 +267,19 @@ class Short(Proportional):
     estimate = np.zeros(3)
 
 
+class Locked(Proportional):
+    def __init__(self):
+        self.lock = threading.Lock()
+
+
+class Answers:
+    def __init__(self, answer):
+        self.answer = answer
+
+    def step(self, measurement, time):
+        return self.answer(measurement)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -242,9 +287,16 @@ class Short(Proportional):
         ({"law": Proportional()}, "the time between two steps"),
         ({"law": Proportional(), "period": -1.0}, "the time between two steps"),
         ({"law": Proportional(), "period": 30.0}, "at most 3 s"),
+        ({"law": Recorder([0.0]), "period": 0.1}, "0.5 s, for which this law was made"),
+        ({"law": Proportional, "period": 0.1}, "law=Proportional(...)"),
+        ({"law": Answers(lambda m: 2.0 * (1.0 - m)), "period": 0.1}, "also where nothing was measured yet"),
+        ({"law": Answers(lambda m: None), "period": 0.1}, "1 finite number(s)"),
+        ({"law": Answers(lambda m: "a"), "period": 0.1}, "ValueError"),
+        ({"law": Answers(lambda m: 1 / 0), "period": 0.1}, "ZeroDivisionError"),
+        ({"law": Locked(), "period": 0.1}, "cannot be copied"),
         ({"law": Proportional(), "period": True}, "the time between two steps"),
-        ({"law": Wide(), "period": 0.1}, "1 entries"),
-        ({"law": Short(), "period": 0.1}, "2 entries"),
+        ({"law": Wide(), "period": 0.1}, "1 finite number(s)"),
+        ({"law": Short(), "period": 0.1}, "2 numbers"),
         ({"law": Proportional(), "period": 0.1, "filter": "extended"}, "the law has its own"),
         ({"period": 0.1}, "law="),
     ],
