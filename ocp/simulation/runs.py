@@ -73,10 +73,10 @@ def simulate(
             measurements and any dynamics, noises and variances; or a dict of parameter or unknown to the value that it
             has in every run. Filter and feedback stay those of the design.
         law: what flies instead of the design's filter and feedback: an object with `step(measurement, time)` that
-            returns the controls fed back, such as a CPackage's `python()`. Each run has a copy of it, started by its
-            `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual measurement
-            over the period before (NaN at time zero); its control is held until the next step. Where it has an
-            `estimate` of the deviation from the nominal, its errors are reported too.
+            returns the whole control, (m,), such as a CPackage's `python()`. Each run has a deep copy of it, started by
+            its `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual
+            measurement over the period before, (r,), NaN at time zero; its control is held until the next step. Where
+            it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too.
         period: time between two steps of the law [s]; None: its own attribute `period`.
         executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
