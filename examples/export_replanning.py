@@ -45,10 +45,11 @@ solution = co.solve(problem, intervals=20, progress=False)
 plan = package.python()()  # no arguments: those of the export
 print(f"cost in C {plan['cost']:.10f}, by Ipopt {solution.cost:.10f}")
 
-folder = package.directory
+folder = package.directory.parent  # beside the package, whose folder holds what the export writes
 (folder / "loop.c").write_text(LOOP, encoding="utf-8")
-sources = ["loop.c", "lag_planner.c", "lag_planner_casadi.c"]
-command = ["cc", "-std=c99", "-Wall", "-Wextra", "-pedantic", "-O1", *sources, "-lm", "-o", "loop"]
+sources = ["loop.c", "lag_planner/lag_planner.c", "lag_planner/lag_planner_casadi.c"]
+flags = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-O1", "-Ilag_planner"]
+command = ["cc", *flags, *sources, "-lm", "-o", "loop"]
 subprocess.run(command, cwd=folder, check=True)
 print(subprocess.run(["./loop"], cwd=folder, check=True, capture_output=True, text=True).stdout, end="")
 time = package.time()["solve"]

@@ -18,7 +18,7 @@ from covocp.export.casadi_code import Generated, Sizes, generate
 from covocp.export.collisions import check_identifiers
 from covocp.export.controller import controller_law
 from covocp.export.design import design_of
-from covocp.export.folder import check_folder, write_folder
+from covocp.export.folder import check_folder, check_names, package_files, write_folder
 from covocp.export.functions import function_laws
 from covocp.export.header import header
 from covocp.export.history import history
@@ -78,7 +78,8 @@ def export_c(
         directory: folder to make; its parent must exist.
         name: of the package, an identifier in C; None: from the directory.
         precision: "double" or "single".
-        overwrite: replace a package that is there.
+        overwrite: replace a package that is there: the files it consists of, and what was built of them. Other files in
+            its folder stay.
         period: of a controller [s]: gains and transitions are made for samples of this period; None: any time between
             two steps, everything computed along the nominal as it is needed.
         limits: of the control that a controller gives out: None, "bounds" (those of the problem), or a dict of control
@@ -135,7 +136,9 @@ def check_settings(
     if period is not None:
         _positive("period", period)
     target = check_folder(directory, overwrite)
-    return target, package_name(target.name) if name is None else check_name(name)
+    package = package_name(target.name) if name is None else check_name(name)
+    check_names(target, package_files(package))
+    return target, package
 
 
 def _written(
@@ -149,16 +152,15 @@ def _written(
     about = (content.title, written)
     work = {law.name: _work_bytes(law, sizes[law.name], precision) for law in laws}
     linking = content.linking
-    files = {
-        f"{package}.h": header(package, about, laws, generated, real),
-        f"{package}.c": source(package, laws, sizes),
-        f"{package}_casadi.c": generated.source,
-        "main.c": self_test(package, laws, precision, tolerance),
-        "CMakeLists.txt": cmake_lists(package, precision, linking.cmake(package) if linking else ""),
-        "README.md": readme(
-            package, about, laws, work, precision, linking.words if linking else "", alone=generated.alone
-        ),
-    }
+    texts = (
+        header(package, about, laws, generated, real),
+        source(package, laws, sizes),
+        generated.source,
+        self_test(package, laws, precision, tolerance),
+        cmake_lists(package, precision, linking.cmake(package) if linking else ""),
+        readme(package, about, laws, work, precision, linking.words if linking else "", alone=generated.alone),
+    )
+    files = dict(zip(package_files(package), texts, strict=True))
     mark = {"name": package, "covocp": version, "casadi": casadi, "date": date, "precision": precision}
     write_folder(target, files, {**mark, "laws": [law.name for law in laws]})
     return CPackage(
