@@ -147,11 +147,11 @@ def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], 
     t, n = sample.t, sample.size
     for run in sample.paths[:, :, row]:
         axes.plot(t, run, color=GREY, linewidth=0.5, alpha=0.5)
-    if row < n:
-        predicted = np.sqrt(sample.predicted[:, row, row].clip(0.0))
-        axes.fill_between(t, -predicted, predicted, color=PREDICTED, alpha=BAND, linewidth=0)
-        for edge in (-predicted, predicted):
-            axes.plot(t, edge, color=PREDICTED, linewidth=1.2)
+    squares = sample.predicted[:, row, row] if row < n else sample.predicted_control[:, row - 2 * n, row - 2 * n]
+    predicted = np.sqrt(squares.clip(0.0))
+    axes.fill_between(t, -predicted, predicted, color=PREDICTED, alpha=BAND, linewidth=0)
+    for edge in (-predicted, predicted):
+        axes.plot(t, edge, color=PREDICTED, linewidth=1.2)
     mean = sample.moments.mean[:, row]
     spread = np.sqrt(np.maximum(sample.moments.product[:, row, row] - mean**2, 0.0))
     for curve, width in ((mean, 1.4), (mean - spread, 1.0), (mean + spread, 1.0)):

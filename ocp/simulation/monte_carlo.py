@@ -48,7 +48,8 @@ class MonteCarlo:
         nominal: augmented state of the nominal, (K, n); nominal_control: its controls that are fed back, (K, m).
         moments: of deviation, estimate of it and deviation of the control, stacked, at the stored times.
         predicted: linear prediction for what was simulated: mean squares of the deviation, (K, n, n);
-            predicted_error: of the error of the estimate; predicted_mean: mean of the deviation, (K, n).
+            predicted_error: of the error of the estimate; predicted_mean: mean of the deviation, (K, n);
+            predicted_control: mean squares of the deviation of the controls fed back, (K, m, m).
         design, design_error: the same mean squares as the design expects them; they differ where there is a truth.
         deviations: at the end, (R, n); of a run that left the domain, just before it did.
         estimates: the filter's estimates of them, (R, n); those of a law at its last step, NaN where it has none.
@@ -87,6 +88,7 @@ class MonteCarlo:
     predicted: Array
     predicted_error: Array
     predicted_mean: Array
+    predicted_control: Array
     design: Array
     design_error: Array
     deviations: Array
@@ -184,8 +186,10 @@ class MonteCarlo:
 
     def predicted_deviation(self, key: Any) -> Array:
         """Standard deviation about the nominal that linear theory predicts, (K,) or (K, size)."""
-        rows, block = self.rows(key, controls=False)
-        return self._shaped(np.sqrt(np.diagonal(self.predicted, axis1=1, axis2=2)[:, rows]), block)
+        rows, block = self.rows(key)
+        predicted = self.predicted_control if block.kind == "control" else self.predicted
+        squares = np.diagonal(predicted, axis1=1, axis2=2)[:, block_rows(rows, block, self.size)]
+        return self._shaped(np.sqrt(squares.clip(0.0)), block)
 
     def error_covariance(self, a: Any, b: Any = None) -> Array:
         """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b).

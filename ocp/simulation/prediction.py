@@ -21,7 +21,7 @@ import numpy as np
 from covocp.errors import ProblemError, describe
 from covocp.matrices import Array
 from covocp.simulation.actual import System
-from covocp.simulation.schedule import Grid, coefficients, nominal_at
+from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
 from covocp.solution import Solution
 
 # Length of a step times the fastest rate: classical Runge-Kutta then errs by less than 1e-6.
@@ -55,6 +55,11 @@ class Prediction:
     def error(self) -> Array:
         """Mean square of the error of the estimate, E where the truth is the design, (K, n, n)."""
         return self._about_nominal(np.hstack([-np.eye(self.size), np.eye(self.size)]))
+
+    @property
+    def estimate(self) -> Array:
+        """Mean square of the estimate of the deviation, (K, n, n)."""
+        return self._about_nominal(np.hstack([np.zeros((self.size, self.size)), np.eye(self.size)]))
 
     def at(self, rows: Any) -> Prediction:
         """The prediction at some of its times; the fastest rates stay those of all intervals."""
@@ -90,6 +95,16 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
             means.append(mean)
             covariances.append(covariance)
     return Prediction(mean=np.array(means), covariance=np.array(covariances), rates=rates)
+
+
+def control_spread(solution: Solution, design: System, prediction: Prediction, nominal: Nominal) -> Array:
+    """Mean square of the deviation of the controls fed back, C <y y'> C', (K, m, m), at the times of the prediction."""
+    loop, count = design.statement.loop, nominal.t.size
+    if loop is None:
+        return np.zeros((count, 0, 0))
+    gains = np.asarray(loop.gain.map(count)(*nominal.columns(solution.duration, solution.parameters)).full())
+    C = gains.reshape(design.fed_back, count, design.size).transpose(1, 0, 2)
+    return np.asarray(C @ prediction.estimate @ C.transpose(0, 2, 1))
 
 
 def _joint(design: System, actual: System) -> ca.Function:

@@ -19,7 +19,7 @@ from covocp.simulation.batches import Batch, StoppedError
 from covocp.simulation.flown import flown_law, sample_indices
 from covocp.simulation.monte_carlo import MonteCarlo
 from covocp.simulation.plan import make_plan
-from covocp.simulation.prediction import Prediction, predict
+from covocp.simulation.prediction import Prediction, control_spread, predict
 from covocp.simulation.request import Request, wrong_argument
 from covocp.simulation.run_step import Limits, Setting, bounded_rows
 from covocp.simulation.sampling import THREE_SIGMA, moments_of
@@ -282,6 +282,7 @@ def _result(
         predicted=true.deviation,
         predicted_error=true.error,
         predicted_mean=true.mean[:, : design.size],
+        predicted_control=control_spread(solution, design, true, nominal),
         design=expected.deviation,
         design_error=expected.error,
         design_cost=costs[0],
