@@ -6,7 +6,7 @@ deviation from the nominal, computes
     y- :  y' = F y + G (u_held - u(time)) over [s, t], one step of the two-stage Gauss method: order 4, stable for any h
     L  =  h E M' (h M E M' + U)^-1           K h to first order; the spectrum of L M is in [0, 1): stable for any h
     y+ =  y- + L (m - h(x, u, t) - M y- - H (u_held - u(t)))
-    u  =  u(t) - C y+,                       then limited
+    u  =  u(t) - C y+,                       within the limits, where there are some
 
 with F, G, M, H, U and the measurement h expected there from the model's own functions along the nominal, E of the
 design and C at t. A measurement stands for the h seconds before it: white noise of density U, averaged over them.
@@ -19,9 +19,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.export.design import Design, clipped
+from covocp.export.design import Design
 from covocp.export.history import History, Nominal
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
+from covocp.export.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.trajectory import times
 from covocp.integrators import COMPILED_SOLVER, GAUSS_NODES, linear_solve
 from covocp.matrices import Array
@@ -38,7 +39,7 @@ ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
     "u), one step of the two-stage Gauss method, stable for any h; it is corrected by L (m - what is expected) with "
-    "L = h E M' (h M E M' + U)^-1; the control is u - C y, limited.",
+    "L = h E M' (h M E M' + U)^-1; the control is u - C y.",
     "A row of the measurement that is not finite is left out. The first measurement that counts is that of the "
     "first call after time zero: it stands for the time from zero to then.",
 )
@@ -81,7 +82,9 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     return Law(
         name="step",
         kind="controller",
-        about=ABOUT,
+        about=(*ABOUT, limits_text(design.statement, design.limits)),
+        notes=limits_notes(design.statement, design.limits),
+        constants=limit_constants(design.statement, design.limits),
         core=core,
         inputs=input_ports(design),
         outputs=field_ports(design, fields),
@@ -154,13 +157,17 @@ def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Array:
-    """First values of the fields: the filter at the mean, the nominal at time zero."""
+    """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits."""
     m = design.sizes[1]
     time = ca.MX.sym("time")
     now = tables.at(time)
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
     x, u, e = (np.asarray(v.full()) for v in ca.Function("nominal", [time], [now.x, now.u, now.e])(0.0))
-    zeros |= {"control": u[:m].ravel(), "nominal_control": u[:m].ravel(), "nominal_state": x.ravel()}
+    zeros |= {
+        "control": np.clip(u[:m].ravel(), *design.limits),
+        "nominal_control": u[:m].ravel(),
+        "nominal_state": x.ravel(),
+    }
     zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
     return np.concatenate(list(zeros.values()))
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_bounds, column
 from covocp.errors import ExportError, describe
-from covocp.lookup import name_of
+from covocp.export.limits import control_limits
 from covocp.matrices import Array, unpack, unpack_symbolic
 from covocp.solution import Solution
 from covocp.statement import Block, Statement
@@ -99,7 +97,7 @@ def design_of(solution: Solution, limits: Any) -> Design:
         linear=ca.Function("linear", [x, u, t], [ca.densify(v) for v in (F, G, h, M, slope, U)]),
         noise=ca.Function("noise", [x, u, t], [ca.densify(Q)]),
         gain=ca.Function("gain", [x, u, e, t], [ca.densify(C), ca.densify(E)]),
-        limits=_limits(statement, m, limits),
+        limits=control_limits(statement, m, limits),
         units=_units(solution, block),
         labels=statement.augmented,
         sizes=(n, m, int(h.shape[0])),
@@ -113,49 +111,3 @@ def _units(solution: Solution, block: Block) -> Array:
     variances = np.max([np.diagonal(matrix, axis1=1, axis2=2).max(axis=0) for matrix in matrices], axis=0)
     units = np.sqrt(np.maximum(variances, 0.0))
     return np.where(np.isfinite(units) & (units > 0.0), units, 1.0)
-
-
-def _limits(statement: Statement, m: int, given: Any) -> tuple[Array, Array]:
-    """Lower and upper limits of the controls that are fed back."""
-    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
-    if given is None:
-        return lower, upper
-    if isinstance(given, str) and given == "bounds":
-        return statement.control_bounds[0][:m].copy(), statement.control_bounds[1][:m].copy()
-    if not isinstance(given, Mapping):
-        raise ExportError(
-            describe(
-                "The limits of the control are of an unknown kind.",
-                expected="None, 'bounds', or a dict of control to (lower, upper)",
-                received=repr(given)[:100],
-                remedy="correct limits=",
-            )
-        )
-    blocks = {b.name: b for b in statement.controls if b.span.stop <= m}
-    for key, pair in given.items():
-        block = blocks[name_of(key, statement.symbols, tuple(blocks))]
-        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-            raise ExportError(
-                describe(
-                    f"The limits of '{block.name}' are no pair.",
-                    expected="(lower, upper)",
-                    received=repr(pair)[:100],
-                    remedy="correct limits=",
-                )
-            )
-        low, high = (
-            column(block.name, what, value, block.size, inf=True)
-            for what, value in zip(("lower limit", "upper limit"), pair, strict=True)
-        )
-        check_bounds(block.name, low, high)
-        lower[block.span], upper[block.span] = low, high
-    return lower, upper
-
-
-def clipped(value: Any, limits: tuple[Array, Array]) -> Any:
-    """A control within its limits, an expression."""
-    rows = []
-    for i, (low, high) in enumerate(zip(*(bound.tolist() for bound in limits), strict=True)):
-        row = ca.fmax(value[i], low) if np.isfinite(low) else value[i]
-        rows.append(ca.fmin(row, high) if np.isfinite(high) else row)
-    return ca.vertcat(*rows)

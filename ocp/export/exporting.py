@@ -23,6 +23,7 @@ from covocp.export.functions import function_laws
 from covocp.export.header import header
 from covocp.export.history import history
 from covocp.export.laws import Law, stacked_size
+from covocp.export.limits import warn_outside
 from covocp.export.linking import Linking
 from covocp.export.names import check_name, package_name
 from covocp.export.package import CPackage
@@ -82,8 +83,9 @@ def export_c(
             its folder stay.
         period: of a controller [s]: gains and transitions are made for samples of this period; None: any time between
             two steps, everything computed along the nominal as it is needed.
-        limits: of the control that a controller gives out: None, "bounds" (those of the problem), or a dict of control
-            to (lower, upper).
+        limits: of the control that a controller gives out: None (not limited, not even to the bounds of the problem),
+            "bounds" (those of the problem), or a dict of control to (lower, upper). A nominal control outside of them
+            is a warning.
         feedback: whether a solution with feedback is exported as a controller; False: its histories only.
         ranges: of inputs of functions by name, (lower, upper): where C is compared with Python; None: normal numbers.
         units: of inputs and outputs of functions by name, for the comments.
@@ -189,6 +191,7 @@ def _solution(
     laws = [sample_law(solution, tables, tolerance)]
     if solution.loop is not None and feedback:
         design = design_of(solution, limits)
+        warn_outside(design.statement, design.limits, tables)
         if period is None:
             laws.append(controller_law(design, tables, tolerance))
         else:

@@ -77,7 +77,8 @@ def _declared(package: str, law: Law, generated: Generated) -> str:
             defined.append(f"#define {text} {number}")
     for name, value in law.constants.items():
         label, _, unit = name.partition(" ")
-        defined.append(f"#define {constant(package, label)} {real(value)} /* {unit} */")
+        signed = f"({real(value)})" if value < 0 else real(value)
+        defined.append(f"#define {constant(package, label)} {signed}" + (f" /* {_plain(unit)} */" if unit else ""))
     parts = ["\n".join(defined)] if defined else []
     if law.kind in ("sample", "controller"):
         parts.append(_fields(package, law))

@@ -93,6 +93,7 @@ class Law:
         defaults: of a solver: inputs of the export, stacked.
         points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
         constants: numbers for the header, by name and unit: "DURATION [s]".
+        notes: what the package says of the law where it is printed.
         most: largest number of points.
         tolerance: largest deviation of C from Python, relative.
     """
@@ -110,6 +111,7 @@ class Law:
     safe: Array = field(default_factory=lambda: np.zeros(0))
     defaults: Array = field(default_factory=lambda: np.zeros(0))
     constants: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     most: int = 100_000
     tolerance: float = 1e-12
 

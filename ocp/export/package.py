@@ -210,10 +210,12 @@ class CPackage:
         return laws_of(self.laws, None)
 
     def __str__(self) -> str:
-        """What there is, and the last check where there was one."""
+        """What there is, what to know of it, and the last check where there was one."""
         listed = ", ".join(f"{self.name}_{law.name}" for law in self.laws)
-        text = f"C package '{self.name}' in {self.directory}: {listed} ({self.precision} precision)"
-        return f"{text}\n{self._kept['check']}" if "check" in self._kept else text
+        lines = [f"C package '{self.name}' in {self.directory}: {listed} ({self.precision} precision)"]
+        lines += [f"{law.name}: {note}" for law in self.laws for note in law.notes]
+        lines += [str(self._kept["check"])] if "check" in self._kept else []
+        return "\n".join(lines)
 
     @property
     def _built(self) -> Build:

@@ -3,7 +3,9 @@
 For the samples t_k = k period, with y the estimate of the deviation and w the control held since the last sample,
 
     y-_k = Phi_k y_(k-1) + Gamma_k w + g_k,          g_k = - int Phi G u dt: the nominal goes on, the control is held
-    y_k  = y-_k + L_k (m_k - h_k - M_k y-_k - H_k (w - u_k)),      u_k  =  u(t_k) - C(t_k) y_k,  then limited
+    y_k  = y-_k + L_k (m_k - h_k - M_k y-_k - H_k (w - u_k)),      u_k  =  u(t_k) - C(t_k) y_k,
+
+the control within the limits, where there are some.
 
 Phi, Gamma, g by the two-stage Gauss method between the nodes of the mesh. L_k = P- M' (M P- M' + U/period)^-1 is the
 gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period.
@@ -32,9 +34,10 @@ from covocp.export.controller import (
     points,
     solved,
 )
-from covocp.export.design import Design, clipped
+from covocp.export.design import Design
 from covocp.export.history import History
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
+from covocp.export.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.integrators import GAUSS_NODES
 from covocp.matrices import Array, pack, unpack_symbolic
 
@@ -48,7 +51,7 @@ ABOUT = (
     "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held "
     "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
     "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
-    "period; the control is u - C y, limited.",
+    "period; the control is u - C y.",
     "A row of the measurement that is not finite is left out: L is then P- M' (M P- M' + U/period)^-1 of the other "
     "rows, P- that of the filter with all of them. At time zero the control is that of the nominal.",
 )
@@ -123,11 +126,14 @@ def sampled_law(design: Design, tables: History, period: float, tolerance: float
         "status": ca.if_else(more, CONTINUE, status_of(conditions)),
     }
     core = ca.Function("step", [y, last, held, measured, time], [flat(v) for v in fields.values()])
+    limits = (design.statement, design.limits)
+    spoken = f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."
     return Law(
         name="step",
         kind="controller",
-        about=(*ABOUT, f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."),
-        constants={"PERIOD [s]": period},
+        about=(*ABOUT, spoken, limits_text(*limits)),
+        notes=limits_notes(*limits),
+        constants={"PERIOD [s]": period} | limit_constants(*limits),
         core=core,
         inputs=_ports(design),
         outputs=field_ports(design, fields),
