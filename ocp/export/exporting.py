@@ -25,7 +25,7 @@ from covocp.export.history import history
 from covocp.export.laws import Law, stacked_size
 from covocp.export.limits import warn_outside
 from covocp.export.linking import Linking
-from covocp.export.names import check_name, package_name
+from covocp.export.names import check_name, package_name, suggestion
 from covocp.export.package import CPackage
 from covocp.export.readme import cmake_lists, readme
 from covocp.export.sampled import sampled_law
@@ -256,14 +256,15 @@ def _work_bytes(law: Law, sizes: Sizes, precision: str) -> int:
 
 def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None:
     """Refuse options that mean nothing to what is exported."""
+    allowed = ("name", "precision", "overwrite", "tolerance", *known)
     for name, value in given.items():
         if value is not None and name not in known:
             raise ExportError(
                 describe(
                     f"export_c has no option '{name}' for {what}.",
-                    expected="one of " + ", ".join(("name", "precision", "overwrite", "tolerance", *known)),
+                    expected="one of " + ", ".join(allowed),
                     received=f"{name}={value!r}"[:100],
-                    remedy="leave it out",
+                    remedy=suggestion(name, allowed) or "leave it out",
                 )
             )
 

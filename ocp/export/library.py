@@ -16,6 +16,7 @@ import numpy as np
 from covocp.errors import ExportError, describe
 from covocp.export.header import struct_name
 from covocp.export.laws import CODES, STATUSES, Law, Port, span, stacked_size
+from covocp.export.names import suggestion
 from covocp.matrices import Array
 
 NAMES = tuple(STATUSES)
@@ -211,41 +212,65 @@ class Call:
             named: arguments by name.
 
         Returns:
-            Of a function its result, or a tuple; of any other law a dict by name. NaN where C writes nothing.
+            Of a function its result, or a tuple; of any other law a dict by name, with its "status". NaN where C writes
+            nothing.
 
         Raises:
-            ExportError: arguments that are missing, too many or of another shape.
+            ExportError: arguments that are missing, unknown, too many or of another shape.
         """
         row = self._row(values, named)
         results, status = self._backend(row)
         self.status = NAMES[status]
         parts = {p.name: _shaped(results[span(self.law.results, p.name)], p) for p in self.law.results}
         if self.law.kind != "function":
-            return parts
+            return {**parts, "status": self.status}
         return next(iter(parts.values())) if len(parts) == 1 else tuple(parts.values())
 
     def _row(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> Array:
         """All inputs, stacked."""
-        ports = self.law.arguments
-        given = {port.name: value for port, value in zip(ports, values, strict=False)} | dict(named)
-        if self.law.kind == "solver":
-            given = {port.name: self.law.defaults[span(self.law.inputs, port.name)] for port in ports} | given
-        wrong = len(values) > len(ports) or set(given) != {port.name for port in ports}
+        given = self._given(values, named)
         parts = []
-        for port in ports if not wrong else ():
-            array = np.asarray(given[port.name], dtype=float)
-            wrong = wrong or array.size != port.size
+        for port in self.law.arguments:
+            if port.name not in given:
+                parts.append(self.law.defaults[span(self.law.inputs, port.name)])
+                continue
+            value = given[port.name]
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise self._unfit(f"{port.name}={value!r}", "give numbers") from error
+            if array.size != port.size:
+                raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
             parts.append(array.ravel())
-        if wrong:
-            raise ExportError(
-                describe(
-                    f"The arguments of '{self.law.name}' do not fit.",
-                    expected=", ".join(f"{p.name} {p.shape or '()'}" for p in ports),
-                    received=f"{len(values)} values; " + ", ".join(f"{k} {np.shape(v)}" for k, v in given.items()),
-                    remedy="give these arguments in these shapes",
-                )
-            )
         return np.concatenate([np.zeros(0), *parts])
+
+    def _given(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
+        """What the caller gives by name; complains about names, never about values."""
+        names = [port.name for port in self.law.arguments]
+        if len(values) > len(names):
+            raise self._unfit(f"{len(values)} values", f"give {len(names)} at most")
+        given = dict(zip(names, values, strict=False))
+        for name, value in named.items():
+            if name not in names:
+                what = f"there is no argument '{name}'"
+                raise self._unfit(f"{name}={value!r}", suggestion(name, names) or f"leave '{name}' out", what)
+            if name in given:
+                raise self._unfit(f"'{name}' by its place and by its name", "give it once")
+            given[name] = value
+        missing = [name for name in names if name not in given]
+        if missing and self.law.kind != "solver":
+            raise self._unfit(", ".join(given) or "nothing", f"give {', '.join(missing)} too")
+        return given
+
+    def _unfit(self, received: str, remedy: str, what: str = "") -> ExportError:
+        return ExportError(
+            describe(
+                f"The arguments of '{self.law.name}' do not fit" + (f": {what}." if what else "."),
+                expected=", ".join(f"{p.name} {p.shape or '()'}" for p in self.law.arguments) or "none",
+                received=received[:100],
+                remedy=remedy,
+            )
+        )
 
 
 class Controller(Call):

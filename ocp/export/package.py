@@ -21,6 +21,7 @@ from covocp.export.self_test import POINTS, SEED, reference
 
 TIMED_SECONDS = 0.2  # of each law in `time`
 LEAST_CALLS, MOST_CALLS = 3, 2_000_000
+PLURAL = ("flags", "samples")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,6 +201,13 @@ class CPackage:
         Each law by its name, as an attribute or an item; calling the whole calls the controller, else the solver, else
         the first law. A controller has `init()`, `step(measurement, time)`, `state`; every law `status`.
 
+        The arguments of a solver are numbers or arrays, by position or by name, and those that are left out are those
+        of the export: `initial_<state>` for each state with a fixed initial value, `initial_<matrix>` for each matrix
+        with one (`initial_E` for the estimation covariance, whole, not as a half-vector), each parameter and each mean
+        of an unknown by its own name, `duration` where it may change, and `guess`, the `variables` of an earlier plan.
+        The plan is a dict of arrays, with its "status". That of a problem with an expected cost is the nominal only:
+        it has no gains and cannot be flown in closed loop by itself.
+
         Raises:
             ExportError: the package cannot be compiled or loaded.
         """
@@ -294,7 +302,7 @@ class CPackage:
     def _wrong(self, what: str, expected: str, received: Any) -> ExportError:
         return ExportError(
             describe(
-                f"The {what} of the package '{self.name}' does not fit.",
+                f"The {what} of the package '{self.name}' {'do' if what in PLURAL else 'does'} not fit.",
                 expected=expected,
                 received=str(received)[:500],
                 remedy=f"correct {what}" if what != "self-test" else "build() again; is the folder complete?",

@@ -62,7 +62,7 @@ def replannable(problem: Problem) -> Replannable:
     own = _copied(problem)
     statement = problem.statement()
     start, _, matrices, _ = statement.boundary_values(statement.values)
-    taken = {"workspace", "guess", "variables", "cost", "time", "infeasibility", "stationarity"}
+    taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
     entries: list[Entry] = []
     _estimated(own)
     for position, state in enumerate(problem.states):

@@ -16,7 +16,7 @@ import numpy as np
 from covocp.errors import ExportError, describe
 from covocp.export.laws import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.linking import PLUGINS, Linking
-from covocp.export.names import identifier
+from covocp.export.names import identifier, suggestion
 from covocp.export.replanning import Replannable, replannable, stacked
 from covocp.guess import choose_scales, quadrature_weights
 from covocp.integrators import COMPILED_SOLVER
@@ -53,6 +53,11 @@ ABOUT = (
     "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
     "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an "
     "argument is not finite, the plan made at the export is returned, and the status says so.",
+)
+# What is said of a problem with an expected cost: its plan is no controller.
+NOMINAL = (
+    "The plan is the nominal only, without gains: the feedback that the expected cost assumes is not in it, so it "
+    "cannot be flown in closed loop by itself."
 )
 
 
@@ -104,14 +109,15 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
             )
         )
     known = {entry.name for entry in fields(Options)} | {"plugin_options"}
+    allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
     for name in options:
         if name not in known:
             raise ExportError(
                 describe(
                     f"export_c has no option '{name}' for a problem.",
-                    expected="one of " + ", ".join(sorted(known)),
+                    expected="one of " + ", ".join(allowed),
                     received=f"{name}={options[name]!r}"[:100],
-                    remedy="correct or remove it",
+                    remedy=suggestion(name, allowed) or "leave it out",
                 )
             )
     task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
@@ -256,7 +262,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     return Law(
         name="solve",
         kind="solver",
-        about=ABOUT,
+        about=ABOUT if task.made.fixed.expected is None else (*ABOUT, NOMINAL),
         core=core,
         inputs=ports,
         outputs=(*(port for port, _ in outputs), Port(name="status")),
@@ -281,7 +287,7 @@ def _results(
         "stationarity": (residuals[1], "largest slope of the Lagrangian that is left, in the solver's units"),
         "variables": (variables, "of the solver, the guess of a next call"),
     }
-    taken = {entry.port.name for entry in task.made.entries} | {"guess", "time", *last}
+    taken = {entry.port.name for entry in task.made.entries} | {"guess", "time", "status", *last}
     times = Port(name="time", rows=nlp.mesh.nodes.size, unit="s", about="of the nodes")
     results = [(times, duration * ca.DM(nlp.mesh.nodes))]
     for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):

@@ -360,6 +360,8 @@ def test_nodes_without_c_code_are_named_with_what_to_do(tmp_path, capfd, case):
         (LAW, {"period": 0.1}, "no option 'period' for functions"),
         (LAW, {"method": "ipopt"}, "no option 'method' for functions"),
         (LAW, {"intervals": 10}, "no option 'intervals' for functions"),
+        (LAW, {"range": {"x": (0, 1)}}, r"(?s)no option 'range' for functions.*did you mean ranges\?"),
+        (LAW, {"overwite": True}, r"(?s)no option 'overwite' for functions.*did you mean overwrite\?"),
         (LAW, {"tolerance": -1.0}, "tolerance"),
         (LAW, {"tolerance": True}, "tolerance"),
     ],
@@ -388,7 +390,7 @@ def test_without_a_compiler_the_error_says_so(tmp_path, monkeypatch):
         made.build("cc")
     with pytest.raises(co.ExportError, match="no such tool"):
         made.build("make")
-    with pytest.raises(co.ExportError, match="list of flags"):
+    with pytest.raises(co.ExportError, match=r"(?s)The flags of the package 'thing' do not fit.*list of flags"):
         made.build(flags="-O3")
 
 

@@ -87,7 +87,7 @@ def test_arguments_that_are_not_finite_return_the_plan_of_the_export():
             argument = defaults[first:last].copy()
             argument[-1] = value
             plan = planner(**{port.name: argument.reshape(port.shape)})
-            assert planner.status == "ARGUMENT_NOT_FINITE"
+            assert planner.status == plan.pop("status") == "ARGUMENT_NOT_FINITE"
             for result, entry in plan.items():
                 np.testing.assert_array_equal(entry, usual[result])
 
@@ -112,3 +112,61 @@ def test_a_plan_backwards_in_time_is_none():
     for duration in (0.0, -0.5):
         planner(duration=duration)
         assert planner.status != "OK"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named", "words"),
+    [
+        ((), {"x": 0.2}, r"there is no argument 'x'.*received: x=0.2\n.*did you mean initial_x\?"),
+        ((), {"initial_X": 0.2}, r"no argument 'initial_X'.*did you mean initial_x\?"),
+        ((), {"weigth": 3.0}, r"no argument 'weigth'.*did you mean weight\?"),
+        ((), {"altitude": 3.0}, r"no argument 'altitude'.*received: altitude=3.0\n.*leave 'altitude' out"),
+        ((), {"initial_x": [1.0, 2.0]}, r"received: initial_x \(2,\)\n.*give 'initial_x' in its shape"),
+        ((), {"initial_x": "here"}, r"received: initial_x='here'\n.*give numbers"),
+        ((0.1,), {"initial_x": 0.1}, r"'initial_x' by its place and by its name"),
+        ((0.0,) * 9, {}, r"received: 9 values\n.*give 6 at most"),
+    ],
+)
+def test_arguments_that_are_none_are_named_with_those_that_there_are(arguments, named, words):
+    listed = r"expected: initial_x \(\), initial_E \(2, 2\), weight \(\), b \(\), duration \(\), guess "
+    with pytest.raises(co.ExportError, match=rf"(?s)arguments of 'solve' do not fit.*{words}") as error:
+        package("planner").reference().solve(*arguments, **named)
+    assert re.search(listed, str(error.value))
+    assert "received: 0 values" not in str(error.value)
+
+
+def test_a_plan_carries_its_status():
+    planner = package("planner").python()
+    assert planner.solve(initial_x=0.1)["status"] == "OK"
+    assert planner.solve(initial_x=np.nan)["status"] == planner.status == "ARGUMENT_NOT_FINITE"
+
+
+def test_a_plan_for_a_feedback_says_that_it_has_no_gains(tmp_path):
+    made = export_c(unknown_lag.steering(parameter_variance=0.05), tmp_path / "steer", intervals=8, substeps=1)
+    plan = made.reference()()
+    assert set(plan) == {
+        "time", "u", "x", "cost", "infeasibility", "stationarity", "variables", "status",
+    }  # fmt: skip
+    text = (made.directory / "README.md").read_text()
+    assert "nominal only, without gains" in text
+    assert "without gains" not in (package("planner").directory / "README.md").read_text()
+    assert "initial_<state>" in type(made).python.__doc__
+
+
+def test_names_of_the_plan_are_not_those_of_its_status(tmp_path):
+    """A control called status has another name in C, where the return value has this one."""
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("status")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2)
+    plan = export_c(ocp, tmp_path / "pk", intervals=4, substeps=1).reference()()
+    assert plan["status"] == "OK"
+    np.testing.assert_allclose(plan["control_status"], 1.0, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("option", "remedy"), [({"interval": 9}, "did you mean intervals"), ({"limits": "bounds"}, "leave it out")]
+)
+def test_options_that_a_solver_has_not_are_refused(tmp_path, option, remedy):
+    with pytest.raises(co.ExportError, match=rf"(?s)no option '{next(iter(option))}' for a problem.*{remedy}"):
+        export_c(unknown_lag.problem(), tmp_path / "pk", **option)
