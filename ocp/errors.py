@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 import warnings
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from covocp.solution import Solution
 
 PACKAGE = __name__.partition(".")[0]
+# Likeness of two names (difflib's ratio) from which on one may be a slip of the other: "fricton" and "friction" have
+# 0.93, "position" and "friction" 0.63.
+ALIKE = 0.75
 
 
 class CovocpError(Exception):
@@ -73,3 +77,44 @@ def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
         The message, four lines.
     """
     return f"{problem}\n  expected: {expected}\n  received: {received}\n  remedy:   {remedy}"
+
+
+def kind_and_name(value: object) -> str:
+    """Type and name of something, or its beginning where it has no name: one line."""
+    name = getattr(value, "name", None)
+    text = f"'{name}'" if isinstance(name, str) and name else " ".join(str(value).split())[:60]
+    return f"{type(value).__name__}: {text}"
+
+
+def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
+    """The remedy for a name that is not known: the known one that is nearly the same, where there is one.
+
+    Args:
+        name: what was given.
+        known: what could be given.
+        otherwise: the remedy where nothing is near.
+    """
+    lower = {word.casefold(): word for word in known}
+    found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
+    return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise
+
+
+def no_option(what: str, name: str, value: object, known: Iterable[str], beside: Iterable[str] = ()) -> ProblemError:
+    """The error for an option that is not there.
+
+    Args:
+        what: that has no such option, the subject of the sentence.
+        name: of the option.
+        value: that was given to it.
+        known: the options that there are.
+        beside: other arguments of the call, which may be meant too.
+    """
+    names = sorted(known)
+    return ProblemError(
+        describe(
+            f"{what} has no option '{name}'.",
+            expected="one of " + ", ".join(names),
+            received=f"{name}={value!r}"[:100],
+            remedy=spelling(name, [*names, *beside], "correct or remove it"),
+        )
+    )

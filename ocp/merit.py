@@ -26,7 +26,8 @@ from covocp.extremal import Extremal
 from covocp.guess import control_scale
 from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
-from covocp.methods import solve
+from covocp.mesh import Options
+from covocp.methods import is_roundoff, solve
 from covocp.problem import Problem
 from covocp.solution import Solution
 
@@ -108,8 +109,12 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
         classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)
     else:
         classical = evaluate(problem, nominal=nominal, intervals=intervals, **options)
-    direction, ell, slope = _statistical_gradient(classical.extremal)
-    size = abs(classical.cost)
+    size, extremal = abs(classical.cost), classical.extremal
+    mesh = Options(grid=extremal.mesh.nodes, control=classical.mesh.control)  # type: ignore[arg-type]
+    if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
+        still = np.zeros_like(extremal.trajectory.u)
+        return Worth(classical=classical, first_order=0.0, gain=0.0, direction=still, step=0.0)
+    direction, ell, slope = _statistical_gradient(extremal)
     first = float(-np.sum(slope * direction)) / size
     gain, best = 0.0, 0.0
     for step in STEPS if first > np.finfo(float).eps else ():

@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.checks import check_kind, is_whole
 from covocp.densities import impossible_density
-from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe, warn_user
+from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe, no_option, spelling, warn_user
 from covocp.evaluate import evaluate_controls, evaluation_mesh
 from covocp.expected import deterministic
 from covocp.extremal import Guess, Outcome, Prepared
@@ -37,7 +37,14 @@ UNMOVED = 1e-6
 NEGATIVE_CURVATURE = -1e-6
 ESCAPES = (1.0, -1.0)
 STARTS = 8
+# Arguments of `solve` beside the options of mesh and method.
+ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
 NOMINALS = ("combined", "deterministic")
+# Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
+# so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
+ROUNDOFF = 1e-10
+# Relative decrease of the cost from which on it is asked whether both are zero.
+SUSPICIOUS_GAIN = 0.5
 # Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
 WORSE = 1e-6
 
@@ -88,7 +95,7 @@ class Solver:
                     "There is no such method.",
                     expected="one of " + ", ".join(repr(name) for name in METHODS),
                     received=repr(method),
-                    remedy="correct method=",
+                    remedy=spelling(method, METHODS, "correct method="),
                 )
             )
         check_problem(problem)
@@ -97,14 +104,7 @@ class Solver:
         own = {name: p for name, p in inspect.signature(prepare).parameters.items() if p.kind is p.KEYWORD_ONLY}
         for name in options:
             if name not in known and name not in own:
-                raise ProblemError(
-                    describe(
-                        f"The method '{method}' has no option '{name}'.",
-                        expected="one of " + ", ".join(sorted([*known, *own])),
-                        received=f"{name}={options[name]!r}",
-                        remedy="correct or remove it",
-                    )
-                )
+                raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
         if nominal not in NOMINALS:
             raise ProblemError(
                 describe(
@@ -199,7 +199,12 @@ class Solver:
             return _noted(solution, classical_missing=str(error).partition("\n")[0])
         if classical is None:
             return _noted(solution, classical_missing="The problem without noise was not solved.")
-        if solution.cost > classical + (WORSE + solution.mesh_error) * abs(classical):
+        excess = solution.cost - classical
+        worse = excess > (WORSE + solution.mesh_error) * abs(classical)
+        suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
+        if suspicious and is_roundoff(excess, self.statement, self._options, given):
+            return _noted(solution, classical_cost=classical, classical_same=True)
+        if worse:
             warn_user(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
                 f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
@@ -310,6 +315,14 @@ class Solver:
                 "more intervals."
             )
         return solution
+
+
+def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
+    """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess."""
+    mesh = evaluation_mesh(statement, options, parameters)
+    start = make_guess(statement, mesh, parameters, None).trajectory
+    outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
+    return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
 
 
 def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:

@@ -24,6 +24,8 @@ LARGEST_MATRIX = 6
 MOST_GAINS = 12
 # Share of the largest feedback, or of the largest gain, that counts as none.
 NO_FEEDBACK = 1e-6
+# Relative gains below this are none, whatever the mesh.
+NO_GAIN = 1e-7
 # Name of the gain of a constrained feedback, and of what the deviations add to an expected cost.
 GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
 # Multipliers below this share of the cost are not shown.
@@ -137,14 +139,27 @@ def _costs(solution: Solution) -> str:
     if solution.loop is not None and DEVIATIONS in solution.cost_terms:
         ended, on_the_way = (number(solution.loop.cost[f"{DEVIATIONS} {where}"], 6) for where in PLACES)
         words.append(f"deviations: {ended} at the end, {on_the_way} on the way")
-    classical = solution.stats.get("classical_cost")
-    if classical and solution.optimised:
-        gain = 1.0 - solution.cost / classical
-        words.append(f"classical design: {number(classical)}, of which {100 * gain:.3g} % are gained")
+    if solution.optimised:
+        words += _gained(solution)
     missing = solution.stats.get("classical_missing")
     if missing:
         words.append(wrapped(f"There is no classical design to compare with: {missing}", ""))
     return "\n".join([text, *words])
+
+
+def _gained(solution: Solution) -> list[str]:
+    """What the combined design gains over the classical one, and whether the mesh can tell."""
+    classical = solution.stats.get("classical_cost")
+    if not classical:
+        return []
+    text = f"classical design: {number(classical)}"
+    if solution.stats.get("classical_same"):
+        return [f"{text}, the same to roundoff"]
+    gain = 1.0 - solution.cost / classical
+    text += f", of which {100 * gain:.3g} % are gained"
+    if NO_GAIN < abs(gain) < solution.mesh_error:
+        text += f": less than the error of the mesh, {100 * solution.mesh_error:.2g} %; more intervals can tell"
+    return [wrapped(text)]
 
 
 def _states(solution: Solution) -> str:
@@ -224,6 +239,11 @@ def _feedback(solution: Solution) -> str:
     loop = solution.loop
     if loop is None or not loop.gain.shape[1]:
         return ""
+    if not loop.Xhat.any():
+        reason = (
+            "nothing is measured" if solution.filter_gain is None else "what is measured tells nothing of the state"
+        )
+        return wrapped(f"{reason}, so nothing is fed back: the actual control is the nominal one", "")
     spread = np.sqrt(np.maximum(np.einsum("kui,kij,kuj->ku", loop.gain, loop.Xhat, loop.gain), 0.0))
     names = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
     room = _room(solution, spread)
@@ -254,7 +274,7 @@ def _room(solution: Solution, spread: Array) -> Array | None:
 
 def _gains(solution: Solution) -> str:
     """A few numbers of each entry of the feedback gain; nothing where there are many."""
-    if solution.loop is None:
+    if solution.loop is None or not solution.loop.Xhat.any():  # the estimate stays zero, whatever the gain
         return ""
     gain = solution.loop.gain
     controls = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))

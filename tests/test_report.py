@@ -201,6 +201,15 @@ def test_what_was_not_optimised_has_no_multipliers_and_no_gain_over_the_classica
     assert row[1] == f"{true.loop.X[-1, 0, 0] ** 0.5:.8g}"
 
 
+def test_a_gain_below_the_error_of_the_mesh_says_so(steered):
+    for share, hint in ((0.5e-3, True), (2e-3, False), (1e-9, False)):
+        classical = steered.cost / (1 - share)
+        text = str(replace(steered, stats={**steered.stats, "classical_cost": classical}, mesh_error=1.2e-3))
+        assert f"of which {100 * share:.3g} % are gained" in text
+        assert ("less than the error of the mesh, 0.12 %" in text) is hint
+        assert max(len(line) for line in text.splitlines()) <= 100
+
+
 def test_the_room_to_the_bounds_is_counted_in_root_mean_squares():
     flight = co.evaluate(mars_entry.problem(upper=0.6), nominal=mars_entry.reference(), intervals=60)
     text, loop = str(flight), flight.loop

@@ -324,3 +324,39 @@ def test_a_warm_start_from_the_classical_design():
     found = solve(problem, grid=GRADED, guess=classical)
     assert found.cost == pytest.approx(STEERED, abs=5e-6)
     assert found.stats["classical_cost"] == pytest.approx(classical.cost, rel=1e-9)
+
+
+# --- nothing to do, nothing to know -----------------------------------------------------------------------------------
+
+
+def uncertain_lag(measured, **weight):
+    """The lag of 6.12 with a milder unknown, which may end anywhere; the measurement is a multiple of its state."""
+    ocp = co.Problem(10.0)
+    x, b, u = ocp.state("x", initial=0.0, variance=1.0), ocp.unknown("b", 1.0, 0.5), ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=1.0)
+    if measured is not None:
+        ocp.measurement("m", measured * x, noise=1.0)
+    ocp.minimize_expected(running=0.5 * u**2, **weight)
+    return ocp
+
+
+def test_costs_of_nothing_but_roundoff_are_no_spurious_stationary_point():
+    """Nothing has to be reached, so nothing is done: both costs are zero, and one is "above" the other by 1e-17."""
+    for method in co.methods():
+        solution = solve(uncertain_lag(1), method=method)  # a warning would be an error
+        assert abs(solution.cost) < 1e-12
+        assert abs(solution.stats["classical_cost"]) < 1e-12
+        assert "gained" not in str(solution)
+    found = co.worth(uncertain_lag(1))
+    assert found.gain == found.first_order == 0.0
+    assert "nothing to gain" in str(found)
+
+
+@pytest.mark.parametrize(("measured", "reason"), [(None, "nothing is measured"), (0, "what is measured tells nothing")])
+def test_without_information_nothing_is_fed_back_and_the_printout_says_so(measured, reason):
+    solution = solve(uncertain_lag(measured, terminal_weight={"x": 2.0}))
+    assert not solution.loop.Xhat.any()
+    text = str(solution)
+    assert f"{reason}" in text
+    assert "nothing is fed back: the actual control is the nominal one" in " ".join(text.split())
+    assert "gain C" not in text
