@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from covocp.errors import CovocpError, ProblemError, describe
+from covocp.errors import CovocpError, ProblemError, describe, kind_and_name, spelling
 from covocp.problem import Problem
 
 MODELS = "covocp.models"
@@ -64,7 +64,7 @@ class Model:
                 describe(
                     f"'{self.name}' did not return a problem.",
                     expected="a covocp.Problem",
-                    received=f"{type(problem).__name__}: {str(problem)[:60]}",
+                    received=kind_and_name(problem),
                     remedy="end the function by returning the problem that it makes",
                 )
             )
@@ -97,7 +97,7 @@ class Model:
                         f"'{self.name}' has no parameter '{name}'.",
                         expected="one of " + (", ".join(named) or "none: it has no parameters"),
                         received=f"--set {setting}",
-                        remedy="correct the name",
+                        remedy=spelling(name, named, "correct the name"),
                     )
                 )
             values[name] = _fitting(name, text, named[name]) if name in named else parse_value(text)
@@ -149,7 +149,9 @@ def find_model(text: str) -> Model:
             f"There is no model '{text}'.",
             expected="one of " + ", ".join(model.name for model in available) + ", or path/to/script.py:function",
             received=text,
-            remedy="correct the name; `covocp list` shows what the models are",
+            remedy=spelling(
+                text, [m.name for m in available], "correct the name; `covocp list` shows what the models are"
+            ),
         )
     )
 
@@ -170,7 +172,7 @@ def _other_function(model: Model, name: str) -> Model:
                 f"The model '{model.name}' has no problem '{name}'.",
                 expected="one of " + ", ".join(f"{model.name}:{n}" for n in own),
                 received=f"{model.name}:{name}",
-                remedy="correct the name",
+                remedy=spelling(name, own, "correct the name"),
             )
         )
     return Model(name=f"{model.name}_{name}", make=getattr(module, name), module=module)

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, kind_and_name, spelling
 from covocp.matrices import Array, pack_symbolic
 
 
@@ -45,7 +45,7 @@ def check_kind(value: Any, kind: type, remedy: str) -> None:
             describe(
                 f"This is not a {kind.__name__.lower()}.",
                 expected=f"a {kind.__name__}",
-                received=f"{type(value).__name__}: {str(value)[:60]}",
+                received=kind_and_name(value),
                 remedy=remedy,
             )
         )
@@ -352,22 +352,6 @@ def check_name(name: Any, declared: list[Any]) -> None:
             )
 
 
-def check_first_cost(problem: Any, call: str) -> None:
-    """A problem has one cost, stated by `minimize` or by `minimize_expected`."""
-    former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
-    if former:
-        raise ProblemError(
-            describe(
-                "The cost is given twice.",
-                expected="one call of minimize() or minimize_expected()",
-                received=f"{call}() after {former}()",
-                remedy="add the terms up in one call"
-                if call == former
-                else "use one of the two: minimize_expected() stands in place of minimize()",
-            )
-        )
-
-
 def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
     """Everything that moves needs a rate."""
     for entry in entries:
@@ -396,12 +380,13 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
             return str(entry.name)
         if is_symbolic(symbol) and symbol.is_symbolic() and ca.is_equal(symbol, own):
             return str(entry.name)
+    names = [str(entry.name) for entry in allowed]
     raise ProblemError(
         describe(
             f"{what}() was given something that is not a symbol of this problem.",
-            expected="one of " + ", ".join(entry.name for entry in allowed),
+            expected="one of " + ", ".join(names),
             received=str(symbol),
-            remedy="pass the symbol that state() or symmetric() returned",
+            remedy=spelling(symbol, names, "check the spelling; or pass the symbol that its declaration returned"),
         )
     )
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from covocp.checks import check_density, check_kind
 from covocp.closed_loop import Statistics, close_loop, densities
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, no_option
 from covocp.extremal import Extremal, Outcome
 from covocp.guess import check_model, controls_guess, evaluate_guess, starts, stiffness
 from covocp.lookup import name_of, stacked_parameters
@@ -115,14 +115,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
     known = {"control", "substeps", "grid", "segments", "covariances", "covariance_step"}
     for name in options:
         if name not in known:
-            raise ProblemError(
-                describe(
-                    f"evaluate() has no option '{name}'.",
-                    expected="one of " + ", ".join(sorted(known)),
-                    received=f"{name}={options[name]!r}",
-                    remedy="correct or remove it",
-                )
-            )
+            raise no_option("evaluate()", name, options[name], known)
     return options
 
 

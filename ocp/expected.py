@@ -66,6 +66,22 @@ def expected_cost(
     )
 
 
+def check_first_cost(problem: Any, call: str) -> None:
+    """A problem has one cost, stated by `minimize` or by `minimize_expected`."""
+    former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
+    if former:
+        raise ProblemError(
+            describe(
+                "The cost is given twice.",
+                expected="one call of minimize() or minimize_expected()",
+                received=f"{call}() after {former}()",
+                remedy="add the terms up in one call"
+                if call == former
+                else "use one of the two: minimize_expected() stands in place of minimize()",
+            )
+        )
+
+
 def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
     """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
     if not isinstance(weights, Mapping):

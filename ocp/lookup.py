@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.checks import column
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, spelling
 from covocp.matrices import Array, half_length, unpack_indices
 from covocp.statement import Statement
 
@@ -66,11 +66,20 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
                     f"There is no parameter '{key}'.",
                     expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
                     received=repr(key)[:100],
-                    remedy="declare it by Problem.parameter",
+                    remedy=spelling(key, blocks, _not_given(str(key), statement, bool(blocks))),
                 )
             )
         values[blocks[name].span] = column(name, "value", value, blocks[name].size)
     return values
+
+
+def _not_given(name: str, statement: Statement, some: bool) -> str:
+    """What to do about a name that is no parameter, nor nearly one."""
+    declared = "what is to change from solve to solve is declared by Problem.parameter"
+    kind = next((block.kind for block in statement.blocks if block.name == name), None)
+    if kind is not None:
+        return f"'{name}' is a {kind}, no parameter: {declared}"
+    return f"give one of these; {declared}" if some else declared
 
 
 def _is_matrix_of(key: Any, half: Any) -> bool:
@@ -92,6 +101,6 @@ def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
             f"'{key}' is not in this solution.",
             expected="a symbol or name of " + ", ".join(names),
             received=str(key),
-            remedy="check the spelling, or use the symbols of the problem that was solved",
+            remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
         )
     )

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from covocp.checks import as_number, is_whole
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, spelling
 from covocp.integrators import LINEAR_SOLVER, Step
 from covocp.matrices import Array
 from covocp.statement import Statement
@@ -44,8 +44,8 @@ class Options:
         _choice("covariances", self.covariances, ("auto", "eliminated", "states"))
         _choice("covariance_step", self.covariance_step, ("auto", "gauss", "strang", "rk4"))
         for name, value in (("substeps", self.substeps), ("segments", self.segments)):
-            if value != "auto":
-                _whole(name, value)
+            if not (isinstance(value, str) and value == "auto"):
+                _whole(name, value, "'auto' or 1, 2, 3, ...")
 
     def nodes(self) -> Array:
         """Nodes of the normalised time, from 0 to 1.
@@ -211,12 +211,12 @@ def _bounded_matrices(statement: Statement) -> list[str]:
     return names
 
 
-def _whole(name: str, value: Any) -> None:
+def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
     if not is_whole(value):
         raise ProblemError(
             describe(
                 f"The option '{name}' must be a positive whole number.",
-                expected="1, 2, 3, ...",
+                expected=expected,
                 received=repr(value),
                 remedy=f"correct {name}=",
             )
@@ -230,6 +230,6 @@ def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
                 f"The option '{name}' has an unknown value.",
                 expected="one of " + ", ".join(repr(choice) for choice in choices),
                 received=repr(value),
-                remedy=f"correct {name}=",
+                remedy=spelling(value, choices, f"correct {name}="),
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.curves import Panel
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, no_option
 from covocp.files import written_whole
 from covocp.panels import abscissa_label, choose_panels
 
@@ -132,6 +133,19 @@ def plot_solutions(
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
     return figure
+
+
+def check_plot_options(given: Mapping[str, Any]) -> None:
+    """Options of a figure must be those of `plot_solutions`.
+
+    Raises:
+        ProblemError: one is not.
+    """
+    parameters = inspect.signature(plot_solutions).parameters.values()
+    known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    for name, value in given.items():
+        if name not in known:
+            raise no_option("plot()", name, value, known)
 
 
 def _arrange(figure: Figure, axes: Any, count: int, abscissa: str) -> None:

@@ -15,7 +15,6 @@ from covocp.checks import (
     check_bounds,
     check_constrains,
     check_density,
-    check_first_cost,
     check_inside,
     check_kind,
     check_limits,
@@ -50,7 +49,7 @@ from covocp.declarations import (
 )
 from covocp.errors import ProblemError, describe
 from covocp.estimation import EstimationCovariance, augmented_names
-from covocp.expected import derive, expected_cost
+from covocp.expected import check_first_cost, derive, expected_cost
 from covocp.freeze import freeze
 from covocp.matrices import pack_symbolic
 from covocp.statement import Statement

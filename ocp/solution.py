@@ -49,6 +49,11 @@ class Sample:
         """The value of a symbol or name."""
         return self.values[name_of(key, self.symbols, tuple(self.values))]
 
+    def __repr__(self) -> str:
+        """The values by name, on one line."""
+        shown = {"t": self.t, **{name: v for name, v in self.values.items() if name not in ("time", "duration")}}
+        return f"Sample({', '.join(f'{name} = {_in_line(value)}' for name, value in shown.items())})"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
@@ -447,6 +452,7 @@ class Solution:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.plot_solutions`."""
+        _later("plot").check_plot_options(options)
         return _later("plot").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
 
     def save(self, path: str | Path) -> Path:
@@ -477,6 +483,12 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
         return dict(terms)
     nominal = {name: loop.cost[name] for name in ("terminal", "running")}
     return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
+
+
+def _in_line(value: Any) -> str:
+    """Numbers on one line, six digits; of large arrays the corners."""
+    text = np.array2string(np.asarray(value, dtype=float), precision=6, threshold=20, edgeitems=2, separator=", ")
+    return " ".join(text.split())
 
 
 def _later(module: str) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, spelling
 from covocp.extremal import Guess
 from covocp.guess import first_guess, quadrature_weights
 from covocp.lookup import name_of
@@ -42,7 +42,7 @@ def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) 
                         f"The guess names '{key}', which cannot be guessed.",
                         expected="states, controls or matrices: " + ", ".join(guesses),
                         received=str(key),
-                        remedy="correct the name",
+                        remedy=spelling(key, guesses, "correct the name"),
                     )
                 )
             guesses[name] = value

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.accuracy import NO_COST
-from covocp.errors import CovocpError, ProblemError, describe
+from covocp.errors import CovocpError, ProblemError, describe, spelling
 from covocp.mesh import Options
 from covocp.methods import METHODS, Solver, check_problem
 from covocp.report import number, render_table, wrapped
@@ -110,8 +110,9 @@ class Comparison:
 
     def plot(self, *names: Any, path: str | Path | None = None, **options: Any) -> Figure:
         """Draw all solutions in one figure; see `covocp.plot.plot_solutions`."""
-        from covocp.plot import plot_solutions
+        from covocp.plot import check_plot_options, plot_solutions
 
+        check_plot_options(options)
         labels = list(self.solutions)
         title = options.pop("title", self.name or None)
         return plot_solutions(
@@ -216,7 +217,7 @@ def _runs(
                     f"The method '{method}' has no option '{name}'.",
                     "one of " + ", ".join(sorted(known)),
                     f"{name}={chosen[name]!r}",
-                    "give it to the methods that know it: method_options={method: {...}}",
+                    spelling(name, known, "give it to the methods that know it: method_options={method: {...}}"),
                 )
         runs.append((label, method, chosen))
     if unused := [name for name in by_method if name not in [run[1] for run in runs]]:

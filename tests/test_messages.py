@@ -1,0 +1,82 @@
+"""Names that are not known: the answer suggests the one that was meant, and says what can be given."""
+
+import pytest
+from refusals import lag, refused, simple
+
+import covocp as co
+from covocp.errors import kind_and_name, spelling
+
+
+def damped():
+    """An integrator with a known friction and a cost of what its feedback does."""
+    ocp = co.Problem(duration=1.0, name="damped")
+    friction = ocp.parameter("friction", 0.5)
+    x, u = ocp.state("position", initial=0.0, final=1.0, variance=0.01), ocp.control("u")
+    ocp.dynamics(x, u - friction * x, noise=0.01)
+    ocp.measurement("range", x, noise=0.1)
+    return ocp, x, u
+
+
+@pytest.fixture(scope="module")
+def solved():
+    ocp, x, u = damped()
+    ocp.minimize_expected(running=u**2, terminal_weight={x: 1.0})
+    return ocp, co.solve(ocp, intervals=20, progress=False)
+
+
+def test_a_name_is_near_another_where_few_letters_differ():
+    known = ("friction", "Mass", "position")
+    for slip, meant in (("fricton", "friction"), ("MASS", "Mass"), ("postion", "position"), ("Friction", "friction")):
+        assert f"'{meant}'" in spelling(slip, known, "no")
+    for other in ("portion of it", "b", "", "action"):
+        assert spelling(other, known, "no") == "no"
+
+
+def test_parameters(solved):
+    ocp, solution = solved
+    meant = "perhaps 'friction' is meant"
+    refused(lambda: co.solve(ocp, parameters={"fricton": 0.7}), "no parameter 'fricton'", meant)
+    refused(lambda: co.simulate(solution, 50, seed=1, truth={"fricton": 0.7}), "fricton", meant)
+    refused(lambda: co.solve(ocp, parameters={"position": 0.2}), "'position' is a state", "Problem.parameter")
+    refused(lambda: co.solve(ocp, parameters={"viscosity": 0.2}), "one of friction", "give one of these")
+    refused(lambda: co.solve(simple()[0], parameters={"a": 0.2}), "declared by Problem.parameter")
+
+
+def test_a_solution_in_place_of_a_problem_is_named_on_one_line(solved):
+    message = refused(lambda: co.solve(solved[1]), "received: Solution: 'damped'\n")
+    assert len(message.splitlines()) == 4
+    assert kind_and_name([1, "a\nb"]) == "list: [1, 'a\\nb']"
+    assert kind_and_name(co.Problem(1.0)) == "Problem: Problem('')"
+
+
+def test_options(solved):
+    ocp, solution = solved
+    refused(lambda: solution.plot(gain=True), "plot() has no option 'gain'", "perhaps 'gains' is meant")
+    refused(lambda: solution.plot(colour="red"), "received: colour='red'", "correct or remove it")
+    refused(lambda: co.solve(ocp, interval=5), "perhaps 'intervals' is meant")
+    refused(lambda: co.solve(ocp, metod="ipopt"), "perhaps 'method' is meant")
+    refused(lambda: co.solve(ocp, "Ipopt"), "perhaps 'ipopt' is meant")
+    refused(lambda: co.evaluate(ocp, substep=2), "perhaps 'substeps' is meant")
+    comparison = co.compare(simple()[0], ["ipopt"], intervals=5, progress=False)
+    refused(lambda: comparison.plot(gain=True), "perhaps 'gains' is meant")
+    refused(lambda: co.compare(ocp, ["ipopt"], substep=2), "perhaps 'substeps' is meant")
+
+
+def test_symbols(solved):
+    refused(lambda: solved[1]["postion"], "perhaps 'position' is meant")
+    ocp, x, u = damped()
+    refused(lambda: ocp.minimize_expected(u**2, terminal_weight={"postion": 1}), "perhaps 'position' is meant")
+    refused(lambda: ocp.minimize_expected(u**2, terminal_weight={"speed": 1}), "check the spelling")
+    refused(lambda: co.solve(lag()[0], guess={"U": 1.0}), "perhaps 'u' is meant")
+    refused(lambda: co.solve(lag()[0], substeps="ato"), "'auto' or 1, 2, 3, ...")
+    refused(lambda: co.solve(lag()[0], segments=0), "'auto' or 1, 2, 3, ...")
+
+
+def test_a_sample_shows_its_values(solved):
+    solution = solved[1]
+    text = repr(solution.at(0.5))
+    assert text.startswith("Sample(t = 0.5, position = ")
+    assert f"u = {float(solution.at(0.5)['u']):.6g}"[:9] in text
+    assert "E = [[" in text
+    assert "friction = 0.5" in text
+    assert "\n" not in repr(solution.at([0.0, 0.5, 1.0]))
