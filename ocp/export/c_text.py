@@ -82,7 +82,8 @@ def described(port: Port) -> str:
     """Unit, meaning and entries of a port, for a comment."""
     parts = [" ".join(part for part in (f"[{port.unit}]" if port.unit else "", port.about) if part)]
     if port.entries:
-        parts[0] += f" ({', '.join(port.entries)})"
+        listed = ", ".join(port.entries)
+        parts[0] = f"{parts[0]} ({listed})" if parts[0] else listed
     if port.columns > 1:
         parts.append(f"{port.rows} x {port.columns}, row by row")
     return "; ".join(part for part in parts if part)

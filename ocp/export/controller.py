@@ -40,8 +40,8 @@ ABOUT = (
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
     "u), one step of the two-stage Gauss method, stable for any h; it is corrected by L (m - what is expected) with "
     "L = h E M' (h M E M' + U)^-1; the control is u - C y.",
-    "A row of the measurement that is not finite is left out. The first measurement that counts is that of the "
-    "first call after time zero: it stands for the time from zero to then.",
+    "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
+    "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
 
 

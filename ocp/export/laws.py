@@ -21,11 +21,12 @@ Points = Callable[[np.random.Generator, int], Array]
 # What the C functions return, in the order of their numbers.
 STATUSES = {
     "OK": "as asked for",
-    "MEASUREMENT_MISSING": "a row of the measurement was not finite and was left out",
+    "MEASUREMENT_MISSING": "a row of the measurement was not finite (or beyond 1e30) and was left out",
     "TIME_BEFORE": "the time is before the start: values of the start",
-    "TIME_AFTER": "the time is after the end: values of the end",
+    "TIME_AFTER": "the time is after the end: values of the end; of a controller the nominal control of the end "
+    "without feedback: the caller must stop",
     "TIME_BACKWARDS": "the time is before that of the last step: nominal control, the estimate stays",
-    "TIME_NOT_FINITE": "the time is NaN or infinite: values of the last valid time",
+    "TIME_NOT_FINITE": "the time is NaN, infinite or beyond 1e30: values of the last valid time",
     "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
     "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
@@ -33,7 +34,8 @@ STATUSES = {
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
 }
 CODES = {name: number for number, name in enumerate(STATUSES)}
-# Beyond this a number of a measurement, a time or an estimate counts as infinite; it is finite in single precision.
+# Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the
+# controllers say; it is finite in single precision.
 LARGEST = 1e30
 
 

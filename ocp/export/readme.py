@@ -40,6 +40,13 @@ if(CMAKE_C_COMPILER_ID STREQUAL "GNU")
     target_compile_options({name} PRIVATE -fsingle-precision-constant)
 endif()
 """
+OWN_CMAKE = """\
+cmake_minimum_required(VERSION 3.13)
+project(app LANGUAGES C)
+add_subdirectory({name}) # the folder of this package, below yours
+add_executable(app app.c)
+target_link_libraries(app PRIVATE {name})
+"""
 
 
 def cmake_lists(name: str, precision: str, plugin: str = "") -> str:
@@ -95,6 +102,8 @@ def readme(
         "The sources compile without warnings; `"
         f"{name}_casadi.c` switches off {warnings} for itself, because all of its functions have the same arguments. "
         "Do not compile with `-ffast-math`: the checks for NaN would disappear.",
+        "## Your own program",
+        _own(name, linking),
         "## Functions",
         *(_function(name, law) for law in laws),
         "## Status codes",
@@ -118,6 +127,22 @@ def readme(
 
 def _link_line(linking: str) -> str:
     return " $(LIBRARIES)" if linking else ""
+
+
+def _own(name: str, linking: str) -> str:
+    """How a program of the user's is compiled with the package."""
+    line = f"cc -std=c99 -O2 -o app app.c {name}.c {name}_casadi.c -lm"
+    by_hand = (
+        "By hand as the self-test above, with `app.c` in the place of `main.c`."
+        if linking
+        else f"A program `app.c` in this folder:\n\n```sh\n{line}\n```\n\n"
+        "From another folder, add `-I` with the path of this one and write that path before the two files. "
+        "A program in this folder stays where the package is exported again with overwrite=True."
+    )
+    return (
+        f'The program includes `"{name}.h"`. {by_hand} With CMake, in the `CMakeLists.txt` of your own project:\n\n'
+        f"```cmake\n{OWN_CMAKE.format(name=name)}```"
+    )
 
 
 def _function(name: str, law: Law) -> str:

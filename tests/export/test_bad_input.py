@@ -1,6 +1,7 @@
 """Controllers in C that are given nonsense: a status of the list, a control that is a number, nothing out of bounds."""
 
 import re
+import shutil
 import subprocess
 
 import casadi as ca
@@ -61,6 +62,22 @@ int main(void)
 }}
 """
 SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+# Needs the header and the object code of any package.
+APP = """\
+#include "{name}.h"
+#include <stdio.h>
+int main(void)
+{{
+    int (*volatile law)() = (int (*)())&{name}_{law};
+    printf("{name} %d\\n", law != 0 ? {capitals}_OK : -1);
+    return 0;
+}}
+"""
+
+
+def app(name):
+    """A program of the user's."""
+    return APP.format(name=name, law=package(name).laws[-1].name, capitals=name.upper())
 
 
 def spoilt(law):
@@ -184,7 +201,8 @@ def test_folders_give_their_name_or_say_why_not(tmp_path):
 def test_every_line_of_the_readme_for_the_shell_works(name, tmp_path):
     text = (package(name).directory / "README.md").read_text(encoding="utf-8")
     lines = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    assert [line.split()[0] for line in lines] == ["cmake", "cc"]
+    assert [line.split()[0] for line in lines] == ["cmake", "cc", "cc"]
+    (tmp_path / "app.c").write_text(app(name))
     for file in package(name).directory.glob("*.*"):
         (tmp_path / file.name).write_bytes(file.read_bytes())
     for line in lines:
@@ -193,7 +211,42 @@ def test_every_line_of_the_readme_for_the_shell_works(name, tmp_path):
             continue
         assert done.returncode == 0, done.stdout + done.stderr
         assert "warning" not in done.stdout + done.stderr
-        assert "passed" in done.stdout
+        assert "passed" in done.stdout or "-o app" in line
+    assert subprocess.run([tmp_path / "app"], capture_output=True, text=True).stdout == f"{name} 0\n"
+
+
+@pytest.mark.parametrize("name", ["lag", "mars_single", "planner"])
+def test_the_lines_of_the_readme_for_cmake_make_a_program(name, tmp_path):
+    if not shutil.which("cmake"):
+        pytest.skip("there is no cmake")
+    text = (package(name).directory / "README.md").read_text(encoding="utf-8")
+    (tmp_path / "CMakeLists.txt").write_text(re.findall(r"```cmake\n(.*?)```", text, re.DOTALL)[0])
+    (tmp_path / "app.c").write_text(app(name))
+    shutil.copytree(package(name).directory, tmp_path / name, ignore=shutil.ignore_patterns("build"))
+    command = "cmake -S . -B build && cmake --build build --target app"
+    done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    made = subprocess.run([tmp_path / "build" / "app"], capture_output=True, text=True)
+    assert made.stdout == f"{name} 0\n"
+
+
+@pytest.mark.parametrize("name", ["lag", "lag_sampled", "mars"])
+def test_header_and_readme_say_what_counts_as_not_finite_and_what_comes_after_the_end(name):
+    for file in (f"{name}.h", "README.md"):
+        text = (package(name).directory / file).read_text(encoding="utf-8")
+        joined = " ".join(text.replace("\n *", " ").split())
+        assert "readings beyond 1e30 count as not finite" in joined
+        assert "nominal control of the end without feedback: the caller must stop" in joined
+        assert ":  (" not in text
+        assert "|  (" not in text
+
+
+@pytest.mark.parametrize(("reading", "missing"), [(0.99e30, False), (1.01e30, True)])
+def test_readings_beyond_1e30_are_left_out(reading, missing):
+    controller = package("lag").python().step
+    controller.init()
+    controller.step(reading, 0.5)
+    assert (controller.status == "MEASUREMENT_MISSING") == missing
 
 
 @pytest.mark.parametrize("name", ["lag", "mars_sampled"])

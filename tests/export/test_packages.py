@@ -64,7 +64,7 @@ def test_the_header_says_what_everything_is():
     for unit in (
         "[ft] state 'h'",
         "(h [ft], theta [rad], v [ft/s], gamma [rad], log_density [ln(slug/ft^3)])",
-        "measurement:  (accelerometers[0] [ft/s^2], accelerometers[1] [ft/s^2])",
+        "measurement: accelerometers[0] [ft/s^2], accelerometers[1] [ft/s^2]\n",
     ):
         assert unit in mars
     assert (
