@@ -29,27 +29,34 @@ class Model:
     """A function that makes a problem.
 
     Attributes:
-        name: for messages and file names.
+        name: for file names.
+        label: what the user calls it: "unknown_lag", "unknown_lag:steering", "path/to/script.py:function".
         make: the function.
         module: where it is; may have `figures()`, see `Model.figures`.
         script: the file, for a function of the user's.
     """
 
     name: str
+    label: str
     make: Callable[..., Any] = field(repr=False)
     module: ModuleType = field(repr=False)
     script: Path | None = None
 
     @property
     def description(self) -> str:
-        """First line of the documentation of its module, or of the function of a script."""
-        documented = self.make if self.script else self.module
+        """First line of the documentation of its module; of the function where that is not the module's `problem`."""
+        documented = self.module if self._own else self.make
         return (inspect.getdoc(documented) or "no description").splitlines()[0]
+
+    @property
+    def _own(self) -> bool:
+        """Whether the function is the `problem` of a module of covocp."""
+        return self.script is None and self.make is getattr(self.module, "problem", None)
 
     def defaults(self) -> dict[str, str]:
         """Parameters and their defaults as they are written."""
         parameters = inspect.signature(self.make).parameters.values()
-        return {p.name: "" if p.default is p.empty else str(p.default) for p in parameters}
+        return {p.name: "VALUE" if p.default is p.empty else str(p.default) for p in parameters}
 
     def build(self, settings: Sequence[str] = ()) -> Problem:
         """The problem for some settings, each "name=value".
@@ -58,11 +65,11 @@ class Model:
             ProblemError: an unknown parameter, a value that does not fit, the function failed or returned no problem.
         """
         values = self._values(settings)
-        problem = _called(self.name, self.script, lambda: self.make(**values))
+        problem = _called(self.label, self.script, lambda: self.make(**values))
         if not isinstance(problem, Problem):
             raise ProblemError(
                 describe(
-                    f"'{self.name}' did not return a problem.",
+                    f"'{self.label}' did not return a problem.",
                     expected="a covocp.Problem",
                     received=kind_and_name(problem),
                     remedy="end the function by returning the problem that it makes",
@@ -77,8 +84,7 @@ class Model:
         list, and of what else `plot_solutions` takes: "names", "over", ... The nominal is that of `solve`, or a dict of
         control to history, which is evaluated.
         """
-        own = self.make is getattr(self.module, "problem", None)
-        if self.script is not None or not own or not hasattr(self.module, "figures"):
+        if not self._own or not hasattr(self.module, "figures"):
             return {}
         figures: dict[str, Any] = self.module.figures()
         return figures
@@ -94,7 +100,7 @@ class Model:
             if name not in named and not anything:
                 raise ProblemError(
                     describe(
-                        f"'{self.name}' has no parameter '{name}'.",
+                        f"'{self.label}' has no parameter '{name}'.",
                         expected="one of " + (", ".join(named) or "none: it has no parameters"),
                         received=f"--set {setting}",
                         remedy=spelling(name, named, "correct the name"),
@@ -105,7 +111,7 @@ class Model:
         if missing:
             raise ProblemError(
                 describe(
-                    f"'{self.name}' needs a value of {', '.join(missing)}.",
+                    f"'{self.label}' needs a value of {', '.join(missing)}.",
                     expected=" ".join(f"--set {name}=VALUE" for name in missing),
                     received=", ".join(settings) or "no --set",
                     remedy="give the missing values",
@@ -121,7 +127,7 @@ def models() -> list[Model]:
     for entry in pkgutil.iter_modules(package.__path__):
         module = importlib.import_module(f"{MODELS}.{entry.name}")
         if hasattr(module, "problem"):
-            found.append(Model(name=entry.name, make=module.problem, module=module))
+            found.append(Model(name=entry.name, label=entry.name, make=module.problem, module=module))
     return found
 
 
@@ -156,16 +162,23 @@ def find_model(text: str) -> Model:
     )
 
 
-def _other_function(model: Model, name: str) -> Model:
-    """Another function of a model's module that makes a problem."""
-    module = model.module
-    own = [
-        n
-        for n, v in vars(module).items()
-        if inspect.isfunction(v)
-        and v.__module__ == module.__name__
-        and str(inspect.signature(v).return_annotation).endswith("Problem")
+def problems(model: Model) -> list[Model]:
+    """A model of covocp, and the other functions of its module that make problems, in their order."""
+    others = [
+        Model(name=f"{model.name}_{name}", label=f"{model.name}:{name}", make=value, module=model.module)
+        for name, value in vars(model.module).items()
+        if inspect.isfunction(value)
+        and value is not model.make
+        and not name.startswith("_")
+        and value.__module__ == model.module.__name__
+        and str(inspect.signature(value).return_annotation).endswith("Problem")
     ]
+    return [model, *others]
+
+
+def _other_function(model: Model, name: str) -> Model:
+    """A function of a model's module that makes a problem."""
+    own = {entry.make.__name__: entry for entry in problems(model)}
     if name not in own:
         raise ProblemError(
             describe(
@@ -175,7 +188,7 @@ def _other_function(model: Model, name: str) -> Model:
                 remedy=spelling(name, own, "correct the name"),
             )
         )
-    return Model(name=f"{model.name}_{name}", make=getattr(module, name), module=module)
+    return own[name]
 
 
 def _from_script(path: Path, name: str) -> Model:
@@ -208,7 +221,7 @@ def _from_script(path: Path, name: str) -> Model:
                 remedy="name a function that returns a covocp.Problem",
             )
         )
-    return Model(name=path.stem, make=make, module=module, script=path)
+    return Model(name=path.stem, label=f"{path}:{name}", make=make, module=module, script=path)
 
 
 def _called(name: str, script: Path | None, function: Callable[[], Any]) -> Any:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import covocp as co
-from covocp.catalogue import find_model, models, parse_value, split_setting
-from covocp.errors import CovocpError, ProblemError, SolveError, describe
+from covocp.catalogue import find_model, models, parse_value, problems, split_setting
+from covocp.errors import CovocpError, ProblemError, SolveError, describe, spelling
 from covocp.files import check_target
 from covocp.mesh import Options
+from covocp.methods import STARTS, method_options
 from covocp.plot import SUFFIXES as FIGURES
+from covocp.report import WIDTH
 from covocp.storage import SUFFIXES as FILES
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
@@ -36,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0; 1 where a solve failed, 2 where the input is wrong, 130 where it was interrupted before an iterate existed.
     """
-    parsed = _parser().parse_args(arguments)
+    parsed, unknown = _parser().parse_known_args(arguments)
+    if unknown:  # told by the command that was meant, with its usage
+        parsed.parser.refuse(unknown)
     try:
         with _plain_warnings():
             return int(parsed.run(parsed))
@@ -60,11 +65,46 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _parser() -> argparse.ArgumentParser:
+class _Parser(argparse.ArgumentParser):
+    """A parser of whole names: what is an abbreviation today may be two options tomorrow."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        """Make a parser without abbreviations, whose lines of help stay as they are written."""
+        settings |= {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(*arguments, **settings)
+        self.set_defaults(parser=self)
+
+    def format_help(self) -> str:
+        """The help; below that of a command that solves, the options of the solver, looked up only now."""
+        if "--option" in self._option_string_actions:
+            self.epilog = _solver_options()
+        return super().format_help()
+
+    def refuse(self, unknown: list[str]) -> NoReturn:
+        """End with what is not known, and the option that was probably meant."""
+        name = unknown[0].partition("=")[0]
+        hint = spelling(name, self._option_string_actions, "") if name.startswith("-") else ""
+        self.error(f"unrecognized: {' '.join(unknown)}" + (f"; {hint}" if hint else ""))
+
+
+def _solver_options() -> str:
+    """What `--option` takes, with the defaults."""
+    groups = {
+        "of the mesh": {f.name: f.default for f in fields(Options) if f.name != "intervals"},
+        **{f"of {method}": method_options(method) for method in co.methods()},
+        "of the start": {"guess": "multistart", "starts": STARTS, "seed": 0},
+        "of an expected cost": {"nominal": "deterministic"},
+    }
+    lines = ["values of --option (docs/api.md says what they mean; METHOD.NAME=VALUE where several methods run):"]
+    for title, options in groups.items():
+        words = "  " + " ".join(f"{name}={value}" for name, value in options.items())
+        lines += [f"  {title}:", *textwrap.wrap(words, WIDTH, initial_indent="  ", subsequent_indent="    ")]
+    return "\n".join(lines)
+
+
+def _parser() -> _Parser:
     """The options of all commands."""
-    parser = argparse.ArgumentParser(
-        prog="covocp", description="Optimal control of a trajectory together with its uncertainty."
-    )
+    parser = _Parser(prog="covocp", description="Optimal control of a trajectory together with its uncertainty.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="show the models with their parameters")
@@ -135,9 +175,9 @@ def _whole(text: str) -> int:
 
 def _list(arguments: argparse.Namespace) -> int:
     """covocp list."""
-    for model in models():
+    for model in (entry for own in models() for entry in problems(own)):
         words = " ".join(f"{name}={value}" for name, value in model.defaults().items())
-        print(f"{model.name}\n    {model.description}")
+        print(f"{model.label}\n    {model.description}")
         print(f"    --set {words}\n" if words else "    no parameters\n")
     return 0
 
@@ -153,10 +193,10 @@ def _solve(arguments: argparse.Namespace) -> int:
         print(solution)
     if arguments.plot:
         solution.plot(path=arguments.plot)
-        _say(arguments, f"figure: {arguments.plot}")
+        _say(arguments, "", f"figure: {arguments.plot}")
     if arguments.save:
         solution.save(arguments.save)
-        _say(arguments, f"solution: {arguments.save}")
+        _say(arguments, *([] if arguments.plot else [""]), f"solution: {arguments.save}")
     return code
 
 
@@ -173,7 +213,7 @@ def _compare(arguments: argparse.Namespace) -> int:
         print(comparison)
     if arguments.plot and comparison.solutions:
         comparison.plot(path=arguments.plot)
-        _say(arguments, f"figure: {arguments.plot}")
+        _say(arguments, "", f"figure: {arguments.plot}")
     return 0 if comparison.converged else FAILED
 
 
@@ -295,9 +335,9 @@ def _check_targets(*targets: tuple[str | None, tuple[str, ...]]) -> None:
             check_target(path, suffixes)
 
 
-def _say(arguments: argparse.Namespace, text: str) -> None:
+def _say(arguments: argparse.Namespace, *lines: str) -> None:
     if not arguments.quiet:
-        print(f"\n{text}")
+        print("\n".join(lines))
 
 
 def _complain(error: object, code: int) -> int:

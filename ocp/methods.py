@@ -54,6 +54,12 @@ def methods() -> tuple[str, ...]:
     return tuple(METHODS)
 
 
+def method_options(method: str) -> dict[str, Any]:
+    """Options of a method besides those of the mesh, with their defaults."""
+    parameters = inspect.signature(importlib.import_module(METHODS[method]).prepare).parameters
+    return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+
+
 def check_problem(problem: Any) -> None:
     """What is solved or compared must be a problem.
 
@@ -100,8 +106,7 @@ class Solver:
             )
         check_problem(problem)
         prepare = importlib.import_module(METHODS[method]).prepare
-        known = {field.name for field in fields(Options)}
-        own = {name: p for name, p in inspect.signature(prepare).parameters.items() if p.kind is p.KEYWORD_ONLY}
+        known, own = {field.name for field in fields(Options)}, method_options(method)
         for name in options:
             if name not in known and name not in own:
                 raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)

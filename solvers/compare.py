@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +14,7 @@ import numpy as np
 from covocp.accuracy import NO_COST
 from covocp.errors import CovocpError, ProblemError, describe, spelling
 from covocp.mesh import Options
-from covocp.methods import METHODS, Solver, check_problem
+from covocp.methods import METHODS, Solver, check_problem, method_options
 from covocp.report import number, render_table, wrapped
 from covocp.solution import Solution
 
@@ -246,9 +244,7 @@ def _triple(entry: Any) -> tuple[str, str, dict[str, Any]]:
 
 def _option_names(method: str) -> set[str]:
     """Options of a method, of every mesh, and of every start."""
-    module = importlib.import_module(METHODS[method])
-    own = {name for name, p in inspect.signature(module.prepare).parameters.items() if p.kind is p.KEYWORD_ONLY}
-    return own | {f.name for f in fields(Options)} | set(SOLVE_OPTIONS)
+    return set(method_options(method)) | {f.name for f in fields(Options)} | set(SOLVE_OPTIONS)
 
 
 def _wrong(problem: str, expected: str, received: str, remedy: str) -> ProblemError:

@@ -66,10 +66,46 @@ def test_list_shows_every_model_with_its_parameters(capsys):
     assert code == 0
     names = [line for line in out.splitlines() if line and not line.startswith(" ")]
     modules = os.listdir(os.path.dirname(covocp.models.__file__))
-    assert names == sorted(name[:-3] for name in modules if name.endswith(".py") and name != "__init__.py")
+    assert [name for name in names if ":" not in name] == sorted(
+        name[:-3] for name in modules if name.endswith(".py") and name != "__init__.py"
+    )
     assert "--set weight=10.0 final=0.0 duration=10.0" in out
     entry = out[out.index("damped_oscillator") :]
     assert "Damped oscillator with unknown damping and stiffness" in entry
+
+
+def test_list_shows_the_other_problems_of_a_model_under_the_names_that_solve_takes(capsys):
+    from covocp.catalogue import find_model
+
+    out = run(capsys, "list")[1]
+    others = [line for line in out.splitlines() if ":" in line and not line.startswith(" ")]
+    assert {"unknown_lag:steering", "mars_entry:truth"} <= set(others)
+    for name in others:
+        assert find_model(name).label == name
+    entry = out[out.index("unknown_lag:steering") :].split("\n\n")[0].splitlines()
+    assert entry[1].strip().startswith("First-order lag with unknown time constant, steered by feedback")
+    assert entry[2].strip().startswith("--set final=1.0 terminal_weight=2.0")
+
+
+def test_help_of_a_command_that_solves_names_the_options_of_the_solver(capsys):
+    for command in ("solve", "compare", "plot", "export"):
+        code, out, _ = run(capsys, command, "--help")
+        assert code == 0
+        for option in ("control=linear", "covariance_step=auto", "max_iterations=None", "variant=gradient", "starts=8"):
+            assert option in out
+        assert max(len(line) for line in out.splitlines()) <= 100
+    assert "values of --option" not in run(capsys, "list", "--help")[1]
+
+
+def test_unknown_options_are_told_by_the_command_with_the_nearest_one(capsys):
+    code, out, err = run(capsys, "solve", "unknown_lag", "--interval", "50")
+    assert (code, out) == (2, "")
+    assert err.startswith("usage: covocp solve ")
+    assert "unrecognized: --interval 50" in err
+    assert "perhaps '--intervals' is meant" in err
+    code, _, err = run(capsys, "list", "everything")
+    assert (code, err.splitlines()[0]) == (2, "usage: covocp list [-h]")
+    assert "unrecognized: everything\n" in err
 
 
 def test_solve_prints_the_solution_and_writes_files(capsys, tmp_path):
@@ -157,6 +193,7 @@ def test_plot_draws_the_figures_of_the_source(capsys, tmp_path):
     assert "Schmidt 5.2" in out
     assert "Schmidt 5.3" in out
     assert "Schmidt 6.12" in out
+    assert [line[:8] for line in out.splitlines()] == 3 * ["figure: "]
 
 
 def test_plot_names_its_file_after_the_model(capsys, tmp_path, monkeypatch):
@@ -349,7 +386,7 @@ def test_wrong_input_is_refused(capsys, arguments, words):
         (":number", "did not return a problem"),
         (":failing", "ZeroDivisionError: division by zero"),
         (":leaving", "SystemExit: 5"),
-        (":needs", "needs a value of weight"),
+        (":needs", "my_script.py:needs' needs a value of weight"),
     ],
 )
 def test_wrong_functions_of_scripts_are_refused(capsys, script, function, words):
@@ -390,8 +427,8 @@ def test_other_problems_of_a_model_and_none_as_a_value() -> None:
     assert steering.build(["duration=5"]).expected is not None
     assert not steering.figures()
     assert find_model("mars_entry").build(["regularization=none"]).expected is not None
-    with pytest.raises(co.ProblemError, match="unknown_lag:steering"):
-        find_model("unknown_lag:steer")
+    with pytest.raises(co.ProblemError, match="perhaps 'steering' is meant"):
+        find_model("unknown_lag:steerin")
 
 
 def test_the_package_runs_as_a_module():
