@@ -143,6 +143,9 @@ def _export_options(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--period", type=float, metavar="SECONDS", help="of the samples of a controller; any by default"
     )
+    export.add_argument(
+        "--limits", choices=("bounds",), help="of a controller's control: the bounds of the problem; none by default"
+    )
     export.add_argument("--samples", type=_whole, default=1000, metavar="N", help="points of the comparison (1000)")
     export.add_argument("--overwrite", action="store_true", help="replace a package that is there")
     export.add_argument("--solver", action="store_true", help="write the solver of the model, for re-planning")
@@ -268,6 +271,8 @@ def _export(arguments: argparse.Namespace) -> int:
         what, code = _solved(what, arguments)
         if code:
             return code
+    if arguments.limits is not None:  # to a solver too, which says that it has no such option
+        settings["limits"] = arguments.limits
     package = export_c(what, arguments.directory, **settings)
     check = package.check(samples=arguments.samples)
     if not arguments.quiet:

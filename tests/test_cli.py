@@ -297,6 +297,8 @@ def test_export_of_a_failed_solve_writes_nothing(capsys, tmp_path):
     [
         (["--name", "int"], "cannot be the name of a C package"),
         (["--period", "0.1"], "those of a controller"),
+        (["--limits", "bounds"], "those of a controller"),
+        (["--solver", "--limits", "bounds"], "no option 'limits' for a problem"),
         (["--solver", "--period", "0.1"], "no option 'period' for a problem"),
         (["--solver", "--option", "colour=3"], "no option 'colour'"),
         (["--period", "-1"], "not a positive number"),

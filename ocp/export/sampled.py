@@ -52,8 +52,9 @@ ABOUT = (
     "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
     "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
     "period; the control is u - C y.",
-    "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then P- M' "
-    "(M P- M' + U/period)^-1 of the other rows, P- that of the filter with all of them. At time zero the control is that of the nominal.",
+    "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then "
+    "P- M' (M P- M' + U/period)^-1 of the other rows, P- that of the filter with all of them. At time zero the control "
+    "is that of the nominal.",
 )
 
 

@@ -10,6 +10,7 @@ import pytest
 from exports import FOLDER, mars
 
 import covocp as co
+from covocp.cli import main
 from covocp.export import export_c
 
 
@@ -111,3 +112,27 @@ def test_limits_of_a_control_without_a_unit(tmp_path, limits):
     low, high = (0, 1) if limits == "bounds" else (0.3, 0.6)
     made = export_c(mars(), tmp_path / "pk", limits=limits)
     assert all(f"lift_to_drag from {low} to {high}." in text for text in texts(made))
+
+
+BOUNDED = """
+import covocp as co
+
+def problem():
+    ocp = co.Problem(duration=1.0, name="bounded")
+    x, u = ocp.state("x", initial=0.0, variance=0.1), ocp.control("u", lower=-2.0, upper=2.0, unit="N")
+    ocp.dynamics(x, u, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize_expected(running=0.5 * (u - 0.3) ** 2, terminal_weight={x: 2.0})
+    return ocp
+"""
+
+
+@pytest.mark.needs_cc
+@pytest.mark.parametrize("limits", [[], ["--limits", "bounds"]])
+def test_the_command_limits_the_control_to_the_bounds(capsys, tmp_path, limits):
+    (tmp_path / "own.py").write_text(BOUNDED)
+    arguments = ["export", f"{tmp_path}/own.py:problem", str(tmp_path / "pk"), "--intervals", "20", "--samples", "50"]
+    assert main([*arguments, *limits]) == 0
+    missed = "not limited to the bounds of the problem (u from -2 to 2 [N])" in capsys.readouterr().out
+    defined = "#define PK_LIMIT_U_UPPER 2.0 /* [N] */" in (tmp_path / "pk" / "pk.h").read_text()
+    assert (missed, defined) == ((False, True) if limits else (True, False))
