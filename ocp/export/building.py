@@ -42,6 +42,17 @@ class Build:
     object_bytes: int | None
     stack_bytes: int | None
 
+    @property
+    def sizes(self) -> str:
+        """Sizes and compiler, a line."""
+        code = f"{self.object_bytes} bytes" if self.object_bytes is not None else "not known"
+        stack = f"at most {self.stack_bytes} bytes" if self.stack_bytes is not None else "not known"
+        return f"object code: {code}; stack: {stack}; {self.compiler}"
+
+    def __str__(self) -> str:
+        """Where everything is, and how large."""
+        return f"library: {self.library}\nself-test: {self.self_test}\n{self.sizes}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:

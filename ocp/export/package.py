@@ -78,13 +78,7 @@ class Check:
             for name, law in self.laws.items()
         ]
         lines.append(f"self-test in C: {'passed' if self.self_test else 'FAILED'}")
-        size, stack = self.build.object_bytes, self.build.stack_bytes
-        lines.append(
-            "object code: " + (f"{size} bytes" if size is not None else "not known")
-            + "; stack: " + (f"at most {stack} bytes" if stack is not None else "not known")
-            + f"; {self.build.compiler}"
-        )  # fmt: skip
-        return "\n".join(lines)
+        return "\n".join([*lines, self.build.sizes])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +94,20 @@ class Timing:
     c: float
     python: float
     virtual_machine: float
+
+    def __str__(self) -> str:
+        """A line."""
+        times = (self.c, self.virtual_machine, self.python)
+        in_c, machine, python = (_duration(nanoseconds) for nanoseconds in times)
+        return f"{in_c} a call in C, {machine} in CasADi, {python} from Python"
+
+
+class Timings(dict[str, Timing]):
+    """Times of the laws of a package by name."""
+
+    def __str__(self) -> str:
+        """One line a law."""
+        return "\n".join(f"{name}: {timing}" for name, timing in self.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,14 +186,14 @@ class CPackage:
         """Whether the last `check` was passed; it is made where there was none."""
         return self._last_check.ok
 
-    def time(self, seconds: float = TIMED_SECONDS) -> dict[str, Timing]:
+    def time(self, seconds: float = TIMED_SECONDS) -> Timings:
         """Time the laws at their reference points.
 
         Args:
             seconds: of each measurement, about.
 
         Returns:
-            By name of the law, nanoseconds a call in C, in Python, in CasADi's virtual machine.
+            By name of the law, nanoseconds a call in C, in Python, in CasADi's virtual machine; printed with units.
 
         Raises:
             ExportError: the package cannot be compiled, or its self-test fails.
@@ -193,7 +201,7 @@ class CPackage:
         first = self._in_c(LEAST_CALLS)
         slowest = max(max(first.values()), 1.0)
         in_c = self._in_c(int(np.clip(seconds * 1e9 / slowest, LEAST_CALLS, MOST_CALLS)))
-        return {law.name: self._timed(law, in_c[law.name], seconds) for law in self.laws}
+        return Timings({law.name: self._timed(law, in_c[law.name], seconds) for law in self.laws})
 
     def python(self) -> Laws:
         """The compiled laws as functions of Python, through ctypes.
@@ -308,6 +316,14 @@ class CPackage:
                 remedy=f"correct {what}" if what != "self-test" else "build() again; is the folder complete?",
             )
         )
+
+
+def _duration(nanoseconds: float) -> str:
+    """A time in the unit in which it has one to three digits before the point."""
+    for size, unit in ((1e9, "s"), (1e6, "ms"), (1e3, "us")):
+        if nanoseconds >= 0.9995 * size:  # what would be rounded to 1000 of the smaller unit
+            return f"{nanoseconds / size:.3g} {unit}"
+    return f"{nanoseconds:.3g} ns"
 
 
 def _places(law: Law) -> list[slice]:
