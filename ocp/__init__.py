@@ -1,4 +1,24 @@
-"""covocp: optimal control of a trajectory together with its uncertainty."""
+"""Optimal control of a trajectory together with its uncertainty.
+
+    import covocp as co
+
+    ocp = co.Problem(duration=10.0)
+    x = ocp.state("x", initial=0.0, final=1.0, variance=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u - x, noise=0.1)
+    ocp.measurement("position", x, noise=1.0)
+    ocp.minimize_expected(running=u**2, terminal_weight={x: 2.0})
+    print(co.solve(ocp))
+
+To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback); expressions are
+CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several methods), `evaluate` (a given control),
+`methods`. To judge a solution: `certify` (is it the global minimum?), `worth` (does the combined design pay?),
+`simulate` (Monte Carlo of the actual system), `simulate_law`. To keep and to fly it: `Solution.save`, `load`,
+`export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`, `SolveError` and
+`ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
+
+`help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +44,39 @@ from covocp.methods import solve as solve
 from covocp.problem import Problem as Problem
 from covocp.solution import Solution as Solution
 
+__all__ = [
+    "Problem",
+    "Free",
+    "Gain",
+    "solve",
+    "Solver",
+    "Solution",
+    "methods",
+    "compare",
+    "Comparison",
+    "evaluate",
+    "certify",
+    "Certificate",
+    "worth",
+    "Worth",
+    "simulate",
+    "MonteCarlo",
+    "simulate_law",
+    "LawSimulation",
+    "export_c",
+    "CPackage",
+    "load",
+    "blocks",
+    "CovocpError",
+    "ProblemError",
+    "SolveError",
+    "ExportError",
+    "CovocpWarning",
+]
+
 if TYPE_CHECKING:
     __version__: str
+    from covocp import blocks as blocks
     from covocp.certificate import Certificate as Certificate
     from covocp.certificate import certify as certify
     from covocp.export import CPackage as CPackage
@@ -62,10 +113,14 @@ else:
         if name == "blocks":
             return importlib.import_module("covocp.blocks")
         if name == "__version__":
-            return importlib.import_module("importlib.metadata").version("covocp")
+            metadata = importlib.import_module("importlib.metadata")
+            try:
+                return metadata.version("covocp")
+            except metadata.PackageNotFoundError:  # a folder that is imported from where it lies; help() asks for it
+                return "(not installed)"
         if name in _LATER:
             return getattr(importlib.import_module(_LATER[name]), name)
         raise AttributeError(f"module 'covocp' has no attribute '{name}'")
 
     def __dir__():
-        return sorted([*globals(), *_LATER])
+        return sorted([*__all__, "__all__", "__doc__", "__file__", "__name__", "__path__", "__version__"])
