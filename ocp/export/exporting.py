@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from covocp.errors import ExportError, describe, warn_user
+from covocp.errors import ExportError, describe, spelling, warn_user
 from covocp.export.building import Sources
 from covocp.export.casadi_code import Generated, Sizes, generate
 from covocp.export.collisions import check_identifiers
@@ -25,7 +25,7 @@ from covocp.export.history import history
 from covocp.export.laws import Law, stacked_size
 from covocp.export.limits import warn_outside
 from covocp.export.linking import Linking
-from covocp.export.names import check_name, package_name, suggestion
+from covocp.export.names import check_name, package_name
 from covocp.export.package import CPackage
 from covocp.export.readme import cmake_lists, readme
 from covocp.export.sampled import sampled_law
@@ -264,7 +264,7 @@ def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) 
                     f"export_c has no option '{name}' for {what}.",
                     expected="one of " + ", ".join(allowed),
                     received=f"{name}={value!r}"[:100],
-                    remedy=suggestion(name, allowed) or "leave it out",
+                    remedy=spelling(name, allowed, "leave it out"),
                 )
             )
 

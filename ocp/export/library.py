@@ -13,10 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from covocp.errors import ExportError, describe
+from covocp.errors import ExportError, describe, spelling
 from covocp.export.header import struct_name
 from covocp.export.laws import CODES, STATUSES, Law, Port, span, stacked_size
-from covocp.export.names import suggestion
 from covocp.matrices import Array
 
 NAMES = tuple(STATUSES)
@@ -253,7 +252,9 @@ class Call:
         for name, value in named.items():
             if name not in names:
                 what = f"there is no argument '{name}'"
-                raise self._unfit(f"{name}={value!r}", suggestion(name, names) or f"leave '{name}' out", what)
+                start = f"'initial_{name}' is meant, where '{name}' starts"
+                remedy = start if f"initial_{name}" in names else spelling(name, names, f"leave '{name}' out")
+                raise self._unfit(f"{name}={value!r}", remedy, what)
             if name in given:
                 raise self._unfit(f"'{name}' by its place and by its name", "give it once")
             given[name] = value

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable
 from typing import Any
 
 from covocp.errors import ExportError, describe
 
 LONGEST = 40
-# Likeness of two names (difflib's ratio) from which on one may be a slip of the other.
-ALIKE = 0.75
 # Of C up to C23, then of C++, whose users include the header.
 _KEYWORDS = """
 auto break case char const continue default do double else enum extern float for goto if inline int long register
@@ -89,12 +85,3 @@ def identifier(text: str, taken: set[str], what: str = "value") -> str:
         result, number = f"{plain}_{number}", number + 1
     taken.add(result)
     return result
-
-
-def suggestion(name: str, names: Iterable[str]) -> str:
-    """A question for the name that was probably meant, one with a prefix too; "" where none is near."""
-    known = {word.casefold(): word for word in names}
-    low = name.casefold()
-    near = [word for word in known if word.endswith(f"_{low}")]
-    near += difflib.get_close_matches(low, known, n=1, cutoff=ALIKE)
-    return f"did you mean {known[near[0]]}?" if near else ""

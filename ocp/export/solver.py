@@ -13,10 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.errors import ExportError, describe
+from covocp.errors import ExportError, describe, spelling
 from covocp.export.laws import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.linking import PLUGINS, Linking
-from covocp.export.names import identifier, suggestion
+from covocp.export.names import identifier
 from covocp.export.replanning import Replannable, replannable, stacked
 from covocp.guess import choose_scales, quadrature_weights
 from covocp.integrators import COMPILED_SOLVER
@@ -117,7 +117,7 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
                     f"export_c has no option '{name}' for a problem.",
                     expected="one of " + ", ".join(allowed),
                     received=f"{name}={options[name]!r}"[:100],
-                    remedy=suggestion(name, allowed) or "leave it out",
+                    remedy=spelling(name, allowed, "leave it out"),
                 )
             )
     task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})

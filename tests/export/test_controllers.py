@@ -350,7 +350,7 @@ def test_limits_hold(limits):
         ({"limits": {"thrust": (0.0, 1.0)}}, "thrust"),
         ({"feedback": False, "period": 0.1}, "those of a controller"),
         ({"intervals": 10}, "no option 'intervals' for a solution"),
-        ({"limit": "bounds"}, r"(?s)no option 'limit' for a solution.*did you mean limits\?"),
+        ({"limit": "bounds"}, r"(?s)no option 'limit' for a solution.*perhaps 'limits' is meant"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, words):
