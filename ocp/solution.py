@@ -487,7 +487,13 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
 
 def _in_line(value: Any) -> str:
     """Numbers on one line, six digits; of large arrays the corners."""
-    text = np.array2string(np.asarray(value, dtype=float), precision=6, threshold=20, edgeitems=2, separator=", ")
+    text = np.array2string(
+        np.asarray(value, dtype=float),
+        formatter={"float_kind": lambda number: f"{number:.6g}"},
+        threshold=20,
+        edgeitems=2,
+        separator=", ",
+    )
     return " ".join(text.split())
 
 
