@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,13 +135,13 @@ def plot_solutions(
     return figure
 
 
-def check_plot_options(given: Mapping[str, Any]) -> None:
-    """Options of a figure must be those of `plot_solutions`.
+def check_plot_options(given: Mapping[str, Any], function: Callable[..., Any] = plot_solutions) -> None:
+    """Options of a figure must be those of the function that draws it.
 
     Raises:
         ProblemError: one is not.
     """
-    parameters = inspect.signature(plot_solutions).parameters.values()
+    parameters = inspect.signature(function).parameters.values()
     known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
     for name, value in given.items():
         if name not in known:

@@ -285,6 +285,7 @@ class MonteCarlo:
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the runs; see `covocp.simulation.clouds.plot_monte_carlo`."""
         module = importlib.import_module("covocp.simulation.clouds")
+        importlib.import_module("covocp.plot").check_plot_options(options, module.plot_monte_carlo)
         return module.plot_monte_carlo(self, *names, **options)  # type: ignore[no-any-return]
 
     def __str__(self) -> str:

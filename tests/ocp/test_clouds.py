@@ -72,6 +72,7 @@ def test_units_and_files(sample, tmp_path):
         ((("x",),), {}, "pairs"),
         ((("x", "u"),), {}, "scalar"),
         ((), {"sigmas": (0.0,)}, "sigmas"),
+        ((), {"sigma": (1.0,)}, "perhaps 'sigmas'"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(sample, names, options, word):
