@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import warnings
 from typing import TYPE_CHECKING
@@ -95,6 +94,8 @@ def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
         otherwise: the remedy where nothing is near.
     """
     lower = {word.casefold(): word for word in known}
+    import difflib  # here: most programs make no mistakes, and importing covocp must not take long
+
     found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
     return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise
 

@@ -6,7 +6,6 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -34,6 +33,8 @@ from covocp.statement import Block, Statement, entry_names
 from covocp.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import matplotlib.figure
 
 
