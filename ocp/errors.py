@@ -93,9 +93,9 @@ def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
         known: what could be given.
         otherwise: the remedy where nothing is near.
     """
-    lower = {word.casefold(): word for word in known}
     import difflib  # here: most programs make no mistakes, and importing covocp must not take long
 
+    lower = {word.casefold(): word for word in known}
     found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
     return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise
 
