@@ -8,10 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.checks import column
+from covocp.checks import bound_columns, check_bounds, column
 from covocp.errors import ProblemError, describe, spelling
 from covocp.matrices import Array, half_length, unpack_indices
 from covocp.statement import Statement
+
+Limits = tuple[Array, Array]
 
 
 def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
@@ -104,3 +106,47 @@ def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
             remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
         )
     )
+
+
+def control_limits(statement: Statement, count: int, given: Any) -> Limits:
+    """What the actual control can do, lower and upper limits, (count,) each; infinite where nothing limits it.
+
+    Args:
+        statement: of the problem.
+        count: number of controls that are fed back, the first ones.
+        given: None (no limits: the bounds of the problem are those of the nominal), "bounds" (those of the problem), or
+            a dict of control to (lower, upper), the others without limits.
+
+    Raises:
+        ProblemError: it means nothing.
+    """
+    lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
+    if given is None:
+        return lower, upper
+    if isinstance(given, str) and given == "bounds":
+        return statement.control_bounds[0][:count].copy(), statement.control_bounds[1][:count].copy()
+    if not isinstance(given, Mapping):
+        raise ProblemError(
+            describe(
+                "The limits of the control are of an unknown kind.",
+                expected="limits=None, 'bounds', or a dict of control to (lower, upper)",
+                received=repr(given)[:100],
+                remedy="give limits={'name': (lower, upper)}",
+            )
+        )
+    blocks = {b.name: b for b in statement.controls if b.span.stop <= count}
+    for key, pair in given.items():
+        block = blocks[name_of(key, statement.symbols, tuple(blocks))]
+        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+            raise ProblemError(
+                describe(
+                    f"The limits of '{block.name}' are no pair.",
+                    expected="(lower, upper)",
+                    received=repr(pair)[:100],
+                    remedy=f"give limits={{'{block.name}': (lower, upper)}}",
+                )
+            )
+        low, high = bound_columns(block.name, pair[0], pair[1], block.size)
+        check_bounds(block.name, low, high)
+        lower[block.span], upper[block.span] = low, high
+    return lower, upper

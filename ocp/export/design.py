@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.errors import ExportError, describe
-from covocp.export.limits import control_limits
+from covocp.lookup import control_limits
 from covocp.matrices import Array, unpack, unpack_symbolic
 from covocp.solution import Solution
 from covocp.statement import Block, Statement

@@ -1,70 +1,20 @@
-"""The limits of the control that a controller gives out: what is given, what is said of them, what keeps them."""
+"""The limits of the control that a controller gives out: what keeps them, what is said of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_bounds, column
-from covocp.errors import ExportError, describe, warn_user
+from covocp.errors import warn_user
 from covocp.export.history import History
 from covocp.export.names import identifier
-from covocp.lookup import name_of
-from covocp.matrices import Array
+from covocp.lookup import Limits
 from covocp.statement import Statement, entry_names
 
-Limits = tuple[Array, Array]
 # Share of its size by which a nominal control may lie outside without a word: solvers widen bounds by less.
 ROUNDING = 1e-6
-
-
-def control_limits(statement: Statement, m: int, given: Any) -> Limits:
-    """Lower and upper limits of the controls that are fed back.
-
-    Args:
-        statement: of the problem.
-        m: number of controls that are fed back.
-        given: None, "bounds", or a dict of control to (lower, upper).
-
-    Raises:
-        CovocpError: they mean nothing.
-    """
-    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
-    if given is None:
-        return lower, upper
-    if isinstance(given, str) and given == "bounds":
-        return statement.control_bounds[0][:m].copy(), statement.control_bounds[1][:m].copy()
-    if not isinstance(given, Mapping):
-        raise ExportError(
-            describe(
-                "The limits of the control are of an unknown kind.",
-                expected="None, 'bounds', or a dict of control to (lower, upper)",
-                received=repr(given)[:100],
-                remedy="correct limits=",
-            )
-        )
-    blocks = {b.name: b for b in statement.controls if b.span.stop <= m}
-    for key, pair in given.items():
-        block = blocks[name_of(key, statement.symbols, tuple(blocks))]
-        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-            raise ExportError(
-                describe(
-                    f"The limits of '{block.name}' are no pair.",
-                    expected="(lower, upper)",
-                    received=repr(pair)[:100],
-                    remedy="correct limits=",
-                )
-            )
-        low, high = (
-            column(block.name, what, value, block.size, inf=True)
-            for what, value in zip(("lower limit", "upper limit"), pair, strict=True)
-        )
-        check_bounds(block.name, low, high)
-        lower[block.span], upper[block.span] = low, high
-    return lower, upper
 
 
 def clipped(value: Any, limits: Limits) -> Any:

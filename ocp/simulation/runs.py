@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from covocp.checks import check_bounds, column
 from covocp.errors import ProblemError, SolveError, describe, warn_user
 from covocp.evaluate import evaluate
-from covocp.lookup import name_of
+from covocp.lookup import control_limits
 from covocp.matrices import Array
 from covocp.progress import Progress
 from covocp.simulation.actual import System, actual_system, design_system
@@ -27,7 +26,7 @@ from covocp.simulation.schedule import Filter, Grid, Nominal, base_grid, nominal
 from covocp.simulation.step_choice import StepChoice, choose_step, given_step
 from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution import Solution
-from covocp.statement import Block, entry_names
+from covocp.statement import entry_names
 
 # Multiple of the largest predicted deviation of a component beyond which a run has left the domain.
 DOMAIN = 100.0
@@ -85,8 +84,8 @@ def simulate(
         step: longest integration step [s]; None: halved until the terminal second moments change by less than a fifth
             of their sampling error.
         limits: what the actual control can do: None (no limits: the bounds of the problem are those of the nominal),
-            "bounds" (those of the problem), or a dict of control to (lower, upper). The share of runs that ask for more
-            is reported in each case.
+            "bounds" (those of the problem), or a dict of control to (lower, upper), the others without limits. The
+            share of runs that ask for more is reported in each case.
         store: number of times at which moments are kept.
         paths: number of runs whose histories are kept at these times.
         batch: number of runs that are simulated together, rounded up to a multiple of 64; None: up to 2048 here, 512 in
@@ -163,31 +162,14 @@ def _design(solution: Solution) -> System:
 
 def _limits(design: System, limits: Any) -> Limits:
     """What the actual control can do, and what counts as all that there is."""
-    m = design.fed_back
-    least, most = (bound[:m].copy() for bound in design.statement.control_bounds)
-    if limits is None:
-        free = np.full(m, np.inf)
-        return Limits(lower=-free, upper=free, least=least, most=most)
-    if isinstance(limits, Mapping):
-        blocks = {b.name: b for b in design.statement.controls if b.offset < m}
-        for key, value in limits.items():
-            block = blocks[name_of(key, design.statement.symbols, tuple(blocks))]
-            least[block.span], most[block.span] = _pair(block, value)
-    elif not isinstance(limits, str) or limits != "bounds":
-        raise wrong_argument("limits", "None, 'bounds', or a dict of control to (lower, upper)", limits)
-    return Limits(lower=least, upper=most, least=least, most=most)
-
-
-def _pair(block: Block, value: Any) -> tuple[Array, Array]:
-    """Lower and upper limits of a control."""
-    if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise wrong_argument(f"limits of '{block.name}", "a pair (lower, upper)", value)
-    low, high = (
-        column(block.name, what, v, block.size, inf=True)
-        for what, v in zip(("lower limit", "upper limit"), value, strict=True)
+    lower, upper = control_limits(design.statement, design.fed_back, limits)
+    least, most = (bound[: design.fed_back] for bound in design.statement.control_bounds)
+    return Limits(
+        lower=lower,
+        upper=upper,
+        least=np.where(np.isfinite(lower), lower, least),
+        most=np.where(np.isfinite(upper), upper, most),
     )
-    check_bounds(block.name, low, high)
-    return low, high
 
 
 def _domain(expected: Prediction) -> Array:
