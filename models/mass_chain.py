@@ -69,7 +69,7 @@ def problem(masses: int = 1, weight: float = 20.0) -> co.Problem:
     duration = 10.0 + 0.5 * (m - 1)  # s
     ocp = co.Problem(duration=duration, name=f"chain of {m} mass" + ("es" if m > 1 else ""))
     terminal_weight = ocp.parameter("weight", weight)
-    free = [np.nan] * (m - 1)
+    free = [None] * (m - 1)
     y = ocp.state("y", m, initial=0.0, final=[*free, TARGET], variance=INITIAL_VARIANCE)
     v = ocp.state("v", m, initial=0.0, final=[*free, 0.0], variance=INITIAL_VARIANCE)
     k = ocp.unknown("k", mean=STIFFNESS, variance=PARAMETER_VARIANCE)

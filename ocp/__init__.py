@@ -35,6 +35,7 @@ from covocp.declarations import Gain as Gain
 from covocp.errors import CovocpError as CovocpError
 from covocp.errors import CovocpWarning as CovocpWarning
 from covocp.errors import ExportError as ExportError
+from covocp.errors import Interrupted as Interrupted
 from covocp.errors import ProblemError as ProblemError
 from covocp.errors import SolveError as SolveError
 from covocp.evaluate import evaluate as evaluate
@@ -70,6 +71,7 @@ __all__ = [
     "CovocpError",
     "ProblemError",
     "SolveError",
+    "Interrupted",
     "ExportError",
     "CovocpWarning",
 ]

@@ -7,35 +7,85 @@ import numpy as np
 from covocp.extremal import Extremal
 from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
-from covocp.shooting import refined_run
+from covocp.refinement import refined_end, refined_run
 
+# Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
+COARSE_MESH = 2e-4
 # Costs below this count as zero: a tracking cost whose optimum is zero is known to roundoff only, and no share of it.
 NO_COST = 1e-12
+# Relative change from which on halving the steps does not tell how far they are off: they are divided in more parts.
+FAR, MANY_PARTS = 0.05, 16
+# Roundoff of a step, relative: an unstable nominal that makes more of it than the change it suffers tells nothing.
+STEP_ROUNDOFF = 1e-13
 
 
 def mesh_error(extremal: Extremal, running: float) -> float:
     """Relative change of the cost by halving the integration steps, to first order.
 
+    Where rates depend on the time explicitly, they may jump: then that of the states over a segment, where it is more.
+
     Each shooting segment is run again from its start. The jumps at the ends of the segments count with the multipliers
-    of the continuity, which are the costates there.
+    of the continuity, which are the costates there: this is the change of the optimal cost. Along the controls
+    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more.
 
     Args:
         extremal: trajectory and multipliers.
         running: its running cost.
 
     Returns:
-        |change| / max(|cost|, NO_COST); nan where the run is not finite.
+        |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
+    st, t = extremal.statement, extremal.trajectory
+    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    change, missed, moved = _change(extremal, running, 2)
+    if abs(change) > FAR * abs(cost):
+        further = _change(extremal, running, MANY_PARTS)
+        change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
+    error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
+    return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
+
+
+def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, float, float]:
+    """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    jumps, refined, last = refined_run(st, mesh, t, extremal.parameters)
+    jumps, refined, last = refined_run(st, mesh, t, extremal.parameters, parts)
     weights = extremal.multipliers.gaps
     if weights.shape != jumps.shape:  # a method without segments
         costates, _, _ = discrete_costates(extremal)
         weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
     change = float(np.sum(weights * jumps)) + refined - running
     change += _at_the_end(extremal, last) - _at_the_end(extremal, t.e[-1])
-    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    return abs(change) / max(abs(cost), NO_COST)
+    return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
+
+
+def _moved(jumps: Array, x: Array) -> float:
+    """Largest change of a state over a segment, relative to its range; where nothing moves, to its size.
+
+    A rate that jumps inside an interval, which steps cannot see, need not change the cost.
+    """
+    size = np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), np.abs(x).max(axis=0))
+    return float((np.abs(jumps).max(axis=0) / np.where(size > 0, size, 1.0)).max(initial=0.0))
+
+
+def _missed(extremal: Extremal, jumps: Array, parts: int) -> float:
+    """Multipliers of the final values times what one run along the controls misses of them.
+
+    Zero where the nominal is so unstable that roundoff alone would miss as much.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    multipliers = extremal.multipliers.final
+    if st.coupled or not multipliers.any():
+        return 0.0
+    if len(mesh.segments) == 1:
+        return float(multipliers @ jumps[-1, : st.nx])
+    drift = refined_end(st, mesh, t, extremal.parameters, parts) - t.x[-1]
+    scale = np.abs(t.x).max(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    suffered = float((np.abs(jumps[:, : st.nx]) / scale).max())
+    amplified = float((np.abs(drift) / scale).max())
+    if not np.isfinite(drift).all() or amplified * STEP_ROUNDOFF > COARSE_MESH * suffered:
+        return 0.0
+    return float(multipliers @ drift)
 
 
 def _at_the_end(extremal: Extremal, matrices: Array) -> float:

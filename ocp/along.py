@@ -7,23 +7,29 @@ from typing import Any
 import numpy as np
 
 from covocp.extremal import Extremal
+from covocp.implicit import one_sided
 from covocp.matrices import Array, unpack
 
 
 def rates_along(extremal: Extremal) -> tuple[Array, Array]:
-    """Rates of x and e stacked at the nodes, and at the ends of the intervals with the control of the interval."""
+    """Rates of x and e stacked at the starts of the intervals and the end, and at the ends of the intervals.
+
+    Each with the control of its interval and the limit of the time from inside it.
+    """
     function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
 
-    def stacked(columns: tuple[Any, ...]) -> Array:
-        state, matrices, _ = function(*columns)
+    def stacked(u: Any, time: Array) -> Array:
+        state, matrices, _ = function(x, u, e, time[None, :], *rest)
         return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
 
-    x, u, *rest = extremal.columns()
-    rates = stacked((x, u, *rest))
-    if extremal.mesh.control == "linear":
+    x, u, e, _, *rest = extremal.columns()
+    t = extremal.time
+    h = np.diff(t)
+    rates = stacked(u, np.append(t[:-1] + one_sided(0.0) * h, t[-1] - one_sided(0.0) * h[-1]))
+    if extremal.mesh.control == "linear" and extremal.statement.autonomous:
         return rates, rates[1:].copy()
-    before = np.hstack([np.asarray(u)[:, :1], np.asarray(u)[:, :-1]])
-    return rates, stacked((x, before, *rest))[1:]
+    before = u if extremal.mesh.control == "linear" else np.hstack([np.asarray(u)[:, :1], np.asarray(u)[:, :-1]])
+    return rates, stacked(before, np.append(t[0], t[1:] - one_sided(0.0) * h))[1:]
 
 
 def filter_gain(extremal: Extremal) -> Array | None:

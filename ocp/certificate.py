@@ -5,57 +5,69 @@ tr(C Lambda^-1) is convex in Lambda. With S^c = Lambda*^-1 C Lambda*^-1 at a sol
 
     J(u) >= q(u) = quadratic cost of x and u + tr(C Lambda*^-1) - tr(S^c (Lambda(u) - Lambda*)),
 
-and q, quadratic in u, touches J at u*. Where u* is stationary (the multipliers of convex inequalities included) and
-the second variation of q is not negative on the controls that keep the terminal conditions, u* is a global minimum. For
-the cost int u^2/2 that second variation is the operator I - sum_ij S^c_ij (G_ij + G_ij') of consequence (i).
+and q, quadratic in u, touches J at u*. Where the second variation of q is not negative on the controls that keep the
+terminal conditions, the least value of q with the multipliers of the (convex) inequalities is a lower bound for every
+admissible control of finite energy, on whatever mesh or none; how far it is below J(u*) is the gap. For the cost
+int u^2/2 that second variation is the operator I - sum_ij S^c_ij (G_ij + G_ij') of consequence (i).
+
+All of it is computed on meshes finer than the solution's, with controls that may jump (`stages`), on two of them: how
+the numbers change from one to the other is their error, and part of the tolerance and of the gap.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
-import casadi as ca
 import numpy as np
 
+from covocp.arguments import checked, truth
 from covocp.checks import check_kind
 from covocp.extremal import Extremal
-from covocp.matrices import Array, unpack
-from covocp.mesh import Mesh
-from covocp.reducible import condition, terminal_slopes, terminal_weight, why_not
-from covocp.reduction import Forms, Reduction
+from covocp.fine import refined
+from covocp.lower_bound import Bound
+from covocp.matrices import unpack
+from covocp.mesh_bound import both_ends, divided, mesh_residual
+from covocp.progress import Progress
+from covocp.reducible import why_not
+from covocp.reduction import Reduction, resolved
 from covocp.solution import Solution
-from covocp.statement import Conditions
+from covocp.threads import one_at_a_time
 
 Verdict = Literal["global minimum (certified)", "not certified", "does not apply"]
 
-# The tolerance of the eigenvalue is this multiple of its estimated errors, plus the roundoff of the eigenproblem; costs
-# below the roundoff count as zero.
+# The tolerance of the eigenvalue is this multiple of its change from one mesh to the next, plus its error on the finer
+# one and the roundoff of the eigenproblem.
 SAFETY = 2.0
 ROUNDOFF = 1e-9
-# The eigenvalue is first order in S^c, this is second order in Lambda^-1, and Lambda is second order in the control.
-PER_INFORMATION = 2.0
-PER_CONTROL = 4.0
-# Above these nothing is certified: tolerance of an eigenvalue that counts as zero; what another control could save,
-# relative to J.
-LARGEST_TOLERANCE = 1e-3
+# Intervals of the coarser of the two meshes, at least.
+INTERVALS = 100
+# Below this an eigenvalue is negative, and not what the mesh leaves of zero.
+# Above these nothing is certified: what another control could save, relative to J; what a constraint is violated by,
+# relative to its limit or to the values.
+LARGEST_FALL = 1e-3
 LARGEST_GAP = 1e-3
+LARGEST_VIOLATION = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
-    """Whether a solution is a global minimum; numbers are None where the theory does not apply.
+    """Whether a solution is a global minimum; numbers are None where they were not computed.
 
     Attributes:
         verdict: in three words.
         reason: what decided it, a sentence.
-        smallest_eigenvalue: of the second variation of the bound q on controls that keep the terminal conditions,
-            relative to the energy int u' L_uu u dt; the lesser of those on the solution's mesh and on the halved one.
-        tolerance: down to minus this the eigenvalue counts as zero; from its change by halving the mesh, the
-            consistency and the stationarity residual.
-        stationarity: norm of the slope of the Lagrangian in the energy metric, relative to sqrt(2 |J|).
+        smallest_eigenvalue: of the second variation of the bound q on controls of finite energy that keep the terminal
+            conditions, relative to the energy int u' L_uu u dt.
+        tolerance: down to minus this the eigenvalue counts as zero; from its change by halving the mesh.
+        stationarity: norm of the slope of the Lagrangian in the energy metric, between the nodes as well, relative to
+            sqrt(2 |J|).
         consistency: largest relative difference between Lambda^-1 and E_bb(T) of the solution.
-        gap: no control on the mesh of the solution costs less by more than this [cost].
+        gap: no admissible control of finite energy costs less by more than this [cost]; inf where nothing is known,
+            None where the theory does not apply.
+        mesh_gap: no admissible control on the mesh of the solution does by more than this [cost]; None where that is
+            not known.
     """
 
     verdict: Verdict
@@ -65,10 +77,11 @@ class Certificate:
     stationarity: float | None = None
     consistency: float | None = None
     gap: float | None = None
+    mesh_gap: float | None = None
 
     @property
     def certified(self) -> bool:
-        """Whether the solution is a global minimum up to the tolerance and the gap."""
+        """Whether the solution is a global minimum up to the gap."""
         return self.verdict == "global minimum (certified)"
 
     def __str__(self) -> str:
@@ -76,18 +89,21 @@ class Certificate:
         if self.smallest_eigenvalue is None:
             return f"{self.verdict}: {self.reason}"
         numbers = (
-            f"smallest eigenvalue {self.smallest_eigenvalue:.3g} (known to {self.tolerance:.2g} by mesh and solver), "
+            f"smallest eigenvalue {self.smallest_eigenvalue:.3g} (known to {self.tolerance:.2g}), "
             f"stationarity residual {self.stationarity:.2g}, "
             f"Lambda^-1 against E_bb(T) {self.consistency:.2g}"
         )
         return f"{self.verdict}: {self.reason}; {numbers}"
 
 
-def certify(solution: Solution) -> Certificate:
+@one_at_a_time
+@checked(progress=truth)
+def certify(solution: Solution, *, progress: bool = True) -> Certificate:
     """Try to prove that a solution is a global minimum (specification, section 5, consequence (i)).
 
     Args:
         solution: of a problem that identifies constant parameters.
+        progress: whether to show on a terminal what is computed.
 
     Returns:
         The certificate; "does not apply" says which condition of the theory fails. "not certified" does not mean that a
@@ -103,198 +119,147 @@ def certify(solution: Solution) -> Certificate:
     if obstacle:
         return Certificate(verdict="does not apply", reason=obstacle)
     if not solution.converged:
-        return Certificate(verdict="not certified", reason=f"the solution did not converge ({solution.message})")
-    u, block = extremal.trajectory.u, extremal.statement.matrices[0]
-    bound = Bound.at(extremal, extremal.mesh, u)
-    halved = Bound.at(extremal, *halve(extremal.mesh, u))
-    nx = extremal.statement.nx
-    covariance = unpack(extremal.trajectory.e[-1], block.size)[nx:, nx:]
-    consistency = float(np.abs(np.linalg.inv(bound.information) - covariance).max() / np.abs(covariance).max())
-    slopes, slack = bound.inequalities(extremal)
-    residual = float(np.linalg.norm(bound.directions.T @ (bound.slope + slopes)))
-    scale = float(np.sqrt(2 * max(abs(solution.cost), ROUNDOFF)))
-    eigenvalue = min(bound.eigenvalue, halved.eigenvalue)
-    errors = abs(bound.eigenvalue - halved.eigenvalue) + PER_INFORMATION * consistency + PER_CONTROL * residual / scale
-    tolerance = SAFETY * errors + ROUNDOFF
-    reach = bound.reach()
-    gap = slack + residual * reach + 0.5 * max(0.0, tolerance - eigenvalue) * reach**2
-    verdict, reason = _judge(eigenvalue, tolerance, gap, abs(solution.cost))
+        reason = f"the solution did not converge ({solution.message})"
+        return Certificate(verdict="not certified", reason=reason, gap=np.inf)
+    broken = violations(solution)
+    if broken:
+        name = max(broken, key=lambda key: broken[key])
+        reason = f"it violates the constraints of the problem: {name} by {broken[name]:.3g}"
+        return Certificate(verdict="not certified", reason=reason, gap=np.inf)
+    with Progress(f"certifying {solution.name}", progress) as reporter:
+        try:
+            return _certified(solution, reporter)
+        except np.linalg.LinAlgError:
+            reason = "the running cost is not strictly convex in the control at all times"
+            return Certificate(verdict="does not apply", reason=reason)
+
+
+def _certified(solution: Solution, reporter: Progress) -> Certificate:
+    """The numbers and the verdict of a solution that meets the constraints."""
+    extremal, cost = refined(solution.extremal), solution.cost  # limits act at all nodes of this
+    mesh = resolved(extremal.statement, extremal.mesh, extremal.parameters)
+    extremal, w = replace(extremal, mesh=mesh), both_ends(extremal)
+    parts = max(1, int(np.ceil(INTERVALS / mesh.intervals)))
+    bounds, eigenvalues, errors = [], [], []
+    for factor in (parts, 2 * parts):
+        reporter.say(f"{factor * mesh.intervals} intervals")
+        bounds.append(Bound.at(extremal, *divided(mesh, w, factor)))
+        eigenvalue, error = bounds[-1].smallest(bounds[-1].curvature)
+        eigenvalues.append(eigenvalue)
+        errors.append(error)
+    eigenvalue = min(eigenvalues)
+    tolerance = SAFETY * (_difference(eigenvalues) + max(errors)) + ROUNDOFF
+    reporter.say("what other controls can save")
+
+    def reach() -> float:
+        return bounds[-1].reach(max(0.0, cost - bounds[-1].cost))
+
+    gaps = [cost - b.cost + b.slack + b.room(e, tolerance, reach) for b, e in zip(bounds, eigenvalues, strict=True)]
+    gap = max(0.0, gaps[-1]) + _difference(gaps)
+    mesh_gap = _on_the_mesh(solution.extremal, eigenvalue, tolerance, reach)
+    mesh_gap = mesh_gap if mesh_gap is None else min(mesh_gap, gap)
+    nx, size = extremal.statement.nx, extremal.statement.matrices[0].size
+    covariance = unpack(extremal.trajectory.e[-1], size)[nx:, nx:]
+    information = Reduction(extremal.statement, mesh, extremal.parameters).covariance(extremal.trajectory.u)[2]
+    consistency = float(np.abs(np.linalg.inv(information) - covariance).max() / np.abs(covariance).max())
+    verdict, reason = _judge(eigenvalue, gap, mesh_gap, abs(cost))
     return Certificate(
         verdict=verdict,
         reason=reason,
         smallest_eigenvalue=eigenvalue,
         tolerance=tolerance,
-        stationarity=residual / scale,
+        stationarity=float(np.linalg.norm(bounds[-1].slope) / np.sqrt(2 * max(abs(cost), ROUNDOFF))),
         consistency=consistency,
         gap=gap,
+        mesh_gap=mesh_gap,
     )
 
 
-def _judge(eigenvalue: float, tolerance: float, gap: float, cost: float) -> tuple[Verdict, str]:
+def _difference(pair: list[float]) -> float:
+    """Of two numbers; none where both are infinite."""
+    return 0.0 if pair[0] == pair[1] else abs(pair[1] - pair[0])
+
+
+def _judge(eigenvalue: float, gap: float, mesh_gap: float | None, cost: float) -> tuple[Verdict, str]:
     """Verdict and reason from the numbers."""
-    if eigenvalue < -tolerance:
+    allowed = LARGEST_GAP * cost + ROUNDOFF
+    if gap <= allowed:
+        on_mesh = "" if mesh_gap is None else f" (on its own mesh: {mesh_gap:.2g})"
+        return (
+            "global minimum (certified)",
+            f"no admissible control of finite energy costs less by more than {gap:.2g}{on_mesh}",
+        )
+    if eigenvalue < -LARGEST_FALL:
         return (
             "not certified",
             "the quadratic lower bound of the cost falls along a direction that keeps the terminal conditions, "
             "so a better control may exist",
         )
-    if eigenvalue < tolerance and tolerance > LARGEST_TOLERANCE:
+    if mesh_gap is not None and mesh_gap <= allowed:
         return (
             "not certified",
-            "mesh or solution are too inaccurate to tell the sign of the eigenvalue: use more intervals, "
-            "covariance_step='gauss' or a smaller tolerance of the solver",
+            f"on its own mesh no admissible control costs less by more than {mesh_gap:.2g}, but a freer one may by up "
+            f"to {gap:.2g}: use more intervals",
         )
-    if not gap <= LARGEST_GAP * cost + ROUNDOFF:
-        return "not certified", f"the residuals of the solution leave room for controls that cost less by {gap:.2g}"
-    return "global minimum (certified)", f"no admissible control costs less by more than {gap:.2g}"
+    return "not certified", f"the residuals of the solution leave room for controls that cost less by {gap:.2g}"
 
 
-def halve(mesh: Mesh, u: Array) -> tuple[Mesh, Array]:
-    """The mesh with every interval halved, and the same control on it."""
-    middles = 0.5 * (mesh.nodes[1:] + mesh.nodes[:-1])
-    nodes = np.sort(np.concatenate([mesh.nodes, middles]))
-    if mesh.control == "constant":
-        return replace(mesh, nodes=nodes), np.repeat(u, 2, axis=0)
-    finer = np.empty((nodes.size, u.shape[1]))
-    finer[::2], finer[1::2] = u, 0.5 * (u[1:] + u[:-1])
-    return replace(mesh, nodes=nodes), finer
+def violations(solution: Solution) -> Mapping[str, float]:
+    """What a solution violates its problem by, by name, beyond a share of the limit or of the values.
 
-
-@dataclass(frozen=True, kw_only=True)
-class Bound:
-    """The quadratic lower bound q at a control, on one mesh; V control values.
-
-    Attributes:
-        reduction: the mesh and the statement.
-        forms: its quadratic forms with the weight S^c.
-        information: Lambda* (nb, nb).
-        directions: basis of the changes of control that keep the terminal conditions, orthonormal in the energy metric,
-            (V, number).
-        curvature: Hessian of q on that basis; `own`: of the cost of x and u alone.
-        slope: gradient of q, and of J, by the control values (V,); `own_slope`: of the cost of x and u alone.
-        uncertain: tr(C Lambda*^-1), the part of the cost that q has been linearised in.
+    It is looked at where limits are imposed: at the nodes, and at the points between them.
     """
-
-    reduction: Reduction
-    forms: Forms
-    information: Array
-    directions: Array
-    curvature: Array
-    own: Array
-    slope: Array
-    own_slope: Array
-    uncertain: float
-
-    @staticmethod
-    def at(extremal: Extremal, mesh: Mesh, u: Array) -> Bound:
-        """The bound at control values u (N + 1 or N, nu) of a mesh."""
-        st, parameters = extremal.statement, extremal.parameters
-        reduction = Reduction(st, mesh, parameters)
-        information = reduction.covariance(u)[2]
-        covariance = np.linalg.inv(information)
-        weight = terminal_weight(st, parameters)[st.nx :, st.nx :]
-        forms = reduction.forms(covariance @ weight @ covariance)
-        size, w = reduction.size, np.append(u.ravel(), 1.0)
-        last = forms.nodes[-1]
-        gradient, hessian = terminal_slopes(st, parameters, last @ w)
-        own = forms.running + last.T @ hessian @ last
-        slope = forms.running @ w + forms.slope + last.T @ gradient
-        rows = [last[~np.isnan(st.boundary_values(parameters)[1])], _terminal_equalities(reduction, forms, u)]
-        directions = _directions(np.vstack(rows)[:, :size], forms.energy[:size, :size])
-        own, falls = own[:size, :size], forms.information[:size, :size]
-        return Bound(
-            reduction=reduction,
-            forms=forms,
-            information=information,
-            directions=directions,
-            curvature=directions.T @ (own - falls) @ directions,
-            own=directions.T @ own @ directions,
-            slope=(slope - forms.information @ w)[:size],
-            own_slope=slope[:size],
-            uncertain=float(np.trace(weight @ covariance)),
-        )
-
-    @property
-    def eigenvalue(self) -> float:
-        """Smallest eigenvalue of the second variation; inf where no other control is admissible."""
-        return float(np.linalg.eigvalsh(self.curvature)[0]) if self.curvature.size else np.inf
-
-    def reach(self) -> float:
-        """How far, in the energy metric, a control that costs no more can be from u*: q without the matrix bounds it.
-
-        J(u) <= J* and tr(C Lambda^-1) >= 0 give slope d + own d^2/2 <= tr(C Lambda*^-1) for the distance d.
-        """
-        if not self.own.size:
-            return 0.0
-        slope, curvature = float(np.linalg.norm(self.directions.T @ self.own_slope)), np.linalg.eigvalsh(self.own)[0]
-        if curvature <= 0:
-            return np.inf
-        return float((slope + np.sqrt(slope**2 + 2 * curvature * self.uncertain)) / curvature)
-
-    def inequalities(self, extremal: Extremal) -> tuple[Array, float]:
-        """Slope by the control values of the inequalities times their multipliers, and the cost of their slack."""
-        st, multipliers, trajectory = extremal.statement, extremal.multipliers, extremal.trajectory
-        size, count = self.reduction.size, extremal.mesh.intervals + 1
-        weights, slack = _acting(multipliers.controls, trajectory.u, *st.control_bounds)
-        slope = weights.ravel()
-        states = multipliers.states.copy()
-        states[-1] += np.where(np.isnan(st.boundary_values(extremal.parameters)[1]), multipliers.final, 0.0)
-        weights, more = _acting(states, trajectory.x, *st.state_bounds)
-        slope, slack = slope + np.einsum("ki,kij->j", weights, self.forms.nodes[:, :, :size]), slack + more
-        for conditions, given, at in (
-            (st.path, multipliers.path, range(count)),
-            (st.start, multipliers.start[None, :], (0,)),
-            (st.end, multipliers.end[None, :], (count - 1,)),
-        ):
-            if not conditions.size:
-                continue
-            values, maps = _rows(self.reduction, self.forms, conditions, extremal.controls, at)
-            weights, more = _acting(given, values, conditions.lower, conditions.upper)
-            slope, slack = slope + np.einsum("ki,kij->j", weights, maps[:, :, :size]), slack + more
-        return slope, slack
+    extremal = refined(solution.extremal)
+    st, t = extremal.statement, extremal.trajectory
+    x0, xf, _, _ = st.boundary_values(extremal.parameters)
+    columns = [np.asarray(column) for column in extremal.columns()]
+    nowhere = np.full(st.nx, np.inf)
+    groups = [
+        (st.control_names, t.u, *st.control_bounds, ""),
+        (st.state_names, t.x, *st.state_bounds, ""),
+        (
+            st.state_names,
+            t.x[:1],
+            np.where(np.isnan(x0), -nowhere, x0),
+            np.where(np.isnan(x0), nowhere, x0),
+            "initial value of ",
+        ),
+        (
+            st.state_names,
+            t.x[-1:],
+            np.where(np.isnan(xf), -nowhere, xf),
+            np.where(np.isnan(xf), nowhere, xf),
+            "final value of ",
+        ),
+    ]
+    for conditions, nodes in ((st.path, slice(None)), (st.start, slice(1)), (st.end, slice(-1, None))):
+        if conditions.size:
+            chosen = [column[..., nodes] for column in columns]
+            values = np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
+            groups.append((conditions.names, values, conditions.lower, conditions.upper, ""))
+    result = dict(solution.violations)
+    for names, values, lower, upper, words in groups:
+        limits = [np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (lower, upper)]
+        whole = t.x if values.shape[1:] == t.x.shape[1:] and "value" in words else values
+        size = np.maximum.reduce([np.ones(lower.size), *limits, np.abs(whole).max(axis=0)])
+        excess = np.maximum(lower - values, values - upper).max(axis=0)
+        for name, value, allowed in zip(names, excess, LARGEST_VIOLATION * size, strict=True):
+            if value > allowed:
+                result[words + name] = max(float(value), result.get(words + name, 0.0))
+    return result
 
 
-def _acting(multipliers: Array, values: Array, lower: Array, upper: Array) -> tuple[Array, float]:
-    """Multipliers of bounds that exist, and the sum of multiplier times distance from the bound [cost]."""
-    above = np.where(np.isfinite(upper), np.maximum(multipliers, 0.0), 0.0)
-    below = np.where(np.isfinite(lower), np.maximum(-multipliers, 0.0), 0.0)
-    high, low = np.where(np.isfinite(upper), upper, 0.0), np.where(np.isfinite(lower), lower, 0.0)
-    return above - below, float(np.sum(np.abs(above * (high - values)) + np.abs(below * (values - low))))
+def _on_the_mesh(extremal: Extremal, eigenvalue: float, tolerance: float, reach: Callable[[], float]) -> float | None:
+    """What another control on the mesh of the solution can save; None where the eigenvalue leaves it open.
 
-
-def _rows(reduction: Reduction, forms: Forms, conditions: Conditions, controls: Array, at: Any) -> tuple[Array, Array]:
-    """Values of affine conditions at some nodes (k, rows) and their slopes by (control values, 1), (k, rows, V + 1)."""
-    st, mesh, duration = reduction.statement, reduction.mesh, reduction.statement.duration.guess
-    z, time, expression = condition(st, conditions, reduction.parameters)
-    function = ca.Function("rows", [z, time], [ca.densify(expression), ca.densify(ca.jacobian(expression, z))])
-    values, maps = [], []
-    for node in at:
-        last = node == mesh.intervals
-        control = reduction.values(node - last, float(last), None)
-        whole = np.vstack([forms.nodes[node], control])
-        x = forms.nodes[node] @ np.append(controls[: mesh.control_nodes].ravel(), 1.0)
-        value, slope = function(np.concatenate([x, controls[node]]), duration * mesh.nodes[node])
-        values.append(np.asarray(value.full()).ravel())
-        maps.append(np.asarray(slope.full()) @ whole)
-    return np.array(values), np.array(maps)
-
-
-def _terminal_equalities(reduction: Reduction, forms: Forms, u: Array) -> Array:
-    """Slopes of the terminal conditions of subject_to that are equalities, (rows, V + 1)."""
-    end = reduction.statement.end
-    if not end.size:
-        return np.zeros((0, reduction.size + 1))
-    controls = u if u.shape[0] > reduction.mesh.intervals else np.vstack([u, u[-1:]])
-    rows = _rows(reduction, forms, end, controls, (reduction.mesh.intervals,))[1][0]
-    return np.asarray(rows[end.lower == end.upper])
-
-
-def _directions(rows: Array, energy: Array) -> Array:
-    """Basis of the null space of the rows, orthonormal in the energy metric."""
-    from scipy.linalg import null_space, solve_triangular  # here: importing scipy takes longer than all of covocp
-
-    sizes = np.linalg.norm(rows, axis=1)
-    kept = rows[sizes > 0] / sizes[sizes > 0][:, None]
-    basis = null_space(kept) if kept.size else np.eye(energy.shape[0])
-    factor = np.linalg.cholesky(basis.T @ energy @ basis)
-    return np.asarray(solve_triangular(factor, basis.T, lower=True).T)
+    The slope on the mesh is the tolerance of the solver; the second variation is that on all controls, or larger.
+    """
+    residual, slack = mesh_residual(extremal, both_ends(extremal))
+    least = eigenvalue - tolerance
+    if np.isinf(least):
+        return max(0.0, slack)
+    if least > 0:
+        return max(0.0, slack + 0.5 * residual**2 / least)
+    radius = reach()
+    room = slack + residual * radius - 0.5 * least * radius**2
+    return max(0.0, room) if np.isfinite(room) else None

@@ -10,8 +10,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.errors import ProblemError, describe, kind_and_name, spelling
-from covocp.matrices import Array, pack_symbolic
+from covocp.arguments import is_number
+from covocp.arguments import is_whole as is_whole
+from covocp.errors import ProblemError, describe, kind_and_name, shown, spelling
+from covocp.matrices import Array, pack_symbolic, real_numbers
+
+# Components of a symbol that still make a matrix that fits into a memory.
+LARGEST_SIZE = 10**4
 
 
 def caller() -> str:
@@ -29,9 +34,9 @@ def is_symbolic(value: Any) -> bool:
     return isinstance(value, ca.MX)
 
 
-def is_whole(value: Any, least: int = 1) -> bool:
-    """Whether the value is a whole number (no truth value) and not below the least one."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
+def is_scalar(value: Any) -> bool:
+    """Whether a number, an array or an expression has one entry."""
+    return bool(value.numel() == 1 if isinstance(value, (ca.MX, ca.DM)) else np.size(value) == 1)
 
 
 def check_kind(value: Any, kind: type, remedy: str) -> None:
@@ -63,27 +68,16 @@ def as_number(name: str, what: str, value: Any) -> Array:
             )
         )
     try:
-        if value is None or _no_numbers(value):
-            raise TypeError("numpy would read words and truths as numbers, and None as NaN")
-        return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
-    except (TypeError, ValueError) as error:
+        return real_numbers(value)
+    except (TypeError, ValueError, OverflowError) as error:
         raise ProblemError(
             describe(
                 f"The {what} of '{name}' is not a number.",
                 expected="a number or an array of numbers",
-                received=repr(value),
+                received=shown(value, 200),
                 remedy=f"check the {what} of '{name}'",
             )
         ) from error
-
-
-def _no_numbers(value: Any) -> bool:
-    """Whether a value is a truth or holds words; None in a list is NaN, arrays of truths are patterns of 0 and 1."""
-    if isinstance(value, (list, tuple)):
-        return any(
-            isinstance(entry, str) or (isinstance(entry, (list, tuple)) and _no_numbers(entry)) for entry in value
-        )
-    return isinstance(value, (str, bool, np.bool_))
 
 
 def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:
@@ -102,12 +96,17 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
         raise ProblemError(
             describe(
                 f"The {what} of '{name}' contains NaN or inf.",
-                expected="finite numbers" + (" (NaN: free)" if nan else ""),
+                expected="finite numbers" + (" (None: free)" if nan else ""),
                 received=str(numbers),
                 remedy=f"correct the {what} of '{name}'",
             )
         )
     return numbers
+
+
+def one_number(name: str, what: str, value: Any) -> float:
+    """The value as one number, which may be NaN or infinite."""
+    return float(column(name, what, value, 1, nan=True, inf=True)[0])
 
 
 def bound_columns(name: str, lower: Any, upper: Any, size: int) -> tuple[Array, Array]:
@@ -143,7 +142,7 @@ def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
         raise shape_error(name, what, expected, f"shape {value.shape}")
     numbers = as_number(name, what, value)
     if numbers.size == 1:
-        numbers = float(numbers.reshape(())) * np.eye(size)
+        numbers = np.diag(np.full(size, float(numbers.reshape(()))))
     elif numbers.size == size and (numbers.ndim == 1 or 1 in numbers.shape):
         numbers = np.diag(numbers.ravel())
     if numbers.shape != (size, size):
@@ -156,6 +155,8 @@ def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite:
     """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
     matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
     if not is_symbolic(value):
+        if matrix.ndim > 2:
+            raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
         matrix = matrix.reshape(1, 1) if matrix.size == 1 else matrix
         known = np.nan_to_num(matrix, nan=0.0, posinf=np.inf, neginf=-np.inf)
         if matrix.shape == (size, size):
@@ -250,11 +251,11 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
 
 def check_size(name: str, size: Any) -> int:
     """The shape of a symbol must be a positive whole number."""
-    if not is_whole(size):
+    if not is_whole(size, 1, LARGEST_SIZE):
         raise ProblemError(
             describe(
                 f"The shape of '{name}' is not a number of components.",
-                expected="a positive whole number",
+                expected=f"a positive whole number, at most {LARGEST_SIZE}",
                 received=repr(size),
                 remedy="give 1 for a scalar, n for a column of n",
             )
@@ -394,15 +395,13 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
 def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
     """The value as an expression of the given shape (a scalar zero fits every shape)."""
     try:
-        if value is None or isinstance(value, ca.SX) or _no_numbers(value):
-            raise TypeError("symbols of another kind, words, or nothing")
-        expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(np.asarray(value, dtype=float)))
-    except (TypeError, ValueError, NotImplementedError) as error:
+        expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(real_numbers(value)))
+    except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
         raise ProblemError(
             describe(
                 f"The {what} of '{name}' is not an expression.",
                 expected="an expression of the symbols of this problem",
-                received=repr(value),
+                received=shown(value, 200),
                 remedy="use casadi functions on the symbols (casadi.vertcat, casadi.sin, @, *), not lists, arrays "
                 "of symbols or symbols made by casadi.SX.sym",
             )
@@ -428,12 +427,12 @@ COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 def column_expression(name: str, what: str, value: Any) -> ca.MX:
     """The value as a column of expressions; comparisons, lists and symbols of another kind are refused."""
-    if not isinstance(value, (ca.MX, ca.DM, int, float)):
+    if not isinstance(value, (ca.MX, ca.DM)) and not is_number(value):
         raise ProblemError(
             describe(
                 f"The {what} '{name}' is not an expression of this problem's symbols.",
                 expected="one expression; several go into one column by casadi.vertcat",
-                received=f"{type(value).__name__}: {str(value)[:100]}",
+                received=kind_and_name(value),
                 remedy="use the symbols that state(), control() and symmetric() return",
             )
         )

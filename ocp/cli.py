@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 import covocp as co
 from covocp.catalogue import find_model, models, parse_value, problems, split_setting
-from covocp.errors import CovocpError, ProblemError, SolveError, describe, spelling
+from covocp.errors import CovocpError, Interrupted, ProblemError, SolveError, describe, spelling
 from covocp.files import check_target
 from covocp.mesh import Options
 from covocp.methods import STARTS, method_options
@@ -146,6 +146,12 @@ def _export_options(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--limits", choices=("bounds",), help="of a controller's control: the bounds of the problem; none by default"
     )
+    export.add_argument(
+        "--largest-spread",
+        type=float,
+        metavar="FACTOR",
+        help="of a controller: by how much its loop may spread more than the solution predicts (1.5)",
+    )
     export.add_argument("--samples", type=_whole, default=1000, metavar="N", help="points of the comparison (1000)")
     export.add_argument("--overwrite", action="store_true", help="replace a package that is there")
     export.add_argument("--solver", action="store_true", help="write the solver of the model, for re-planning")
@@ -271,8 +277,9 @@ def _export(arguments: argparse.Namespace) -> int:
         what, code = _solved(what, arguments)
         if code:
             return code
-    if arguments.limits is not None:  # to a solver too, which says that it has no such option
-        settings["limits"] = arguments.limits
+    for name in ("limits", "largest_spread"):  # to a solver too, which says that it has no such option
+        if getattr(arguments, name) is not None:
+            settings[name] = getattr(arguments, name)
     package = export_c(what, arguments.directory, **settings)
     check = package.check(samples=arguments.samples)
     if not arguments.quiet:
@@ -296,6 +303,9 @@ def _solved(problem: Any, arguments: argparse.Namespace, nominal: Any = None) ->
     except SolveError as error:
         _complain(error, FAILED)
         return error.solution, FAILED
+    except Interrupted as error:
+        _complain(error, INTERRUPTED)
+        return error.solution, INTERRUPTED
     except CovocpError:
         raise
     except (RuntimeError, TypeError, ValueError, ArithmeticError, ImportError) as error:

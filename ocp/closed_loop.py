@@ -21,8 +21,10 @@ import casadi as ca
 import numpy as np
 
 from covocp.extremal import Extremal
-from covocp.hamiltonian import fine_trajectory
-from covocp.integrators import GAUSS_NODES, KEPT, LINEAR_SOLVER, gauss_matrix, hermite, interval_symbols
+from covocp.fine import fine_trajectory
+from covocp.implicit import one_sided
+from covocp.integrators import GAUSS_NODES, KEPT, gauss_matrix, hermite, interval_symbols
+from covocp.linear_solve import LINEAR_SOLVER
 from covocp.matrices import Array, unpack, unpack_symbolic
 from covocp.riccati import inverse
 from covocp.shooting import common_columns, substep_columns
@@ -105,24 +107,10 @@ def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
     st, mesh = extremal.statement, extremal.mesh
     size = len(st.augmented)
     statistics = truth if truth is not None else design_statistics(extremal)
-    n, m = mesh.intervals, _substeps(extremal)
+    n, m = mesh.intervals, loop_substeps(extremal)
     fine = fine_trajectory(extremal, m)
-    common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
-    before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
-    q = np.tile(statistics.parameters[:, None], (1, n * m))
-    step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
-    joint = np.zeros((2 * size, 2 * size))
-    joint[:size, :size] = statistics.initial
-    values = np.zeros((n * m + 1, 2 * size, 2 * size))
-    values[0] = joint
-    matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
-    for k, D in enumerate(matrices):
-        half = 2 * size
-        moved = D[half:, :half] + D[half:, half:] @ joint
-        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
-        joint = 0.5 * (joint + joint.T)
-        values[k + 1] = joint
-    cost, other = _costs(extremal, fine, values.reshape(n * m + 1, 2 * size, 2 * size), truth is None)
+    values = _joint_covariances(extremal, fine, statistics)
+    cost, other = _costs(extremal, fine, values, truth is None)
     at = values[::m]
     columns = extremal.columns()
     loop = _loop(st)
@@ -138,7 +126,46 @@ def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
     )
 
 
-def _substeps(extremal: Extremal) -> int:
+def covariances_along(extremal: Extremal, fine: Array) -> Array:
+    """Covariances of the deviations at the nodes where the gains are taken from a given course of x, E and S.
+
+    Args:
+        extremal: of a statement with a loop.
+        fine: x and the half-vectors at the starts of equal parts of all intervals and at the ends, (N, m + 1, size).
+
+    Returns:
+        (N + 1, n, n); not finite where such a loop diverges.
+    """
+    size = len(extremal.statement.augmented)
+    with np.errstate(over="ignore", invalid="ignore"):
+        joint = _joint_covariances(extremal, fine, design_statistics(extremal))[:: fine.shape[1] - 1]
+    E, Z, Xhat = joint[:, :size, :size], joint[:, :size, size:], joint[:, size:, size:]
+    return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
+
+
+def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) -> Array:
+    """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
+    st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
+    size = len(st.augmented)
+    common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
+    before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
+    q = np.tile(statistics.parameters[:, None], (1, n * m))
+    step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
+    joint = np.zeros((2 * size, 2 * size))
+    joint[:size, :size] = statistics.initial
+    values = np.zeros((n * m + 1, 2 * size, 2 * size))
+    values[0] = joint
+    matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
+    half = 2 * size
+    for k, D in enumerate(matrices):
+        moved = D[half:, :half] + D[half:, half:] @ joint
+        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
+        joint = 0.5 * (joint + joint.T)
+        values[k + 1] = joint
+    return values
+
+
+def loop_substeps(extremal: Extremal) -> int:
     """Even number of steps an interval that resolves filter and feedback: S falls fast before a weighted end."""
     st, count = extremal.statement, extremal.mesh.intervals + 1
     x, u, e, t, duration, p = extremal.columns()
@@ -215,7 +242,7 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     def slope(z: Any, u: Any, at: Any) -> Any:
         return ca.vertcat(*statement.rates(z[:nx], u, z[nx:], duration * at, duration, p)[:2])
 
-    fa, fb = slope(za, ua, s), slope(zb, ub, s + ds)
+    fa, fb = slope(za, ua, s + one_sided(0.0) * ds), slope(zb, ub, s + one_sided(1.0) * ds)
     block = next(b for b in statement.matrices if b.estimation)
     loop = _loop(statement)
     points = []
@@ -280,7 +307,7 @@ def _points(extremal: Extremal, fine: Array) -> tuple[Array, Array, Array, Array
     u, nodes = extremal.controls, extremal.time
     after = u[:-1] if extremal.mesh.control == "constant" else u[1:]
     c = np.linspace(0.0, 1.0, points)[:, None]
-    time = nodes[:-1, None, None] + c * np.diff(nodes)[:, None, None]
+    time = nodes[:-1, None, None] + np.clip(c, one_sided(0.0), one_sided(1.0)) * np.diff(nodes)[:, None, None]
     controls = u[:-1, None, :] + c * (after - u[:-1])[:, None, :]
     return fine[:, :, : extremal.statement.nx], controls, time, np.full(time.shape, extremal.trajectory.duration)
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.lookup import block_of
 from covocp.matrices import Array
-from covocp.solution import Sample, Solution
+from covocp.sample import Sample
+from covocp.solution import Solution
 from covocp.statement import Block
+from covocp.threads import cached
 
 # Curves are sampled at the nodes, on coarser meshes at least this often.
 SAMPLES = 200
@@ -47,6 +49,15 @@ class Curve:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Ellipse:
+    """A covariance (2, 2) of abscissa and ordinate about a point (2,) of a path, of the solution of some number."""
+
+    centre: Array
+    covariance: Array
+    order: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Panel:
     """One pair of axes.
 
@@ -56,6 +67,10 @@ class Panel:
         curves: what is drawn.
         bounds: of the quantity.
         legend: whether the entries are explained in it.
+        key: name of what it shows where that is one entry of one symbol; "" otherwise.
+        path: whether it is one state over another.
+        equal: whether a unit is as long along both axes.
+        ellipses: covariances along a path.
     """
 
     label: str
@@ -63,6 +78,10 @@ class Panel:
     curves: tuple[Curve, ...]
     bounds: tuple[float, ...] = ()
     legend: bool = True
+    key: str = ""
+    path: bool = False
+    equal: bool = False
+    ellipses: tuple[Ellipse, ...] = ()
 
 
 class Drawn:
@@ -71,15 +90,21 @@ class Drawn:
     def __init__(self, solution: Solution, order: int) -> None:
         """Choose the times."""
         self.solution, self.order = solution, order
-        self.names = {b.name for b in solution.blocks}
         self.covariance = next((b for b in solution.blocks if b.estimation and b.covariance), None)
         nodes, parts = solution.t, -(-SAMPLES // solution.mesh.intervals)
         if solution.mesh.control == "constant":  # rates jump at the nodes, which a smooth curve would follow
             parts = 1
         inner = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
-        self.t = np.append(inner.ravel(), nodes[-1])
+        regular = np.append(inner.ravel(), nodes[-1])
+        # where something happens between the nodes; what a closed loop shows is known at its nodes
+        knots = solution.dense.knots if solution.loop is None else solution.mesh.nodes
+        self.t = np.union1d(regular, knots[~np.isin(knots, solution.mesh.nodes)] * solution.duration)
 
-    @cached_property
+    def knows(self, name: str) -> bool:
+        """Whether a name, or the vector of an entry, is in the solution."""
+        return block_of(name, self.solution.blocks) is not None
+
+    @cached
     def sample(self) -> Sample:
         """Values between the nodes."""
         return self.solution.at(self.t)
@@ -88,7 +113,8 @@ class Drawn:
         """Rows of the covariance that belong to a state or an unknown."""
         if self.covariance is None:
             return []
-        return [i for i, label in enumerate(self.covariance.labels) if label.split("[")[0] == name]
+        labels = self.covariance.labels
+        return [i for i, label in enumerate(labels) if name in (label, label.split("[")[0])]
 
     def deviation(self, block: Block) -> Array | None:
         """Half the width of a band at the times, (K, size); None where nothing is uncertain.
@@ -176,12 +202,18 @@ def shortened(expression: Any) -> str:
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
     """The unit of a symbol as it stands on an axis; "" where none is known."""
-    return f" [{units[name]}]" if units.get(name) else ""
+    word = _unit(name, units)
+    return f" [{word}]" if word else ""
+
+
+def _unit(name: str, units: Mapping[str, str]) -> str:
+    """The unit of a symbol, or of the vector that it is an entry of; "" where none is known."""
+    return units.get(name) or units.get(name.split("[")[0], "")
 
 
 def product_unit(owners: list[str], units: Mapping[str, str]) -> str:
     """Unit of a covariance between two symbols."""
-    words = [units.get(owner, "") for owner in owners]
+    words = [_unit(owner, units) for owner in owners]
     if not all(words):
         return ""
     words = [_bracketed(word) for word in words]
@@ -190,9 +222,8 @@ def product_unit(owners: list[str], units: Mapping[str, str]) -> str:
 
 def ratio_unit(above: str, below: str, units: Mapping[str, str]) -> str:
     """Unit of a gain from one symbol to another."""
-    if not units.get(above) or not units.get(below):
-        return ""
-    return f" [{_bracketed(units[above])}/{_bracketed(units[below])}]"
+    words = _unit(above, units), _unit(below, units)
+    return f" [{_bracketed(words[0])}/{_bracketed(words[1])}]" if all(words) else ""
 
 
 def _bracketed(word: str) -> str:

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_positive, check_times, symmetric_data
+from covocp.arguments import check_argument, truth
+from covocp.checks import check_positive, check_times, one_number, symmetric_data
 from covocp.matrices import Array, half_length, unpack_symbolic
 
 Guess = float | Array | Callable[[Array], Any] | None
@@ -35,10 +36,10 @@ class Free:
 
     def __init__(self, guess: float, lower: float | None = None, upper: float = np.inf) -> None:
         """Check and keep the three numbers."""
-        check_positive("duration", guess, unit="s")
-        object.__setattr__(self, "guess", float(guess))
-        object.__setattr__(self, "lower", 1e-3 * float(guess) if lower is None else float(lower))
-        object.__setattr__(self, "upper", float(upper))
+        start = check_positive("duration", guess, unit="s")
+        object.__setattr__(self, "guess", start)
+        object.__setattr__(self, "lower", 1e-3 * start if lower is None else one_number("Free", "lower bound", lower))
+        object.__setattr__(self, "upper", one_number("Free", "upper bound", upper))
         check_times(self.guess, self.lower, self.upper)
 
 
@@ -181,22 +182,31 @@ def declare_matrix(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dynamics:
-    """Rate of a state or of the half-vector of a matrix; `noise` is a square density matrix, None without noise."""
+    """Rate of a state or of the half-vector of a matrix; `noise` is a square density matrix, None without noise.
+
+    `one_density`: whether the noise was given as one number for all rows.
+    """
 
     rate: ca.MX
     noise: ca.MX | None
     where: str
+    one_density: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
-    """A continuous measurement and the density matrix of its noise."""
+    """A continuous measurement and the density matrix of its noise.
+
+    information: the inverse density where it was stated in place of the density (a diagonal matrix that may be zero),
+        else None. `noise` is then what stands for the density where a filter or a simulation needs one.
+    """
 
     name: str
     expression: ca.MX
     noise: ca.MX
     unit: str
     where: str
+    information: ca.MX | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -228,6 +238,10 @@ class Gain:
     lower: Any = -np.inf
     upper: Any = np.inf
     guess: Any = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no truth value; the arrays are checked with the problem that they belong to."""
+        check_argument("Gain()", "constant", truth, self.constant)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -264,3 +278,5 @@ class Expansion:
     running: ca.MX
     terminal: ca.MX
     gain: ca.MX
+    alternative: ca.MX | None = None
+    product: ca.MX | None = None

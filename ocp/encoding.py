@@ -18,6 +18,7 @@ from covocp.errors import ExportError, describe
 
 KINDS = "biuf"  # of arrays: truth values, whole numbers, floating-point numbers
 LARGEST_ITEM = 8  # bytes: what Python's own numbers hold exactly
+PLAIN_DTYPE = re.compile(rf"[<>|=]?[{KINDS}][1248]")
 
 
 class DamagedFileError(Exception):
@@ -121,6 +122,8 @@ def _written_out(array: Any) -> dict[str, Any]:
 
 def _read_in(content: Mapping[str, Any]) -> Any:
     """The inverse of `_written_out`."""
+    if not PLAIN_DTYPE.fullmatch(str(content["dtype"])):  # before numpy makes room for anything larger
+        raise ValueError(content["dtype"])
     dtype = np.dtype(str(content["dtype"]))
     values = content["values"]
     numbers = np.array([0 if isinstance(v, str) else v for v in values], dtype=dtype)

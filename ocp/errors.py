@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import warnings
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from covocp.solution import Solution
 
@@ -15,6 +17,8 @@ PACKAGE = __name__.partition(".")[0]
 # Likeness of two names (difflib's ratio) from which on one may be a slip of the other: "fricton" and "friction" have
 # 0.93, "position" and "friction" 0.63.
 ALIKE = 0.75
+# Whether warnings are held back, in this thread: the filters of the module `warnings` belong to all threads.
+_HELD_BACK = ContextVar("held_back", default=False)
 
 
 class CovocpError(Exception):
@@ -23,6 +27,10 @@ class CovocpError(Exception):
 
 class ProblemError(CovocpError, ValueError):
     """The statement of a problem, or an option, is wrong: says which name, what was given and what is needed."""
+
+
+class OutsideDomainError(ProblemError):
+    """A start lies where the model gives no numbers; another one may not."""
 
 
 class SolveError(CovocpError, RuntimeError):
@@ -43,6 +51,19 @@ class SolveError(CovocpError, RuntimeError):
         self.violations = dict(violations or {})
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C stopped a solver: a `KeyboardInterrupt`, so that a loop of solves ends too.
+
+    Attributes:
+        solution: the last iterate as a `Solution`, or the best of the starts that were solved before.
+    """
+
+    def __init__(self, message: str, *, solution: Solution | None = None) -> None:
+        """Keep what was found beside the message."""
+        super().__init__(message)
+        self.solution = solution
+
+
 class ExportError(CovocpError, RuntimeError):
     """Something cannot be exported or written: says what, and why."""
 
@@ -57,10 +78,45 @@ def warn_user(message: str) -> None:
     Args:
         message: what the user should know.
     """
+    if _HELD_BACK.get():
+        return
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, CovocpWarning, stacklevel=level)
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Hold back the warnings of covocp meanwhile, in this thread: they concern something that the user does not see."""
+    token = _HELD_BACK.set(True)
+    try:
+        yield
+    finally:
+        _HELD_BACK.reset(token)
+
+
+@contextmanager
+def evaluating(name: str) -> Iterator[None]:
+    """What CasADi raises where a model has no value (a singular factorisation, a number too large), as an own error.
+
+    Args:
+        name: of the problem.
+
+    Raises:
+        SolveError: without a solution.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if isinstance(error, CovocpError):
+            raise
+        reason = " ".join(str(error).strip().splitlines()[-1:])
+        raise SolveError(
+            f"'{name or 'The problem'}' has no value somewhere between its guess and its end: a solve of linear "
+            f"equations inside it fails, or a number is too large ({reason[:200]}). Give another guess, bounds that "
+            "keep the model in its domain, or other units."
+        ) from error
 
 
 def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
@@ -78,10 +134,18 @@ def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
     return f"{problem}\n  expected: {expected}\n  received: {received}\n  remedy:   {remedy}"
 
 
+def shown(value: object, length: int = 100, form: Callable[[object], str] = repr) -> str:
+    """The beginning of what Python shows of a value, on one line; of numbers that are too long for it the type."""
+    try:
+        return " ".join(form(value).split())[:length]
+    except ValueError:
+        return type(value).__name__
+
+
 def kind_and_name(value: object) -> str:
     """Type and name of something, or its beginning where it has no name: one line."""
     name = getattr(value, "name", None)
-    text = f"'{name}'" if isinstance(name, str) and name else " ".join(str(value).split())[:60]
+    text = f"'{name}'" if isinstance(name, str) and name else shown(value, 60, str)
     return f"{type(value).__name__}: {text}"
 
 

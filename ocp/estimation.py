@@ -10,6 +10,7 @@ import casadi as ca
 from covocp.checks import is_symbolic
 from covocp.declarations import Matrix, State, Unknown
 from covocp.errors import ProblemError, describe
+from covocp.threads import methods_one_at_a_time
 
 Entry = State | Unknown
 
@@ -21,6 +22,7 @@ def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
     )
 
 
+@methods_one_at_a_time
 class EstimationCovariance:
     """The covariance of the estimation error of the augmented state (states, then unknowns).
 

@@ -7,24 +7,30 @@ statistics [6.11] is this with the gains of the design and the covariances of th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_density, check_kind
+from covocp.checks import as_number, check_density, check_kind
 from covocp.closed_loop import Statistics, close_loop, densities
-from covocp.errors import ProblemError, describe, no_option
+from covocp.doubts import mention_doubts
+from covocp.errors import ProblemError, describe, evaluating, no_option
 from covocp.extremal import Extremal, Outcome
-from covocp.guess import check_model, controls_guess, evaluate_guess, starts, stiffness
+from covocp.forgotten import mention_forgotten
+from covocp.grading import graded
+from covocp.guess import check_model, controls_guess, evaluate_guess, resolve_mesh, starts
 from covocp.lookup import name_of, stacked_parameters
 from covocp.matrices import Array, unpack
-from covocp.mesh import Mesh, Options, choose_mesh, choose_step
+from covocp.mesh import Mesh, Options
+from covocp.nlp import check_costs
+from covocp.path_limits import NOTED
 from covocp.problem import Problem
 from covocp.shooting import single_shooting
 from covocp.solution import Solution
-from covocp.statement import Statement
+from covocp.statement import Statement, entry_names
+from covocp.threads import one_at_a_time
 from covocp.trajectory import Multipliers, Trajectory
 
 METHOD = "evaluate"
@@ -36,6 +42,7 @@ RELAXED = 1e-8
 SAME = 1e-9
 
 
+@one_at_a_time
 def evaluate(
     problem: Problem | Solution,
     *,
@@ -64,7 +71,7 @@ def evaluate(
         ProblemError: a control is not given, a name is unknown, `truth` has other symbols.
     """
     if isinstance(problem, Solution):
-        if nominal is not None or options or parameters:
+        if nominal is not None or options or parameters is not None:
             raise ProblemError(
                 describe(
                     "evaluate(solution) keeps its nominal, mesh and parameters.",
@@ -75,7 +82,8 @@ def evaluate(
             )
         solution = problem
     else:
-        solution = _along(problem, nominal, intervals, parameters or {}, options)
+        with evaluating(str(getattr(problem, "name", ""))):
+            solution = _along(problem, nominal, intervals, {} if parameters is None else parameters, options)
     return solution if truth is None else _under(solution, truth)
 
 
@@ -85,18 +93,37 @@ def _along(
     """The problem along a nominal."""
     check_kind(problem, Problem, "evaluate(problem, nominal=...), or evaluate(solution, truth=...)")
     st = problem.statement()
+    mention_forgotten(problem)
     values = stacked_parameters(st, parameters)
     given = Options(intervals=intervals, **_known(options))
     if isinstance(nominal, Solution) and not options:
         own = nominal.mesh
         given = replace(given, grid=own.nodes, control=own.control)  # type: ignore[arg-type]
+    given = graded(st, given, values)
     mesh = evaluation_mesh(st, given, values)
-    u, duration = _controls(st, mesh, nominal)
+    u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
     x0, e0 = starts(st, mesh, values)
     if isinstance(nominal, Solution):
         x0 = _started_like(st, nominal, x0, values)
     check_model(st, x0, u[:1].ravel(), e0, duration, values)
-    return Solution.of(evaluate_controls(st, mesh, u, duration, values, x0), METHOD)
+    outcome = evaluate_controls(st, mesh, u, duration, values, x0)
+    if outcome.converged:
+        check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
+    solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
+    if not solution.converged:
+        return solution
+    mention_doubts(solution)
+    return replace(solution, violations=_with_passed(solution))
+
+
+def _with_passed(solution: Solution) -> dict[str, float]:
+    """What a nominal misses, and the limits that it passes between the nodes."""
+    result = dict(solution.violations)
+    for entry in solution.passed_limits():
+        name = f"bounds of {entry.name}" if entry.name in solution.state_names else entry.name
+        if entry.share > NOTED:
+            result[name] = max(result.get(name, 0.0), entry.by)
+    return result
 
 
 def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters: Array) -> Array:
@@ -112,7 +139,7 @@ def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
     """Options of the mesh; others mean nothing here."""
-    known = {"control", "substeps", "grid", "segments", "covariances", "covariance_step"}
+    known = {field.name for field in fields(Options)} - {"intervals", "points"}  # nothing is imposed here
     for name in options:
         if name not in known:
             raise no_option("evaluate()", name, options[name], known)
@@ -121,10 +148,8 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
 
 def evaluation_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """One segment over the whole time, with the matrices propagated along it."""
-    step = choose_step(statement, options)
-    stiff = stiffness(statement, options.nodes(), options.control, parameters, matrices=step == "rk4")
-    mesh = choose_mesh(statement, options, stiff)
-    return replace(mesh, segments=(mesh.intervals,), eliminated=True)
+    mesh = resolve_mesh(statement, options, parameters)
+    return replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
 
 
 def evaluate_controls(
@@ -167,12 +192,12 @@ def evaluate_controls(
         cost_terms={"terminal": terminal, "running": float(running.item())},
         converged=finite,
         message="evaluated along a given nominal" if finite else "the model becomes NaN or inf along this nominal",
-        violations=_missed(extremal) if finite else {},
+        violations=missed(extremal) if finite else {},
         stats={},
     )
 
 
-def _missed(extremal: Extremal) -> dict[str, float]:
+def missed(extremal: Extremal) -> dict[str, float]:
     """Prescribed final values, bounds, terminal and path inequalities that the nominal does not meet, by name."""
     st, t = extremal.statement, extremal.trajectory
     result = {}
@@ -199,8 +224,8 @@ def _missed(extremal: Extremal) -> dict[str, float]:
     return result
 
 
-def _controls(statement: Statement, mesh: Mesh, nominal: Any) -> tuple[Array, float]:
-    """Control values on a mesh, and the terminal time, of what the user gave."""
+def _controls(statement: Statement, mesh: Mesh, nominal: Any, asked: int) -> tuple[Array, float]:
+    """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
     nodes, duration = mesh.nodes, statement.duration.guess
     at = nodes if mesh.control == "linear" else 0.5 * (nodes[1:] + nodes[:-1])
     if nominal is None:
@@ -231,7 +256,11 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Any) -> tuple[Array, fl
     for block in statement.controls:
         if block.name not in given:
             raise _not_given(block.name, ", ".join(given) or "nothing")
-        columns.append(evaluate_guess(block, given[block.name], at))
+        value = given[block.name]
+        value = value if callable(value) else as_number(block.name, "guess", value)
+        if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
+            value = value[(at * asked).astype(int)]  # one for each interval that was asked for
+        columns.append(evaluate_guess(block, value, at))
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
 
 
@@ -370,6 +399,10 @@ def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None
         ("starts elsewhere: the initial mean", st.state_names, first, np.where(np.isnan(start), x[:, 0], start)),
         ("takes another time: the value", ("duration",), duration[:, :1], np.array([lasts])),
     ]
+    if unknowns := st.of_kind("unknown"):
+        rows = [k for b in unknowns for k in range(b.span.start, b.span.stop)]
+        one, two = (values[rows, None] for values in (design.parameters, parameters))
+        compared.append(("has another constant: the mean", entry_names(unknowns), one, two))
     functions: tuple[tuple[str, tuple[str, ...], int, Any, Any], ...] = (
         ("moves differently: the rate", st.state_names, 0, st.nominal, truth.nominal),
         ("moves differently: the slope", st.augmented, 0, first_loop, other_loop),

@@ -13,6 +13,11 @@ tr(S X) may be integrated by parts (E-20), and once more with E in place of X, w
 
     J = k + int L dt + 1/2 tr S(T) E(T) + 1/2 int tr(A E + S E W E) dt,      W = M' U^-1 M.
 
+On any part of the time the last two are equal but for the ends, d tr(S E) = tr(S Q + C'B C E - A E - S E W E) dt. The
+first is smooth where S is steep, towards the end, the second where E is steep, at the start: there S E W E is a spike
+of width U/E(0). So the integral is taken in the second form over the first half of the time, in the first over the
+rest (`integrators.simpson_interval`).
+
 So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had afterwards. The costate of S is
 -Xhat/2. Where the gain is constrained (`Gain`), C is a control and the matrices are E and Xhat instead.
 """
@@ -32,6 +37,8 @@ from covocp.declarations import Backward, Control, Dynamics, Expansion, Expected
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
 from covocp.expansion import expand, measurement_slope
+from covocp.information import inverse_density
+from covocp.lookup import name_of, split_entry
 from covocp.matrices import pack_symbolic
 from covocp.riccati import inverse
 
@@ -86,11 +93,20 @@ def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
     """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
     if not isinstance(weights, Mapping):
         return weights
-    result = {}
+    result: dict[str, Any] = {}
+    word = what.replace("_", " ")
+    symbols, sizes = {e.name: e.symbol for e in entries}, {e.name: e.size for e in entries}
     for key, value in weights.items():
-        name = find_name(key, what, entries, tuple(entries))
-        size = next(entry.size for entry in entries if entry.name == name)
-        result[name] = density_matrix(name, what.replace("_", " "), value, size)
+        name = name_of(key, symbols, tuple(sizes), missing_ok=True, sizes=sizes)
+        entry = split_entry(name)
+        if name in sizes or entry is None:
+            name = find_name(key, what, entries, tuple(entries))
+            weight = density_matrix(name, word, value, sizes[name])
+        else:
+            name, k = entry
+            own = density_matrix(f"{name}[{k}]", word, value, 1)
+            weight = ca.diagcat(ca.MX(k, k), own, ca.MX(sizes[name] - k - 1, sizes[name] - k - 1))
+        result[name] = result[name] + weight if name in result else weight
     return result
 
 
@@ -120,9 +136,15 @@ def derive(problem: Problem) -> Problem:
     size = E.shape[0]
     jacobian, density = measurement_slope(derived, size)
     innovation = E @ jacobian.T  # K U
-    information = innovation @ _inverse(density) @ innovation.T if jacobian.shape[0] else ca.MX(size, size)
+    information = ca.MX(size, size)
+    if jacobian.shape[0]:
+        blocks = [(entry.noise, entry.information) for entry in derived.measurements]
+        information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
     if expected.gain is None:
         S, expansion = _add_feedback(derived, expansion)
+        fed = S @ expansion.G + expansion.N
+        regained = _trace(S, expansion.Q) + _trace(fed @ _inverse(expansion.B) @ fed.T, E)
+        expansion = replace(expansion, alternative=expansion.running + regained / 2, product=_trace(S, E) / 2)
         running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
         terminal = expansion.terminal + _trace(expansion.end, E) / 2
     else:

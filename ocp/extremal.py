@@ -14,6 +14,9 @@ from covocp.progress import Progress
 from covocp.statement import Statement
 from covocp.trajectory import Multipliers, Trajectory
 
+# How a method says, among its counts, that it lost its way: it was stopped, or ended by itself.
+STOPPED, ENDED = "stopped", "ended"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Extremal:
@@ -59,7 +62,7 @@ class Outcome:
         converged: whether the method's own test was met.
         message: how it ended, a sentence.
         violations: largest violation of each violated constraint by its name.
-        stats: iterations, times, what the method counts.
+        stats: iterations, times, what the method counts; `wandered` where it lost its way (STOPPED or ENDED).
     """
 
     extremal: Extremal
@@ -90,9 +93,11 @@ class Guess:
         multipliers: of a related solution on the same mesh, or None.
         costates: p and the costates of the half-vectors at the nodes that belong to them, or None.
         warm: whether it comes from a solution.
+        tentative: whether there are others: a method that loses its way should stop.
     """
 
     trajectory: Trajectory
     multipliers: Multipliers | None = None
     costates: tuple[Array, Array] | None = None
     warm: bool = False
+    tentative: bool = False

@@ -15,6 +15,7 @@ from covocp.checks import check_dynamics
 from covocp.declarations import Constraint, Matrix, Place
 from covocp.errors import ProblemError, describe
 from covocp.estimation import augmented_names
+from covocp.information import check_readings, inverse_density
 from covocp.matrices import pack_symbolic, unpack_symbolic
 from covocp.riccati import inverse, recognise, riccati_rate
 from covocp.statement import INPUTS, Block, Conditions, Duration, Loop, Statement
@@ -76,6 +77,7 @@ def freeze(problem: Problem) -> Statement:
         riccati=riccati,
         measurement=measurement,
         measurements=_measured(problem),
+        information=_information(problem, stacked),
         path=_conditions(problem, stacked, "path"),
         start=_conditions(problem, stacked, "initial"),
         end=_conditions(problem, stacked, "final"),
@@ -147,25 +149,7 @@ def _check_complete(problem: Problem) -> None:
             )
         )
     _check_symbols(problem)
-    _check_measurements(problem)
-
-
-def _check_measurements(problem: Problem) -> None:
-    """An instrument reads the actual system: what it shows, and its noise, know no covariance."""
-    matrices = {entry.symbol.__hash__(): entry.name for entry in problem.matrices}
-    for measurement in problem.measurements:
-        for what, value in (("", measurement.expression), ("noise density of ", measurement.noise)):
-            for symbol in ca.symvar(value):
-                if symbol.__hash__() in matrices:
-                    raise ProblemError(
-                        describe(
-                            f"The {what}measurement '{measurement.name}' contains the matrix "
-                            f"'{matrices[symbol.__hash__()]}' (declared at {measurement.where}).",
-                            expected="states, unknowns, controls, parameters and time",
-                            received=str(value)[:200],
-                            remedy="measure what the actual system shows; matrices go into costs and constraints",
-                        )
-                    )
+    check_readings(problem.measurements, problem.matrices)
 
 
 def _check_symbols(problem: Problem) -> None:
@@ -330,7 +314,19 @@ def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: An
     if measurement is None:
         return drift, noise, stacked.symbolic(size, size)
     _, jacobian, density = measurement
-    return drift, noise, jacobian.T @ inverse(density) @ jacobian
+    blocks = [
+        (stacked.substitute(m.noise)[0], None if m.information is None else stacked.substitute(m.information)[0])
+        for m in problem.measurements
+    ]
+    return drift, noise, jacobian.T @ inverse_density(density, blocks, inverse) @ jacobian
+
+
+def _information(problem: Problem, stacked: Stacked) -> ca.Function | None:
+    """What is stated as information, one below the other."""
+    stated = [ca.diag(entry.information) for entry in problem.measurements if entry.information is not None]
+    if not stated:
+        return None
+    return stacked.function("information", stacked.substitute(ca.vertcat(*stated)), without=("matrices",))
 
 
 def _noise_varies(problem: Problem) -> bool:
@@ -443,6 +439,9 @@ def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
     slopes = [ca.densify(entry) for entry in stacked.substitute(v.F, v.G, v.A, v.B, v.N, v.Q)]
     (gain, running, terminal, end) = stacked.substitute(v.gain, v.running, v.terminal, v.end)
     u = stacked.inputs[1][: slopes[3].shape[0]]
+    by_parts = None
+    if v.alternative is not None:
+        by_parts = stacked.function("by_parts", stacked.substitute(v.alternative, v.product))
     return Loop(
         expansion=stacked.function("expansion", slopes, without=("matrices",)),
         gain=stacked.function("gain", [ca.densify(gain)]),
@@ -451,6 +450,7 @@ def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
         extra_control=stacked.function(
             "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
         ),
+        by_parts=by_parts,
     )
 
 

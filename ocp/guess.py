@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.checks import as_number, check_density
 from covocp.errors import ProblemError, describe
 from covocp.integrators import KEPT, full_interval, nominal_interval
-from covocp.matrices import Array, half_indices, pack, unpack
-from covocp.mesh import Mesh
+from covocp.matrices import Array, half_indices, pack, real_numbers, unpack
+from covocp.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
 from covocp.nlp import Scales
 from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Block, Statement
@@ -21,16 +24,13 @@ from covocp.trajectory import Trajectory
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.
 BENDING = 1.0
-RANDOM_AMPLITUDE = 1.0
-STEERING_STEPS = 4
 RESPONSE_STEP = 1e-3
-STEERING_TOLERANCE = 1e-6
+# Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
+DAMPED = -0.5
 
 
-def controls_guess(
-    statement: Statement, nodes: Array, control: str, random: np.random.Generator | None = None, sign: float = 1.0
-) -> Array:
-    """Controls at the nodes (N+1 or N, nu): the user's guess, bent where it is one number, or random (multistart)."""
+def controls_guess(statement: Statement, nodes: Array, control: str, sign: float = 1.0) -> Array:
+    """Controls at the nodes (N+1 or N, nu): the user's guess, bent where it is one number."""
     at = nodes if control == "linear" else 0.5 * (nodes[:-1] + nodes[1:])
     columns = []
     for block in statement.controls:
@@ -38,9 +38,7 @@ def controls_guess(
         lower, upper = (bound[block.span] for bound in statement.control_bounds)
         values = evaluate_guess(block, 0.0 if guess is None else guess, at)
         scale = control_scale(statement, block, values)
-        if random is not None:
-            values = values + RANDOM_AMPLITUDE * scale * _random_wave(at, block.size, random)
-        elif is_plain(guess):
+        if is_plain(guess):
             values = values + sign * BENDING * scale * (1.0 - at[:, None])
         columns.append(np.clip(values, lower, upper))
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1)
@@ -49,13 +47,6 @@ def controls_guess(
 def is_plain(guess: Any) -> bool:
     """Whether a guess is one number, which says little: it may be steered and bent."""
     return not callable(guess) and np.ndim(0.0 if guess is None else guess) == 0
-
-
-def _random_wave(at: Array, size: int, random: np.random.Generator) -> Array:
-    """A smooth random function: a few cosines with random coefficients."""
-    orders = np.arange(4)
-    coefficients = random.standard_normal((orders.size, size)) / (1.0 + orders[:, None])
-    return np.asarray(np.cos(np.pi * np.outer(at, orders)) @ coefficients)
 
 
 def control_scale(statement: Statement, block: Block, values: Array) -> Array:
@@ -76,7 +67,7 @@ def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
     Raises:
         ProblemError: where its shape does not fit or it is not finite.
     """
-    values = guess(at) if callable(guess) else guess
+    values = _called(block.name, guess, at) if callable(guess) else guess
     numbers = as_number(block.name, "guess", values)
     if numbers.ndim == 0:
         numbers = np.full((at.size, block.size), float(numbers))
@@ -102,30 +93,26 @@ def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
     return numbers
 
 
-def first_guess(
-    statement: Statement, mesh: Mesh, parameters: Array, random: np.random.Generator | None = None
-) -> Trajectory:
-    """The trajectory from which a solver starts.
-
-    Controls from their guesses; states from theirs, or simulated; matrices simulated.
+def _called(name: str, guess: Callable[[Any], Any], at: Array) -> Any:
+    """A function of s at all of them at once, or one by one where it takes numbers only (`math.sin`, `if s < 0.5`).
 
     Raises:
-        ProblemError: where a rate is NaN or inf at the start (says which).
+        ProblemError: it fails.
     """
-    u = controls_guess(statement, mesh.nodes, mesh.control, random)
-    duration = statement.duration.guess
-    start, e0 = starts(statement, mesh, parameters)
-    check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
-    if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
-        u = steer(statement, mesh, start, u, duration, parameters)
-    guessed = [b for b in statement.states if statement.guesses[b.name] is not None]
-    if len(guessed) < len(statement.states):
-        x = simulate_states(statement, mesh, start, e0, u, duration, parameters)
-    else:
-        x = np.zeros((mesh.intervals + 1, statement.nx))
-    for block in guessed:
-        x[:, block.span] = evaluate_guess(block, statement.guesses[block.name], mesh.nodes)
-    return Trajectory(x=x, u=u, e=simulate_matrices(statement, mesh, x, u, e0, duration, parameters), duration=duration)
+    try:
+        return guess(at)
+    except Exception:  # whatever the user's function raises
+        try:
+            return np.array([real_numbers(guess(float(s))) for s in at])
+        except Exception as error:
+            raise ProblemError(
+                describe(
+                    f"The guess of '{name}' is a function that fails.",
+                    expected="a function of s = t/T, an array of numbers in [0, 1], that returns as many values",
+                    received=f"{type(error).__name__}: {error}"[:200],
+                    remedy=f"correct the guess of '{name}': numpy.sin, not math.sin; one argument",
+                )
+            ) from error
 
 
 def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
@@ -155,7 +142,7 @@ def matrix_guess(block: Block, guess: Any) -> Array:
     """
     numbers = as_number(block.name, "guess", guess)
     if numbers.size == 1:
-        numbers = float(numbers.reshape(())) * np.eye(block.size)
+        numbers = np.diag(np.full(block.size, float(numbers.reshape(()))))
     wrong = numbers.shape != (block.size, block.size)
     if wrong or not np.isfinite(numbers).all() or not np.allclose(numbers, numbers.T):
         raise ProblemError(
@@ -179,24 +166,29 @@ def _check_covariances(statement: Statement, e0: Array) -> None:
 def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: float, parameters: Array) -> None:
     """The model must be finite where the solver starts, and its noise densities sensible.
 
+    The terminal cost counts at the end of the guess, where the methods look at it.
+
     Raises:
         ProblemError: names the rate, the cost, the constraint or the measurement.
     """
     arguments = (x, u, e, 0.0, duration, parameters)
+    if statement.information is not None:
+        stated = np.asarray(statement.information(x, u, 0.0, duration, parameters).full())
+        check_density(", ".join(statement.measurement_names), "information", np.diagflat(stated), definite=False)
     if statement.measurement is not None:
         density = np.asarray(statement.measurement(x, u, 0.0, duration, parameters)[2].full())
-        check_density(", ".join(statement.measurement_names), "measurement noise density", density, definite=True)
+        for block in statement.measurements:
+            own = density[block.span, block.span]
+            check_density(block.name, "measurement noise density", own, definite=True)
     if statement.loop is not None:
         weights = np.asarray(statement.loop.expansion(x, u, 0.0, duration, parameters)[3].full())
         fed = statement.control_names[: weights.shape[0]]
         check_density(", ".join(fed), "control weight", weights, definite=True)
     rates, matrix_rates, running = (np.asarray(v.full()).ravel() for v in statement.rates(*arguments))
-    terminal = np.asarray(statement.terminal(x, e, duration, parameters).full()).ravel()
     groups = [
         ("rate of", statement.state_names, rates),
         ("rate of", statement.matrix_names, matrix_rates),
         ("cost", ("running",), running),
-        ("cost", ("terminal",), terminal),
     ]
     for conditions in (statement.path, statement.start):
         groups.append(("constraint", conditions.names, np.asarray(conditions.function(*arguments).full()).ravel()))
@@ -227,7 +219,7 @@ def _simulation(statement: Statement, mesh: Mesh) -> ca.Function:
     if statement.coupled:
         interval = full_interval(statement, mesh.substeps, mesh.step)
     else:
-        interval = nominal_interval(statement, mesh.substeps)
+        interval = nominal_interval(statement, mesh.substeps, mesh.step)
     return interval.mapaccum("simulate", mesh.intervals)
 
 
@@ -245,61 +237,6 @@ def simulate_states(
     final = statement.boundary_values(parameters)[1]
     final = np.where(np.isnan(final), start, final)
     return np.asarray(start + mesh.nodes[:, None] * (final - start))
-
-
-def steer(statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array) -> Array:
-    """Add the control of least energy that brings the nominal to its final values; the bend follows its sign.
-
-    The bend 1 - s breaks symmetries; where the terminal conditions prefer a direction, it must not oppose them. Steps
-    of Gauss and Newton on the miss, kept only while the miss falls.
-    """
-    final = statement.boundary_values(parameters)[1]
-    fixed = np.flatnonzero(~np.isnan(final))
-    if not fixed.size or not np.isfinite(start).all():
-        return u
-    miss = _miss_function(statement, mesh, fixed.tolist())
-    weights = np.tile(quadrature_weights(mesh)[:, None], (1, statement.nu)).ravel()
-    scale = np.maximum(np.maximum(np.abs(final[fixed]), np.abs(start[fixed])), 1e-3)
-
-    def pull(controls: Array) -> tuple[Array, Array, float]:
-        value, slope = miss(start, controls.T, duration, parameters)
-        gap = (np.asarray(value.full()).ravel() - final[fixed]) / scale
-        return gap, np.asarray(slope.full()) / scale[:, None], float(np.linalg.norm(gap))
-
-    plain = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
-    best, (gap, slope, norm) = plain, pull(plain)
-    for _ in range(STEERING_STEPS):
-        if not np.isfinite(slope).all() or norm < STEERING_TOLERANCE:
-            break
-        change = -(slope / weights).T @ np.linalg.pinv(slope / weights @ slope.T, rcond=1e-8) @ gap
-        trial = np.clip(best + change.reshape(u.shape), *statement.control_bounds)
-        following = pull(trial)
-        if not following[2] < norm:
-            break
-        best, (gap, slope, norm) = trial, following
-    bend = u - plain
-    sign = np.where(np.sum((best - plain) * bend, axis=0) < 0, -1.0, 1.0)
-    return np.asarray(np.clip(best + sign * bend, *statement.control_bounds))
-
-
-def quadrature_weights(mesh: Mesh) -> Array:
-    """Weight of each control value in the integral over s: trapezoidal for linear controls, lengths for constant."""
-    steps = np.diff(mesh.nodes)
-    if mesh.control == "constant":
-        return steps
-    return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
-
-
-def _miss_function(statement: Statement, mesh: Mesh, fixed: list[int]) -> ca.Function:
-    """(start, controls, T, parameters) -> final values of the fixed components, their Jacobian by the controls."""
-    u = ca.MX.sym("u", statement.nu * mesh.control_nodes)
-    x0, duration, p = ca.MX.sym("x0", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)
-    matrix = ca.reshape(u, statement.nu, mesh.control_nodes)
-    run = nominal_interval(statement, mesh.substeps).mapaccum("simulate", mesh.intervals)
-    last = run(x0, *common_columns(mesh, matrix, duration, p))[0][:, -1][fixed]
-    inner = ca.Function("miss", [x0, u, duration, p], [last, ca.jacobian(last, u)])
-    controls = ca.MX.sym("controls", statement.nu, mesh.control_nodes)
-    return ca.Function("miss", [x0, controls, duration, p], list(inner(x0, ca.vec(controls), duration, p)))
 
 
 def simulate_matrices(
@@ -324,34 +261,61 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     common = common_columns(mesh, u, duration, p)
-    _, states, cost = nominal_interval(statement, mesh.substeps).map(mesh.intervals)(x[:, :-1], *common)
+    _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p)
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])
 
 
-def stiffness(statement: Statement, nodes: Array, control: str, parameters: Array, *, matrices: bool) -> float:
-    """Largest h times spectral radius of what Runge-Kutta steps, at the start: f_x, with `matrices` 2 (F - E W)."""
+def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
+    """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
+    stiff = stiffness(statement, options, parameters)
+    return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
+
+
+def stiffness(statement: Statement, options: Options, parameters: Array) -> Stiffness:
+    """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
+
+    A graded mesh knows that of the filter on each of its intervals.
+    """
+    nodes, control = options.nodes(), options.control
     u = controls_guess(statement, nodes[:2], control)[0]
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
     x, e = starts(statement, mesh, parameters)
     duration = statement.duration.guess
-    largest = _radius(_state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
-    if matrices and statement.ne:
-        for block, form in zip(statement.matrices, statement.riccati, strict=True):
-            if form is None:
-                slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
-                largest = max(largest, _radius(slope))
-                break
-            drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
-            largest = max(largest, 2 * _radius(drift - unpack(e[block.span], block.size) @ information))
-    return float(largest * duration * np.diff(nodes).max())
+    rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
+    longest = duration * float(np.diff(nodes).max())
+    matrices = 0.0
+    for block, form in zip(statement.matrices, statement.riccati, strict=True):
+        if form is None:
+            slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
+            matrices = max(matrices, _largest(_eigenvalues(slope)))
+            break
+        if block.estimation and isinstance(options.grid, Graded):
+            matrices = max(matrices, options.grid.stiffness / longest)
+            continue
+        drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
+        with np.errstate(invalid="ignore"):  # a density that is zero: refused by its name later
+            filtered = drift - unpack(e[block.span], block.size) @ information
+        matrices = max(matrices, 2 * _largest(_eigenvalues(filtered)))
+    return Stiffness(
+        nominal=longest * _largest(rates),
+        oscillating=longest * _largest(rates[rates.real >= DAMPED * np.abs(rates)]),
+        decaying=longest * _largest(rates[rates.real <= 0.0]),
+        matrices=longest * matrices,
+    )
 
 
-def _radius(matrix: Array) -> float:
-    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
+def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
+    """Eigenvalues; none of a matrix that is not finite."""
+    return np.linalg.eigvals(matrix).astype(complex) if np.isfinite(matrix).all() else np.zeros(0, complex)
 
 
-def _state_jacobian(statement: Statement) -> ca.Function:
+def _largest(values: NDArray[np.complex128]) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+@lru_cache(maxsize=KEPT)
+def state_jacobian(statement: Statement) -> ca.Function:
     """f_x as a function of the six arguments."""
     symbols = _six_symbols(statement)
     if statement.nominal is None:
@@ -373,8 +337,8 @@ def _six_symbols(statement: Statement) -> list[Any]:
     return [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
 
 
-def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
-    """Magnitudes from the given scales, bounds, boundary values, standard deviations and the guess."""
+def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:
+    """Magnitudes from the given scales, bounds, boundary values, standard deviations and the trajectory itself."""
     x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     candidates = [np.abs(guess.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
@@ -394,15 +358,23 @@ def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameter
         if block.name in statement.scales:
             x[block.span] = statement.scales[block.name]
     u = np.ones(statement.nu)
-    response = None
     for block in statement.controls:
         u[block.span] = control_scale(statement, block, guess.u[:, block.span])
+    return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+
+
+def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
+    """The magnitudes along a guess; controls without bounds on both sides by what they move as well."""
+    scales = magnitudes(statement, guess, parameters)
+    u, response = scales.u.copy(), None
+    for block in statement.controls:
         bounds = np.concatenate([bound[block.span] for bound in statement.control_bounds])
         if block.name not in statement.scales and not np.isfinite(bounds).all() and not statement.coupled:
-            response = _needed_controls(statement, mesh, guess, x, parameters) if response is None else response
+            if response is None:
+                response = _needed_controls(statement, mesh, guess, scales.x, parameters)
             magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
             u[block.span] = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
-    return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+    return replace(scales, u=u)
 
 
 def _needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
@@ -426,5 +398,5 @@ def _matrix_scales(statement: Statement, e: Array) -> Array:
         rows, columns = half_indices(block.size)
         diagonal = np.abs(e[:, block.span][:, rows == columns]).max(axis=0, initial=0.0)
         diagonal = np.where(diagonal > 0, diagonal, 1.0)
-        scales[block.span] = np.sqrt(diagonal[rows] * diagonal[columns])
+        scales[block.span] = np.sqrt(diagonal[rows]) * np.sqrt(diagonal[columns])
     return scales

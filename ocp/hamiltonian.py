@@ -19,6 +19,8 @@ import casadi as ca
 import numpy as np
 
 from covocp.extremal import Extremal
+from covocp.fine import fine_trajectory, interval_columns, prolongation, refined
+from covocp.implicit import one_sided, part_of
 from covocp.integrators import KEPT, Step, full_interval, hermite, interval_symbols, nominal_interval
 from covocp.matrices import Array
 from covocp.mesh import Mesh
@@ -122,33 +124,26 @@ def impulses(extremal: Extremal) -> Array:
     return np.asarray(jumps)
 
 
-def _columns(extremal: Extremal) -> tuple[Any, ...]:
-    """Common arguments of the interval functions along an extremal."""
-    return common_columns(
-        extremal.mesh, ca.DM(extremal.trajectory.u.T), extremal.trajectory.duration, ca.DM(extremal.parameters)
-    )
-
-
 def _stack(extremal: Extremal) -> Any:
     return ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
 
 
 @lru_cache(maxsize=KEPT)
-def adjoint_interval(statement: Statement, substeps: int, step: Step | None) -> ca.Function:
-    """Adjoint of one discrete control interval; of the nominal alone, without cost, where no covariance step is given.
+def adjoint_interval(statement: Statement, substeps: int, step: Step, *, nominal: bool = False) -> ca.Function:
+    """Adjoint of one discrete control interval; with `nominal` of the nominal alone, without cost.
 
     Returns:
         (costates at the end, which of them to keep (1 or 0), values in place of the others, impulse at the start,
         x and e stacked, *common) -> costates at the start, slopes of the Lagrangian by the control at the start, by
         that at the end, by T.
     """
-    interval = full_interval(statement, substeps, step) if step else nominal_interval(statement, substeps)
+    interval = nominal_interval(statement, substeps, step) if nominal else full_interval(statement, substeps, step)
     symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
     size = interval.size1_in(0)
     after, keep, known, impulse, z = (symbolic.sym(name, size) for name in ("after", "keep", "known", "impulse", "z"))
     common = interval_symbols(statement, symbolic)
     end, _, cost = interval(z, *common)
-    value = ca.dot(keep * after + known, end) + (cost if step else 0)
+    value = ca.dot(keep * after + known, end) + (0 if nominal else cost)
     by = (z, common[0], common[1], *([common[4]] if statement.duration.free else []))
     slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
     return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
@@ -164,7 +159,11 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
         Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
         multipliers of control bounds; its slope by T through the intervals.
     """
-    st = extremal.statement
+    st, points = extremal.statement, extremal.mesh.points
+    if points > 1:  # limits act between the nodes: swept on the mesh that has them as nodes
+        fine, slopes, by_duration = discrete_costates(refined(extremal))
+        at_nodes = Costates(state=fine.state[::points], matrices=fine.matrices[::points])
+        return at_nodes, prolongation(extremal.mesh).T @ slopes, by_duration
     if st.behind:
         return _costates_both_ways(extremal)
     last = np.concatenate(terminal_costates(extremal))
@@ -180,7 +179,7 @@ def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array,
     sweep = interval.mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
     keep, known = (values[:size] for values in _restarts(extremal))
-    stacked = (keep, known, jumps[:-1].T, z[:, :n], *_columns(extremal))
+    stacked = (keep, known, jumps[:-1].T, z[:, :n], *interval_columns(extremal))
     outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
     values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
     slopes = np.zeros((mesh.control_nodes, st.nu))
@@ -209,7 +208,7 @@ def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
     last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
-    interval = adjoint_interval(st, mesh.substeps, None)
+    interval = adjoint_interval(st, mesh.substeps, mesh.step, nominal=True)
     costates, slopes, total = _swept(extremal, interval, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T))
     return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
 
@@ -219,14 +218,16 @@ def without_passage(extremal: Extremal) -> Extremal:
 
     A transcription that eliminates these matrices sees l and the slope as one.
     """
-    st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
+    st, m = extremal.statement, extremal.multipliers
     if st.matrix_end is None or not st.matrix_end.jac_sparsity(0, 0).nnz():
         return extremal
-    weights = impulses(extremal)[:, st.nx :]
-    weights[-1] = terminal_costates(extremal)[1]
+    fine = refined(extremal)
+    t = fine.trajectory
+    weights = impulses(fine)[:, st.nx :]
+    weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)
     weights[-1, behind] -= m.final_matrices[behind]
-    outputs = passage_slopes(st, extremal.mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    outputs = passage_slopes(st, fine.mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
     through = np.asarray(outputs[0].full())[:, -1]
     return replace(extremal, multipliers=replace(m, final=m.final - through))
 
@@ -265,36 +266,13 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     e0, kicks = ca.MX.sym("e0", statement.ne), ca.MX.sym("kicks", statement.ne, n + 1)
     weights = ca.MX.sym("weights", statement.ne, n + 1)
     common = common_columns(mesh, u, duration, p)
-    _, states, cost = nominal_interval(statement, mesh.substeps).map(n)(x[:, :-1], *common)
+    _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
     values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
     return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
-
-
-def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
-    """Each interval integrated again from its node with other substeps; what runs backward from its later node.
-
-    Returns:
-        x and e stacked at the starts of the substeps and at the end, (N, substeps + 1, nx + ne).
-    """
-    st, n = extremal.statement, extremal.mesh.intervals
-    z, common = _stack(extremal), _columns(extremal)
-    interval = full_interval(st, substeps, extremal.mesh.step).map(n)
-    size = z.shape[0]
-
-    def run(start: Any, columns: tuple[Any, ...]) -> Array:
-        inside = np.asarray(interval(start, *columns)[1].full()).T.reshape(n, substeps, size)
-        return np.concatenate([np.asarray(start.full()).T[:, None, :], inside], axis=1)
-
-    values = run(z[:, :n], common)
-    if st.behind:
-        before, after, s, ds, duration, parameters = common
-        turned = run(z[:, 1:], (after, before, s + ds, -ds, duration, parameters))
-        values[:, :, _behind(st)] = turned[:, ::-1, _behind(st)]
-    return values
 
 
 def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
@@ -322,7 +300,7 @@ def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = T
 
     def rate(costate: Any, c: float) -> Any:
         z, full = points[round(2 * c)], _with(costate, behind, given[round(2 * c)])
-        u, t = ua + c * (ub - ua), duration * (s + c * ds)
+        u, t = ua + c * (ub - ua), duration * (s + one_sided(c) * ds)
         return slope(z[:nx], u, z[nx:], t, duration, p, full[:nx], full[nx:])
 
     h = duration * ds
@@ -366,8 +344,10 @@ def forward_costates(statement: Statement, pairs: int) -> ca.Function:
 
     def rate(costate: Any, point: int) -> Any:
         full = _with(ca.MX.zeros(nx + statement.ne), behind, costate)
-        u, _, s, _, duration, p = part_of(common, point / (2 * pairs), point / (2 * pairs))
-        return -slope(z[:nx, point], u, z[nx:, point], duration * s, duration, p, full[:nx], full[nx:])[behind]
+        c = point / (2 * pairs)
+        u, _, _, _, duration, p = part_of(common, c, c)
+        time = duration * (common[2] + one_sided(c) * common[3])
+        return -slope(z[:nx, point], u, z[nx:, point], time, duration, p, full[:nx], full[nx:])[behind]
 
     h = common[4] * common[3] / pairs
     for j in range(pairs):
@@ -386,12 +366,6 @@ def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = Tru
     """H_x and H_E stacked, as a function made by `hamiltonian`."""
     make = hamiltonian(statement, cost=cost, matrices=matrices)
     return make("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
-
-
-def part_of(common: tuple[Any, ...], c: float, d: float) -> tuple[Any, ...]:
-    """The common arguments of the part [c, d] of an interval, 0 <= c <= d <= 1."""
-    ua, ub, s, ds, duration, p = common
-    return ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, (d - c) * ds, duration, p
 
 
 def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, matrices: bool = True) -> ca.Function:
@@ -438,7 +412,10 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     Returns:
         Costates at the nodes.
     """
-    st, n = extremal.statement, extremal.mesh.intervals
+    st, n, parts = extremal.statement, extremal.mesh.intervals, extremal.mesh.points
+    if parts > 1:
+        fine = integrated_costates(refined(extremal), max(1, -(-pairs // parts)))
+        return Costates(state=fine.state[::parts], matrices=fine.matrices[::parts])
     size = st.nx + st.ne
     values = fine_trajectory(extremal, 2 * pairs)
     interval = backward_interval(st, pairs)
@@ -447,14 +424,16 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     start, _ = interval(keep * after + known, *rest)
     sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
-    given, last_given = given_costates(st, values, _columns(extremal), pairs)
+    given, last_given = given_costates(st, values, interval_columns(extremal), pairs)
     points = values[backward].transpose(2, 0, 1).reshape(size, -1)
     stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
     last[: st.nx] += passage_end(extremal, last_given)[0]
     reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
-    result = sweep(last, *stacked, points, reversed_given, *(column[:, backward] for column in _columns(extremal)))
+    result = sweep(
+        last, *stacked, points, reversed_given, *(column[:, backward] for column in interval_columns(extremal))
+    )
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
 

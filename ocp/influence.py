@@ -33,16 +33,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.hamiltonian import backward_interval, forward_costates, hamiltonian, part_of
-from covocp.integrators import (
-    COMMON,
-    full_interval,
-    interval_symbols,
-    joint_interval,
-    nominal_interval,
-    propagate_step,
-    step_matrix,
-)
+from covocp.hamiltonian import backward_interval, forward_costates, hamiltonian
+from covocp.implicit import one_sided, part_of
+from covocp.integrators import COMMON, full_interval, inside_interval, interval_symbols, nominal_interval
 from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.shooting import common_columns, matrices_along
@@ -162,7 +155,7 @@ def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
         pairs=pairs,
         terminal=terminal,
         forward=_passage(statement, mesh),
-        refine=_fine_interval(statement, mesh, 2 * pairs).map(n),
+        refine=inside_interval(statement, 2 * pairs, mesh.step, mesh.linear_solver).map(n),
         given=None if given is None else given.mapaccum("given", n),
         backward=backward.mapaccum("backward", n),
         quadrature=quadrature.map(n),
@@ -188,50 +181,10 @@ def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
         interval = full_interval(statement, mesh.substeps, mesh.step, solver).mapaccum("passage", n)
         ends, _, cost = interval(start, *common)
         return ca.Function("forward", [start, *common], [ca.horzcat(start, ends), cost])
-    ends, fine, cost = nominal_interval(statement, mesh.substeps).mapaccum("passage", n)(start[:nx], *common)
+    ends, fine, cost = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("passage", n)(start[:nx], *common)
     x = ca.horzcat(start[:nx], ends)
     e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common[-1][:, 0], start[nx:])
     return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
-
-
-def _fine_interval(statement: Statement, mesh: Mesh, count: int) -> ca.Function:
-    """Trajectory inside an interval: x and E stepped from its start, S from its end, as they were to get there.
-
-    Returns:
-        (z at the start, z at the end, *common) -> z at the ends of `count` substeps and before, (size, count + 1).
-    """
-    nx, size, solver = statement.nx, statement.nx + statement.ne, mesh.linear_solver
-    before, after = ca.MX.sym("before", size), ca.MX.sym("after", size)
-    common = interval_symbols(statement, ca.MX)
-    if not statement.behind:
-        _, fine, _ = full_interval(statement, count, mesh.step, solver)(before, *common)
-        return ca.Function("fine", [before, after, *common], [ca.horzcat(before, fine)])
-    x = ca.horzcat(before[:nx], nominal_interval(statement, count)(before[:nx], *common)[1])
-    ahead, behind = statement.entries(statement.ahead), statement.entries(statement.behind)
-    first, last = [before[nx:][ahead]], [after[nx:][behind]]
-    for j in range(count):
-        part = part_of(common, j / count, (j + 1) / count)
-        first.append(_matrix_step(statement, mesh, statement.ahead, first[-1], (x[:, j], x[:, j + 1], *part)))
-    for j in range(count, 0, -1):
-        ua, ub, s, ds, *rest = part_of(common, (j - 1) / count, j / count)
-        turned = (x[:, j], x[:, j - 1], ub, ua, s + ds, -ds, *rest)
-        last.append(_matrix_step(statement, mesh, statement.behind, last[-1], turned))
-    e = ca.vertcat(ca.horzcat(*first), ca.horzcat(*last[::-1]))[np.argsort(ahead + behind).tolist(), :]
-    return ca.Function("fine", [before, after, *common], [ca.vertcat(x, e)])
-
-
-def _matrix_step(
-    statement: Statement, mesh: Mesh, positions: tuple[int, ...], halves: Any, arguments: tuple[Any, ...]
-) -> Any:
-    """Half-vectors of some matrices after one step along (x there, x after it, *common of the step)."""
-    if mesh.step == "rk4":
-        entries = statement.entries(positions)
-        e = ca.MX.zeros(statement.ne)
-        e[entries] = halves
-        end = joint_interval(statement, 1)(ca.vertcat(arguments[0], e), *arguments[2:])[0]
-        return end[statement.nx :][entries]
-    steps = [step_matrix(statement, i, mesh.step, mesh.linear_solver)(*arguments) for i in positions]
-    return propagate_step(statement, positions, mesh.linear_solver)(halves, *steps)
 
 
 def terminal_conditions(statement: Statement) -> Terminal:
@@ -288,7 +241,8 @@ def quadrature_interval(statement: Statement, pairs: int, influences: int, *, ma
     rest = (common[4], common[5])
     ends = [*(passed[:, j * width : (j + 1) * width] for j in range(pairs)), after]
     where = [part_of(common, c, c) for c in np.arange(2 * pairs + 1) / (2 * pairs)]
-    at = [(z[:, i], place[0], place[2], *rest) for i, place in enumerate(where)]
+    sides = [common[2] + one_sided(i / (2 * pairs)) * common[3] for i in range(2 * pairs + 1)]
+    at = [(z[:, i], place[0], sides[i], *rest) for i, place in enumerate(where)]
     slopes = [rates(ends[j], *at[2 * j])[0] for j in range(pairs + 1)]
     step = common[4] * common[3] / pairs
     totals: list[Any] = [0.0] * 5

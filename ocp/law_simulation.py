@@ -14,10 +14,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from covocp.arguments import a, a_function, checked, optional, positive, whole
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
-from covocp.matrices import pack, pack_symbolic, unpack_symbolic
+from covocp.errors import CovocpError, ProblemError, describe, shown
+from covocp.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
 from covocp.simulation.vectorised import Columns, padded, vectorise
+from covocp.threads import one_at_a_time
 
 Array = NDArray[np.float64]
 # A casadi.Function, or a Python function of arrays that returns an array.
@@ -67,6 +70,24 @@ class LawSimulation:
     diverged: NDArray[np.bool_]
 
 
+def _of_state_and_control(value: Any) -> str:
+    """A function of state and control."""
+    fits = isinstance(value, ca.Function) and (value.n_in(), value.n_out()) == (2, 1)
+    return "" if fits else "a casadi.Function of (x, u)"
+
+
+@one_at_a_time
+@checked(
+    plant=_of_state_and_control,
+    law=a_function,
+    observer=optional(a(Filter)),
+    running=optional(_of_state_and_control),
+    samples=whole(2, 10**7),
+    runs=optional(whole(1, 10**7)),
+    duration=positive,
+    step=positive,
+    seed=whole(0, None),
+)
 def simulate_law(
     plant: ca.Function,
     law: Law,
@@ -109,14 +130,16 @@ def simulate_law(
     Raises:
         ProblemError: an argument does not fit, or a Python function in runs with noise.
     """
-    start = np.asarray(initial, dtype=float).ravel()
+    start = _numbers("initial", initial)
+    if plant.size1_out(0) != plant.size1_in(0):
+        raise values.wrong_argument("plant", "rates of all its states, (n,)", f"{plant}"[:100])
     if start.size != plant.size1_in(0):
         raise values.wrong_argument("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
-    _check_numbers({"samples": (samples, 2), "runs": (1 if runs is None else runs, 1)}, duration=duration, step=step)
+    pauses = _numbers("breaks", breaks)
     times = np.linspace(0.0, float(duration), int(samples))
     loop = _Loop(plant=plant, law=law, observer=observer, running=running, size=start.size)
     if runs is None:
-        return _accurate(loop, start, times, sorted(b for b in breaks if 0.0 < b < duration))
+        return _accurate(loop, start, times, sorted(b for b in pauses.tolist() if 0.0 < b < duration))
     noises = (
         _root("process_noise", process_noise, start.size),
         _root("measurement_noise", measurement_noise, loop.measured),
@@ -124,6 +147,7 @@ def simulate_law(
     return _noisy(loop, np.tile(loop.start(start)[:, None], int(runs)), times, float(step), noises, seed)
 
 
+@checked(dynamics=_of_state_and_control, gain=a_function)
 def gain_filter(
     dynamics: ca.Function, gain: Law, H: ArrayLike, initial: ArrayLike, *, integrate: ArrayLike | None = None
 ) -> Filter:
@@ -140,9 +164,9 @@ def gain_filter(
     Returns:
         The filter.
     """
-    start = np.asarray(initial, dtype=float).ravel()
-    size, rows = start.size, np.atleast_2d(np.asarray(H, dtype=float))
-    sums = np.zeros((0, size)) if integrate is None else np.atleast_2d(np.asarray(integrate, dtype=float))
+    start = _numbers("initial", initial)
+    size = start.size
+    rows, sums = _rows("H", H, size), _rows("integrate", [] if integrate is None else integrate, size)
 
     def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
         estimate = state[:size]
@@ -157,6 +181,7 @@ def gain_filter(
     return Filter(rate=made, initial=np.append(start, np.zeros(len(sums))), size=size + len(sums), H=rows)
 
 
+@checked(dynamics=_of_state_and_control)
 def extended_filter(
     dynamics: ca.Function,
     H: ArrayLike,
@@ -181,10 +206,13 @@ def extended_filter(
     Returns:
         The filter.
     """
-    start, half = np.asarray(initial, dtype=float).ravel(), pack(np.asarray(covariance, dtype=float))
-    size, rows = start.size, np.atleast_2d(np.asarray(H, dtype=float))
-    sums = np.zeros((0, size)) if integrate is None else np.atleast_2d(np.asarray(integrate, dtype=float))
-    weighted = np.linalg.solve(np.asarray(V, dtype=float), rows).T
+    start = _numbers("initial", initial)
+    size = start.size
+    rows, sums = _rows("H", H, size), _rows("integrate", [] if integrate is None else integrate, size)
+    half = pack(values.numeric("covariance", values.weight("covariance", covariance, size)))
+    process = values.numeric("W", values.weight("W", W, size))
+    noise = values.numeric("V", values.weight("V", V, len(rows), definite=True))
+    weighted = np.linalg.solve(noise, rows).T
 
     def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
         estimate = ca.SX.sym("estimate", size)
@@ -193,7 +221,7 @@ def extended_filter(
         slope = ca.substitute(slope, estimate, state[:size])
         P = unpack_symbolic(state[size + len(sums) :], size)
         correction = P @ ca.DM(weighted) @ (y - ca.DM(rows) @ state[:size])
-        growth = pack_symbolic(kalman.rate(P, tangent, rows, W, V))
+        growth = pack_symbolic(kalman.rate(P, tangent, rows, process, noise))
         return ca.vertcat(slope + correction, ca.DM(sums) @ state[:size], growth)
 
     made = _function(rate, [size + len(sums) + half.size, 1, dynamics.size1_in(1), len(rows)])
@@ -347,10 +375,22 @@ def _function(expression: Law, sizes: Sequence[int]) -> ca.Function:
 
 def _value(function: Law, *arguments: Any) -> Any:
     """The value of a function, as an array where the arguments are numbers; columns are flat."""
-    value = function(*arguments)
-    if isinstance(value, ca.SX):
-        return value
-    numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+    try:
+        value = function(*arguments)
+        if isinstance(value, ca.SX):
+            return value
+        numbers = real_numbers(value)
+    except CovocpError:
+        raise
+    except Exception as error:  # whatever a function of the user raises
+        raise ProblemError(
+            describe(
+                "A function of the loop fails.",
+                expected="functions as simulate_law() says: plant (x, u), law (estimate, t), running (x, u)",
+                received=f"{type(error).__name__} in {shown(function, 60)}: {error}"[:300],
+                remedy="call it by itself with a state and a control of these sizes",
+            )
+        ) from error
     return numbers.ravel() if numbers.ndim < 2 or numbers.shape[1] == 1 else numbers
 
 
@@ -364,18 +404,25 @@ def _stack(*parts: Any) -> Any:
     return np.concatenate([np.ravel(part) for part in parts])
 
 
-def _check_numbers(counts: dict[str, tuple[int, int]], **times: float) -> None:
-    """Counts that are whole and not below their least value, times that are positive."""
-    for name, (count, least) in counts.items():
-        if isinstance(count, bool) or int(count) != count or count < least:
-            raise values.wrong_argument(name, f"a whole number, {least} or more", repr(count))
-    for name, seconds in times.items():
-        if not 0.0 < seconds < np.inf:
-            raise values.wrong_argument(name, "a positive time [s]", repr(seconds))
+def _numbers(name: str, given: Any) -> Array:
+    """Finite numbers in a row."""
+    return values.numeric(name, values.matrix(name, given)).ravel()
+
+
+def _rows(name: str, given: Any, size: int) -> Array:
+    """Rows of finite numbers, (r, size); a row may be given by itself."""
+    numbers = values.numeric(name, values.matrix(name, given))
+    if numbers.shape[1] == 1 and numbers.shape[0] == size:
+        numbers = numbers.T
+    return (
+        numbers.reshape(-1, size)
+        if not numbers.size
+        else values.numeric(name, values.matrix(name, numbers, (None, size)))
+    )
 
 
 def _root(name: str, density: ArrayLike, size: int) -> Array:
     """A square root of a power spectral density, (size, size)."""
-    given = np.asarray(density, dtype=float)
-    full = values.numeric(name, values.weight(name, given * np.eye(size) if given.ndim == 0 else given, size))
+    given = values.numeric(name, values.matrix(name, density))
+    full = values.numeric(name, values.weight(name, given * np.eye(size) if given.size == 1 else given, size))
     return root(full)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -11,13 +13,28 @@ import numpy as np
 from covocp.checks import bound_columns, check_bounds, column
 from covocp.errors import ProblemError, describe, spelling
 from covocp.matrices import Array, half_length, unpack_indices
-from covocp.statement import Statement
+from covocp.statement import Block, Statement
 
 Limits = tuple[Array, Array]
+ENTRY = re.compile(r"(?P<vector>.+)\[(?P<entry>\d+)\]")
 
 
-def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, missing_ok: bool = False) -> str:
-    """Name of a symbol or name; "" where it is not one and that is allowed.
+def name_of(
+    key: Any,
+    symbols: Mapping[str, Any],
+    names: tuple[str, ...],
+    *,
+    missing_ok: bool = False,
+    sizes: Mapping[str, int] | None = None,
+) -> str:
+    """Name of a symbol, a name, or an entry of a vector; "" where it is none of them and that is allowed.
+
+    Args:
+        key: a symbol, the full matrix of one, an entry `p[0]` of one, or a name.
+        symbols: by name.
+        names: that may be meant.
+        missing_ok: whether it may be none of them.
+        sizes: number of entries of the vectors whose entries may be meant too; the name of an entry is "p[0]".
 
     Raises:
         ProblemError: where it is unknown.
@@ -33,9 +50,89 @@ def name_of(key: Any, symbols: Mapping[str, Any], names: tuple[str, ...], *, mis
     label = getattr(key, "labels", None)
     if label is not None and "E" in names:
         return "E"
+    vectors = {name: size for name, size in (sizes or {}).items() if name in names}
+    if found := _entry_name(key, symbols, vectors):
+        return found
     if missing_ok:
         return ""
-    raise unknown_name(key, names)
+    raise _no_such_entry(key, vectors) or unknown_name(key, names)
+
+
+def sizes_of(blocks: Iterable[Block]) -> dict[str, int]:
+    """Number of entries of each symbol that has entries of its own: of all but matrices."""
+    return {b.name: b.size for b in blocks if b.kind != "matrix"}
+
+
+def split_entry(name: str) -> tuple[str, int] | None:
+    """Vector and number of the name of an entry, "p[0]"; None for other names."""
+    found = ENTRY.fullmatch(name)
+    return (found["vector"], int(found["entry"])) if found else None
+
+
+def block_of(name: str, blocks: Iterable[Block]) -> Block | None:
+    """Where a name, or the name of an entry of a vector, lies; the block of an entry has one row. None: nowhere."""
+    every = {b.name: b for b in blocks}
+    entry = split_entry(name)
+    if name in every or entry is None or entry[0] not in every:
+        return every.get(name)
+    owner, k = every[entry[0]], entry[1]
+    if owner.kind == "matrix" or k >= owner.size:
+        return None
+    return owner if owner.size == 1 else replace(owner, name=name, size=1, offset=owner.offset + k)
+
+
+def entry_values(values: Mapping[str, Array], name: str) -> Array:
+    """What values by name hold for a name, or for that of an entry of a vector, which is the last axis."""
+    entry = split_entry(name)
+    if name in values or entry is None:
+        return values[name]
+    return np.asarray(values[entry[0]][..., entry[1]])
+
+
+def _entry_name(key: Any, symbols: Mapping[str, Any], sizes: Mapping[str, int]) -> str:
+    """Name of an entry of a vector, given as such or as the expression `p[0]`; "" where it is none."""
+    vector, k = "", -1
+    if isinstance(key, str) and (entry := split_entry(key)) is not None:
+        vector, k = entry
+    elif isinstance(key, ca.MX) and key.shape == (1, 1) and not key.is_symbolic():
+        owners = ca.symvar(key)
+        if len(owners) == 1:
+            vector = next((n for n in sizes if n in symbols and ca.is_equal(owners[0], symbols[n])), "")
+            k = chosen_entry(key, owners[0]) if vector else -1
+    if not 0 <= k < sizes.get(vector, 0):
+        return ""
+    return vector if sizes[vector] == 1 else f"{vector}[{k}]"
+
+
+def chosen_entry(key: Any, vector: Any) -> int:
+    """Which entry of a vector an expression is, -1 where it is something else."""
+    if [s.__hash__() for s in ca.symvar(key)] != [vector.__hash__()]:
+        return -1
+    slope = ca.jacobian(key, vector)
+    if vector.shape[1] != 1 or ca.symvar(slope):
+        return -1
+    weights = np.asarray(ca.evalf(ca.densify(slope)).full()).ravel()
+    rows = np.flatnonzero(weights)
+    if rows.size != 1 or weights[rows[0]] != 1.0:
+        return -1
+    offset = float(ca.Function("offset", [vector], [key])(np.zeros(vector.shape)))
+    return int(rows[0]) if offset == 0.0 else -1
+
+
+def _no_such_entry(key: Any, sizes: Mapping[str, int]) -> ProblemError | None:
+    """The error for an entry that a vector does not have; None where no such vector is named."""
+    entry = split_entry(key) if isinstance(key, str) else None
+    if entry is None or entry[0] not in sizes:
+        return None
+    vector, size = entry[0], sizes[entry[0]]
+    return ProblemError(
+        describe(
+            f"'{vector}' has no entry {entry[1]}.",
+            expected=f"'{vector}'" + (f", or an entry '{vector}[0]' to '{vector}[{size - 1}]'" if size > 1 else ""),
+            received=f"'{key}'",
+            remedy="entries are counted from 0",
+        )
+    )
 
 
 def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Array | None = None) -> Array:
@@ -134,9 +231,11 @@ def control_limits(statement: Statement, count: int, given: Any) -> Limits:
                 remedy="give limits={'name': (lower, upper)}",
             )
         )
-    blocks = {b.name: b for b in statement.controls if b.span.stop <= count}
+    controls = tuple(b for b in statement.controls if b.span.stop <= count)
+    names, sizes = tuple(b.name for b in controls), sizes_of(controls)
     for key, pair in given.items():
-        block = blocks[name_of(key, statement.symbols, tuple(blocks))]
+        block = block_of(name_of(key, statement.symbols, names, sizes=sizes), controls)
+        assert block is not None
         if not isinstance(pair, (tuple, list)) or len(pair) != 2:
             raise ProblemError(
                 describe(

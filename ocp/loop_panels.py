@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from covocp.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, ratio_unit, shortened, unit_of
+from covocp.lookup import block_of
 from covocp.solution import Solution
 from covocp.statement import Block, entry_names
 
@@ -35,8 +36,9 @@ def rms(drawn: Sequence[Drawn], key: Any, blocks: Mapping[str, Block], units: Ma
     deviations nothing changes, the error of the estimate alone.
     """
     name = key if isinstance(key, str) else shortened(key)
-    kind = blocks[key].kind if isinstance(key, str) else "state"
-    entries = entry_names((blocks[key],)) if isinstance(key, str) else entry_names((_as_block(name, key),))
+    block = block_of(key, blocks.values()) if isinstance(key, str) else None
+    kind = block.kind if block is not None else "state"
+    entries = entry_names((_as_block(name, key) if block is None else block,))
     closed = any(d.solution.loop is not None for d in drawn)
     shown: tuple[int, ...] = (0,)
     if closed and kind == "unknown":
@@ -81,7 +83,7 @@ def gain(drawn: Sequence[Drawn], word: str, of: str | None, units: Mapping[str, 
     panels = []
     some = any(np.any(history) for history in histories)
     for owner in dict.fromkeys(label.split("[")[0] for label in labels) if of is None else (of,):
-        rows = [i for i, label in enumerate(labels) if label.split("[")[0] == owner]
+        rows = [i for i, label in enumerate(labels) if owner in (label, label.split("[")[0])]
         if of is None and some and not any(np.any(history[:, rows]) for history in histories):
             continue
         unit = ratio_unit(others[0].split("[")[0], owner, units) if fed else ""

@@ -21,6 +21,35 @@ Array = NDArray[np.float64]
 SEMIDEFINITE_TOLERANCE = 1e-9
 
 
+def real_numbers(value: Any) -> Array:
+    """Numbers as an array of floats. None in a sequence is NaN; arrays of truths are patterns of 0 and 1.
+
+    Raises:
+        TypeError: words, a truth, None by itself, symbols, complex numbers, dates, masked entries, no numbers at all.
+        ValueError: rows of different lengths.
+        OverflowError: a whole number that no float can hold.
+    """
+    if isinstance(value, (float, int)) and not isinstance(value, bool):
+        return np.asarray(float(value))
+    if value is None or _no_number(value):
+        raise TypeError("numpy would read words and truths as numbers, and None as NaN")
+    if np.ma.is_masked(value):
+        raise TypeError("numpy would read what is masked too")
+    numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value)
+    if numbers.dtype.kind not in "fiubO":
+        raise TypeError(f"numbers of the type {numbers.dtype} are not real")
+    if numbers.dtype.kind == "O" and any(_no_number(entry) for entry in numbers.flat):
+        raise TypeError("not all are numbers")
+    return numbers.astype(float)
+
+
+def _no_number(value: Any) -> bool:
+    """Whether a value is a truth, a word or a symbol, or a sequence that holds a word or a symbol."""
+    if isinstance(value, (list, tuple)):
+        return any(not isinstance(entry, (bool, np.bool_)) and _no_number(entry) for entry in value)
+    return isinstance(value, (str, bytes, bool, np.bool_, ca.SX, ca.MX))
+
+
 def half_length(size: int) -> int:
     """Number of distinct entries of a symmetric matrix of the given size."""
     return size * (size + 1) // 2

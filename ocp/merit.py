@@ -30,6 +30,7 @@ from covocp.mesh import Options
 from covocp.methods import is_roundoff, solve
 from covocp.problem import Problem
 from covocp.solution import Solution
+from covocp.threads import one_at_a_time
 
 # Steps along the statistical gradient at which the expected cost is evaluated.
 STEPS = tuple(2.0 ** np.arange(2, -13, -1))
@@ -79,6 +80,7 @@ class Worth:
         )
 
 
+@one_at_a_time
 def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **options: Any) -> Worth:
     """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from covocp.checks import as_number, is_whole
 from covocp.errors import ProblemError, describe, spelling
-from covocp.integrators import LINEAR_SOLVER, Step
+from covocp.integrators import Step
+from covocp.linear_solve import LINEAR_SOLVER
 from covocp.matrices import Array
 from covocp.statement import Statement
 
@@ -23,6 +24,27 @@ SCALAR_ENTRIES = 12
 PATH_ENTRIES = 21
 # h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
 STIFFNESS_PER_STEP = 1.0
+# h times the largest rate of a decaying nominal from which on classical Runge-Kutta diverges.
+STABILITY_LIMIT = 2.78
+# Steps an interval that a nominal may need by classical Runge-Kutta before it is stepped implicitly.
+EXPLICIT_SUBSTEPS = 8
+# Implicit steps an interval, at most: what happens faster than these has died out. DC motor with a time constant of
+# 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
+IMPLICIT_SUBSTEPS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Graded:
+    """The nodes of a default mesh that was graded at its ends, in place of a grid that is given (`grading`).
+
+    nodes: of t/T; asked: intervals that the user asked for; added: nodes added at the start and at the end; stiffness:
+        largest h times rate of the filter on its intervals.
+    """
+
+    nodes: Array
+    asked: int
+    added: tuple[int, int]
+    stiffness: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +58,8 @@ class Options:
     segments: int | Literal["auto"] = "auto"
     covariances: Literal["auto", "eliminated", "states"] = "auto"
     covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
+    step: Literal["auto", "rk4", "rodas"] = "auto"
+    points: int | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -43,7 +67,8 @@ class Options:
         _choice("control", self.control, ("linear", "constant"))
         _choice("covariances", self.covariances, ("auto", "eliminated", "states"))
         _choice("covariance_step", self.covariance_step, ("auto", "gauss", "strang", "rk4"))
-        for name, value in (("substeps", self.substeps), ("segments", self.segments)):
+        _choice("step", self.step, ("auto", "rk4", "rodas"))
+        for name, value in (("substeps", self.substeps), ("segments", self.segments), ("points", self.points)):
             if not (isinstance(value, str) and value == "auto"):
                 _whole(name, value, "'auto' or 1, 2, 3, ...")
 
@@ -55,6 +80,8 @@ class Options:
         """
         if self.grid is None:
             return np.linspace(0.0, 1.0, self.intervals + 1)
+        if isinstance(self.grid, Graded):
+            return self.grid.nodes
         nodes = as_number("grid", "option", self.grid).ravel()
         if nodes.size < 2 or nodes[0] != 0 or nodes[-1] != 1 or not (np.diff(nodes) > 0).all():
             raise ProblemError(
@@ -67,6 +94,13 @@ class Options:
             )
         return nodes
 
+    @property
+    def grading(self) -> dict[str, Any]:
+        """What is said of the mesh in the statistics of a solution: how its ends were graded, where they were."""
+        if not isinstance(self.grid, Graded) or not any(self.grid.added):
+            return {}
+        return {"intervals_asked": self.grid.asked, "nodes_added": self.grid.added}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
@@ -78,8 +112,10 @@ class Mesh:
         substeps: integration steps an interval.
         segments: lengths of the shooting segments, in intervals; they add up to N.
         eliminated: whether the matrices are propagated along the nominal instead of being variables.
-        step: covariance step.
+        step: covariance step; "rodas": implicit steps of the nominal, gauss steps of the covariances.
         linear_solver: CasADi's linear solver of the covariance steps.
+        points: equally spread points of an interval, its start among them, where path inequalities and bounds of
+            states are imposed; they are ends of substeps. 1: at the nodes only.
     """
 
     nodes: Array
@@ -89,6 +125,7 @@ class Mesh:
     eliminated: bool
     step: Step
     linear_solver: str = LINEAR_SOLVER
+    points: int = 1
 
     @property
     def intervals(self) -> int:
@@ -106,40 +143,151 @@ class Mesh:
         return tuple(np.cumsum([0, *self.segments]).tolist())
 
 
-def choose_mesh(statement: Statement, options: Options, stiffness: float) -> Mesh:
+@dataclass(frozen=True, kw_only=True)
+class Stiffness:
+    """Largest h times rate of change for one step an interval.
+
+    Args:
+        nominal: of the nominal, the spectral radius of f_x.
+        oscillating: of what does not die out faster than it moves (real part above -1/2 of the modulus): implicit
+            steps must resolve it too, they would damp it.
+        decaying: of what does not grow: explicit steps that are too long for it end in nonsense.
+        matrices: of the covariances, where they are stepped by Runge-Kutta.
+    """
+
+    nominal: float
+    oscillating: float
+    decaying: float
+    matrices: float = 0.0
+
+
+def choose_mesh(statement: Statement, options: Options, step: Step, stiffness: Stiffness) -> Mesh:
     """Resolve every "auto".
 
     Args:
         statement: the problem.
         options: what the user asked for.
-        stiffness: largest h times rate of change of what is stepped by Runge-Kutta (`guess.stiffness`), for one step
-            an interval.
+        step: as chosen by `choose_step`.
+        stiffness: of the problem on this mesh (`guess.stiffness`).
 
     Raises:
         ProblemError: options that contradict the problem.
     """
     nodes = options.nodes()
     intervals = nodes.size - 1
-    step = choose_step(statement, options)
     eliminated = _choose_eliminated(statement, options)
     if options.segments == "auto":
         count = min(ELIMINATED_SEGMENTS, intervals) if eliminated and statement.matrices else intervals
     else:
         count = min(options.segments, intervals)
     if options.substeps == "auto":
-        substeps = int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
+        if step == "rodas":
+            implicit = int(np.clip(np.ceil(np.sqrt(stiffness.nominal)), 1, IMPLICIT_SUBSTEPS))
+            substeps = max(implicit, explicit_substeps(stiffness.oscillating))
+        else:
+            substeps = explicit_substeps(max(stiffness.nominal, stiffness.matrices if step == "rk4" else 0.0))
     else:
         substeps = options.substeps
-    if statement.running_uses_matrices and (step != "rk4" or statement.behind) and substeps % 2:
+    if step != "rodas" and stiffness.decaying > STABILITY_LIMIT * substeps:
+        raise _too_few_substeps(substeps, stiffness.decaying)
+    paired = statement.running_uses_matrices and (step != "rk4" or bool(statement.behind))
+    if paired and substeps % 2:
         substeps += 1  # Simpson's rule for the running cost takes them in pairs
+    substeps, points = _choose_points(statement, options, substeps, 2 if paired else 1)
     short, longer = divmod(intervals, count)
     lengths = (short + 1,) * longer + (short,) * (count - longer)
     return Mesh(
-        nodes=nodes, control=options.control, substeps=substeps, segments=lengths, eliminated=eliminated, step=step
+        nodes=nodes,
+        control=options.control,
+        substeps=substeps,
+        segments=lengths,
+        eliminated=eliminated,
+        step=step,
+        points=points,
     )
 
 
-def choose_step(statement: Statement, options: Options) -> Step:
+def _choose_points(statement: Statement, options: Options, substeps: int, group: int) -> tuple[int, int]:
+    """Substeps, and points of an interval where limits are imposed: ends of groups of so many substeps.
+
+    An interval that needs substeps holds changes that its ends do not show, which the optimiser would use.
+
+    Raises:
+        ProblemError: given substeps that do not end at the given points.
+    """
+    if not (statement.path.size or statement.bounded_states):
+        return substeps, 1
+    if options.points == "auto":
+        return substeps, max(1, substeps // group)
+    least = options.points * group if options.points > 1 else 1
+    if options.substeps != "auto" and substeps % least:
+        raise ProblemError(
+            describe(
+                f"The points at which limits are imposed are no ends of {'pairs of ' * (group > 1)}integration steps.",
+                expected=f"substeps={least}, {2 * least}, ... for points={options.points}",
+                received=f"substeps={options.substeps}",
+                remedy="leave substeps='auto', or take a divisor of them as points",
+            )
+        )
+    return -(-substeps // least) * least, options.points
+
+
+def _too_few_substeps(substeps: int, rate: float) -> ProblemError:
+    """Explicit steps that diverge."""
+    needed = int(np.ceil(rate / STIFFNESS_PER_STEP))
+    return ProblemError(
+        describe(
+            "The integration steps of the nominal are too long: classical Runge-Kutta diverges.",
+            expected=f"about {needed} steps an interval: the fastest rate of the system, at its start, times the "
+            f"longest interval is {rate:.3g}",
+            received=f"{substeps} steps an interval",
+            remedy=f"leave step= and substeps= 'auto' (implicit steps where they apply), or give substeps={needed} or "
+            "more intervals",
+        )
+    )
+
+
+def explicit_substeps(stiffness: float) -> int:
+    """Steps of classical Runge-Kutta that an interval of this stiffness takes."""
+    return int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
+
+
+def choose_step(statement: Statement, options: Options, stiffness: Stiffness) -> Step:
+    """The step of nominal and covariances.
+
+    Args:
+        statement: the problem.
+        options: what the user asked for.
+        stiffness: of the problem on this mesh.
+
+    Returns:
+        "rodas" where the nominal is too stiff for explicit steps, or asked for; else the covariance step.
+
+    Raises:
+        ProblemError: a step that does not apply.
+    """
+    covariance = _choose_covariance_step(statement, options)
+    riccati = not statement.coupled and all(form is not None for form in statement.riccati)
+    possible = riccati and options.covariance_step in ("auto", "gauss")
+    if options.step == "rodas" and not possible:
+        raise ProblemError(
+            describe(
+                "step='rodas' does not apply: it goes with gauss steps of the covariances.",
+                expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
+                received=f"covariance_step='{options.covariance_step}'"
+                if riccati
+                else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
+                remedy="leave step='auto', with more substeps= where the system is stiff",
+            )
+        )
+    needed = explicit_substeps(stiffness.nominal)
+    too_few = options.substeps == "auto" or options.substeps < needed
+    dies_out = explicit_substeps(stiffness.oscillating) <= EXPLICIT_SUBSTEPS
+    stiff = options.step == "auto" and needed > EXPLICIT_SUBSTEPS and too_few and dies_out
+    return "rodas" if possible and (options.step == "rodas" or stiff) else covariance
+
+
+def _choose_covariance_step(statement: Statement, options: Options) -> Step:
     """The covariance step: gauss where every rate has the Riccati form, else rk4.
 
     Where E and S of a closed loop are variables and small, rk4: written out in scalars, its exact derivatives cost a
@@ -224,7 +372,7 @@ def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
 
 
 def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ProblemError(
             describe(
                 f"The option '{name}' has an unknown value.",

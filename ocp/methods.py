@@ -4,39 +4,53 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import warnings
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, cast
 
 import numpy as np
 
+from covocp.arguments import checked, text, truth
+from covocp.attempts import best_of, cost_of, from_starts
 from covocp.checks import check_kind, is_whole
 from covocp.densities import impossible_density
-from covocp.errors import CovocpError, CovocpWarning, ProblemError, SolveError, describe, no_option, spelling, warn_user
+from covocp.doubts import mention_doubts, mention_limits
+from covocp.errors import (
+    CovocpError,
+    Interrupted,
+    ProblemError,
+    SolveError,
+    describe,
+    evaluating,
+    no_option,
+    spelling,
+    warn_user,
+    without_warnings,
+)
 from covocp.evaluate import evaluate_controls, evaluation_mesh
 from covocp.expected import deterministic
 from covocp.extremal import Guess, Outcome, Prepared
+from covocp.forgotten import mention_forgotten, mention_lengths
+from covocp.grading import graded
 from covocp.lookup import stacked_parameters
 from covocp.matrices import Array
 from covocp.mesh import Options
 from covocp.problem import Problem
 from covocp.progress import Progress
+from covocp.random_starts import random_guesses
 from covocp.solution import Solution
-from covocp.starting import make_guess, random_guesses
+from covocp.starting import make_guess, make_guesses
 from covocp.statement import Statement
+from covocp.threads import methods_one_at_a_time, one_at_a_time
 
 METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
 
-# Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
-COARSE_MESH = 2e-4
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
 # A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
 UNMOVED = 1e-6
-NEGATIVE_CURVATURE = -1e-6
 ESCAPES = (1.0, -1.0)
-STARTS = 8
+STARTS, MOST_STARTS = 8, 10**6
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
 NOMINALS = ("combined", "deterministic")
@@ -47,6 +61,9 @@ ROUNDOFF = 1e-10
 SUSPICIOUS_GAIN = 0.5
 # Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
 WORSE = 1e-6
+# Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
+CONTINUED = 1e-3
+TOLERANCE = 1e-7
 
 
 def methods() -> tuple[str, ...]:
@@ -69,6 +86,7 @@ def check_problem(problem: Any) -> None:
     check_kind(problem, Problem, "pass the Problem itself (solutions go into guess=)")
 
 
+@methods_one_at_a_time
 class Solver:
     """A problem made ready for one method: built once, solved again with new parameters and guesses.
 
@@ -78,13 +96,14 @@ class Solver:
         intervals: number of control intervals.
         nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
             the cost without noise (quadratic synthesis), filter and feedback around it.
-        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`) and of the
-            method.
+        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`) and
+            of the method.
 
     Raises:
         ProblemError: unknown method or option, or a statement that is wrong.
     """
 
+    @checked(method=text, nominal=text)
     def __init__(
         self,
         problem: Problem,
@@ -123,16 +142,19 @@ class Solver:
         self.nominal = nominal
         self.statement: Statement = problem.statement()
         self._problem, self._classical = problem, cast("Solver | None", None)
-        self._options = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        self._options = graded(self.statement, asked, self.statement.values)
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else deterministic(problem).statement()
         self._solved = solved
-        self._prepared = cast(
-            Prepared, prepare(solved, self._options, **{k: v for k, v in options.items() if k in own})
-        )
+        self._own = {k: v for k, v in options.items() if k in own}
+        self._prepared = cast(Prepared, prepare(solved, self._options, **self._own))
+        mention_forgotten(problem)
+        mention_lengths(self.statement.guesses, self._options)
 
+    @checked(progress=truth, allow_failure=truth)
     def solve(
         self,
         parameters: Mapping[str, Any] | None = None,
@@ -155,24 +177,29 @@ class Solver:
             seed: of the random starts.
 
         Returns:
-            The solution. After Ctrl-C the last iterate, with a warning; its `converged` is false.
+            The solution.
 
         Raises:
             ProblemError: a name or a guess is wrong.
             SolveError: the method did not converge (carries the last iterate).
+            Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
-        values = stacked_parameters(self.statement, parameters or {})
-        with Progress(self.statement.name or "solving", progress) as reporter:
-            if isinstance(guess, str):
-                outcome = self._multistart(guess, values, starts, seed, reporter)
-            else:
-                start = make_guess(self._solved, self._prepared.mesh, values, guess)
-                outcome = self._prepared.solve(values, start, reporter)
-                outcome = self._leave_saddle(outcome, values, reporter, start)
-        if self.nominal == "deterministic":
-            outcome = self._closed(outcome)
-        solution = self._finish(outcome, allow_failure, interrupted=reporter.stop)
-        return self._beside_classical(solution, values)
+        values = stacked_parameters(self.statement, {} if parameters is None else parameters)
+        if isinstance(guess, Mapping):
+            mention_lengths({str(key): value for key, value in guess.items()}, self._options)
+        with evaluating(self.statement.name):
+            with Progress(self.statement.name or "solving", progress) as reporter:
+                if isinstance(guess, str):
+                    outcome = self._multistart(guess, values, starts, seed, reporter)
+                else:
+                    guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
+                    outcome, start = from_starts(self._prepared, values, guesses, reporter)
+                    outcome = self._leave_saddle(outcome, values, reporter, start)
+            if self.nominal == "deterministic":
+                outcome = self._closed(outcome)
+            if reporter.stop:
+                raise interrupted(Solution.of(outcome, self.method))
+            return self._beside_classical(self._finish(outcome, allow_failure), values)
 
     def _closed(self, outcome: Outcome) -> Outcome:
         """Filter and feedback around the nominal of the deterministic cost."""
@@ -196,16 +223,19 @@ class Solver:
             if self._classical is None:
                 mesh = {field.name: getattr(self._options, field.name) for field in fields(Options)}
                 self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", CovocpWarning)  # they concern another solution
+            with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
                 classical = self._classical._solve_values(given)
+        except KeyboardInterrupt:
+            message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
+            raise Interrupted(message, solution=solution) from None
         except CovocpError as error:  # no deterministic cost: there is nothing to compare with
             return _noted(solution, classical_missing=str(error).partition("\n")[0])
         if classical is None:
             return _noted(solution, classical_missing="The problem without noise was not solved.")
-        excess = solution.cost - classical
-        worse = excess > (WORSE + solution.mesh_error) * abs(classical)
+        if _is_worse(solution, classical):  # stationary up to a tolerance only, or spurious: going on from there tells
+            solution = self._continued(solution, given)
+        excess, worse = solution.cost - classical, _is_worse(solution, classical)
         suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
         if suspicious and is_roundoff(excess, self.statement, self._options, given):
             return _noted(solution, classical_cost=classical, classical_same=True)
@@ -216,11 +246,34 @@ class Solver:
             )
         return _noted(solution, classical_cost=classical)
 
+    def _continued(self, solution: Solution, values: Array) -> Solution:
+        """The solution after going on from it with a smaller tolerance, where that makes it better."""
+        tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
+        prepare = importlib.import_module(METHODS[self.method]).prepare
+        try:
+            prepared = prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
+            with Progress("", show=False) as reporter:
+                start = make_guess(self._solved, prepared.mesh, values, solution)
+                outcome = prepared.solve(values, start, reporter)
+        except CovocpError:  # a plugin that has no tolerance
+            return solution
+        if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
+            return solution
+        continued = Solution.of(outcome, self.method)
+        counted = {
+            name: solution.stats[name] + outcome.stats[name]
+            for name in ("iterations", "build_seconds", "solve_seconds")
+            if name in solution.stats and name in outcome.stats
+        }
+        return _noted(continued, **{**solution.stats, **counted})
+
     def _solve_values(self, values: Array) -> float | None:
         """Cost of the classical design for stacked parameters; None where it was not found."""
         with Progress("", show=False) as reporter:
-            start = make_guess(self._solved, self._prepared.mesh, values, None)
-            outcome = self._closed(self._prepared.solve(values, start, reporter))
+            guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
+            outcome = self._closed(from_starts(self._prepared, values, guesses, reporter)[0])
+            if reporter.stop:
+                raise KeyboardInterrupt
         return float(sum(outcome.cost_terms.values())) if outcome.converged else None
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
@@ -234,8 +287,8 @@ class Solver:
                     remedy="correct guess=",
                 )
             )
-        for name, number, least in (("starts", starts, 0), ("seed", seed, 0)):
-            if not is_whole(number, least):
+        for name, number, most in (("starts", starts, MOST_STARTS), ("seed", seed, None)):
+            if not is_whole(number, 0, most):
                 raise ProblemError(
                     describe(
                         f"The option '{name}' is not a whole number.",
@@ -244,18 +297,8 @@ class Solver:
                         remedy=f"correct {name}=",
                     )
                 )
-        best: Outcome | None = None
-        costs = []
-        for start in random_guesses(self._solved, self._prepared.mesh, values, starts, seed):
-            outcome = self._prepared.solve(values, start, reporter)
-            cost = sum(outcome.cost_terms.values())
-            costs.append(cost if outcome.converged else np.nan)
-            if best is None or (outcome.converged, -cost) > (best.converged, -sum(best.cost_terms.values())):
-                best = outcome
-            if reporter.stop:
-                break
-        assert best is not None
-        return _with_stats(best, starts=costs)
+        guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
+        return best_of(self._prepared, values, guesses, starts + 1, reporter)
 
     def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
         """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it."""
@@ -269,34 +312,29 @@ class Solver:
         from covocp.curvature import smallest_curvature
 
         curvature = smallest_curvature(outcome.extremal)
-        if curvature is None or curvature.value > NEGATIVE_CURVATURE * curvature.largest:
+        if curvature is None or curvature.verdict != "saddle":
             return outcome
         candidates = []
         for sign in ESCAPES:
             moved = curvature.displaced(outcome.extremal, sign)
             displaced = make_guess(self._solved, self._prepared.mesh, values, moved)
             candidates.append(self._prepared.solve(values, displaced, reporter))
-        better = [
-            c for c in candidates if c.converged and sum(c.cost_terms.values()) < sum(outcome.cost_terms.values())
-        ]
+        better = [c for c in candidates if c.converged and cost_of(c) < cost_of(outcome)]
         if not better:
             return outcome
         warn_user(
             "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
-        return _with_stats(min(better, key=lambda c: sum(c.cost_terms.values())), left_saddle=True)
+        return _with_stats(min(better, key=cost_of), left_saddle=True)
 
-    def _finish(self, outcome: Outcome, allow_failure: bool, interrupted: bool) -> Solution:
+    def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
         if impossible:
             outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(outcome, self.method)
+        solution = Solution.of(_with_stats(outcome, **self._options.grading), self.method)
         if not outcome.converged:
-            if interrupted:
-                message = "Interrupted: this is the last iterate, not a solution."
-                warn_user(message)
-            if allow_failure or interrupted:
+            if allow_failure:
                 return solution
             lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
@@ -307,19 +345,25 @@ class Solver:
                 solution=solution,
                 violations=outcome.violations,
             )
-        error = solution.mesh_error
-        if not error <= COARSE_MESH:
-            warn_user(
-                f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative). "
-                "Use more intervals or substeps."
-            )
-        smallest = solution.smallest_eigenvalue
-        if smallest < 0 and not solution.semidefinite:
-            warn_user(
-                f"A covariance is indefinite (smallest eigenvalue {smallest:.3g}); use covariance_step='gauss' or "
-                "more intervals."
-            )
+        mention_doubts(solution)
+        mention_limits(solution)
         return solution
+
+
+def interrupted(solution: Solution) -> Interrupted:
+    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
+    starts = solution.stats.get("starts")
+    if starts is None:
+        found = "the last iterate" if not solution.converged else "a solution"
+    else:
+        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
+        found += "" if solution.converged else ", of which none converged"
+    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)
+
+
+def _is_worse(solution: Solution, classical: float) -> bool:
+    """Whether a combined design costs more than the classical one, by more than the mesh leaves open."""
+    return bool(solution.cost - classical > (WORSE + solution.mesh_error) * abs(classical))
 
 
 def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
@@ -338,6 +382,8 @@ def _noted(solution: Solution, **stats: Any) -> Solution:
     return replace(solution, stats={**solution.stats, **stats})
 
 
+@one_at_a_time
+@checked(progress=truth, allow_failure=truth)
 def solve(
     problem: Problem,
     method: str = "ipopt",
@@ -364,11 +410,12 @@ def solve(
         options: of the mesh and of the method; see `Solver`.
 
     Returns:
-        The solution. After Ctrl-C the last iterate, with a warning; its `converged` is false.
+        The solution.
 
     Raises:
         ProblemError: the statement or an option is wrong.
         SolveError: the method did not converge (carries the last iterate).
+        Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
     """
     extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
     if extra and not isinstance(guess, str):

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.errors import OutsideDomainError, describe
 from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.statement import Statement
@@ -149,11 +150,15 @@ class NLP:
         starts = list(mesh.starts)
         states[starts[1:-1]] = (parts["x"] / self.scales.x)[1:-1]
         if "state_bounds" in by_kind:
-            bounded = np.flatnonzero(np.isfinite(st.state_bounds[0]) | np.isfinite(st.state_bounds[1]))
+            bounded = st.bounded_states
             inside = sorted(set(range(mesh.intervals + 1)) - set(starts))
-            states[np.ix_(np.array(inside, dtype=np.intp), bounded)] = by_kind["state_bounds"].reshape(
-                len(inside), bounded.size
-            )
+            states[np.ix_(np.array(inside, dtype=np.intp), np.array(bounded, dtype=np.intp))] = by_kind[
+                "state_bounds"
+            ].reshape(len(inside), len(bounded))
+        inside_states = zero.inside_states.copy()
+        if "bounds_inside" in by_kind:
+            bounded = st.bounded_states
+            inside_states[..., bounded] = by_kind["bounds_inside"].reshape(*inside_states.shape[:2], len(bounded))
         end = by_kind.get("end", zero.end)
         path = by_kind.get("path", zero.path.ravel()).reshape(zero.path.shape)
         costate = by_kind["gap_x"][-st.nx :]
@@ -176,6 +181,8 @@ class NLP:
             matrices=matrices,
             controls=parts["u"] / self.scales.u,
             gaps=np.hstack(gaps),
+            inside_path=by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape),
+            inside_states=inside_states,
         )
 
     def pack_multipliers(self, multipliers: Multipliers, costates: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -183,13 +190,17 @@ class NLP:
         starts = list(self.mesh.starts)
         inside = sorted(set(range(self.mesh.intervals + 1)) - set(starts))
         st = self.statement
-        bounded = np.flatnonzero(np.isfinite(st.state_bounds[0]) | np.isfinite(st.state_bounds[1]))
+        bounded = st.bounded_states
         known = ~np.isnan(st.boundary_values(st.values)[3])
         values = {
             "gap_x": costates[0][starts[1:]],
             "gap_e": costates[1][starts[1:]],
-            "state_bounds": multipliers.states[np.ix_(np.array(inside, dtype=np.intp), bounded)],
+            "state_bounds": multipliers.states[
+                np.ix_(np.array(inside, dtype=np.intp), np.array(bounded, dtype=np.intp))
+            ],
+            "bounds_inside": multipliers.inside_states[..., bounded],
             "path": multipliers.path,
+            "path_inside": multipliers.inside_path,
             "start": multipliers.start,
             "end": multipliers.end,
             "final_matrices": multipliers.final_matrices[known],
@@ -203,6 +214,28 @@ class NLP:
         if st.duration.free:
             lam_x.append(np.zeros(1))
         return np.concatenate([v.ravel() for v in lam_x]), np.concatenate([np.zeros(0), *lam_g])
+
+    def units(self, scales: Scales) -> Array:
+        """Other magnitudes of the variables, in the units of this NLP, an entry for each variable."""
+        st, count, nodes = self.statement, len(self.mesh.starts), self.mesh.control_nodes
+        parts = [np.tile(scales.x / self.scales.x, count)]
+        if not self.mesh.eliminated:
+            parts.append(np.tile(scales.e / self.scales.e, count))
+        parts.append(np.broadcast_to(scales.u / self.scales.u, (nodes, st.nu)).ravel())
+        if st.duration.free:
+            parts.append(np.array([scales.duration / self.scales.duration]))
+        return np.concatenate(parts)
+
+    def row_units(self, scales: Scales) -> Array:
+        """Other magnitudes of what the rows of g compare, in units of these rows; 1 where rows have no magnitude."""
+        whole = {"gap_x": scales.x, "gap_e": scales.e}
+        parts = [
+            np.tile(whole[rows.kind], rows.lower.size // whole[rows.kind].size) / rows.scale
+            if rows.kind in whole
+            else np.ones(rows.lower.size)
+            for rows in self.rows
+        ]
+        return np.concatenate([np.zeros(0), *parts])
 
     def _split(self, w: Array) -> dict[str, Array]:
         """Parts of a vector of the size of the variables, a row for each node."""
@@ -235,3 +268,37 @@ def _fix(lower: Array, upper: Array, values: Array) -> None:
     """Fix the entries that have a value (in place)."""
     known = ~np.isnan(values)
     lower[known] = upper[known] = values[known]
+
+
+def check_finite(nlp: NLP, w: Array, parameters: Array) -> None:
+    """The cost must be finite where a solver starts: the running cost on the way, the terminal cost at the end.
+
+    Raises:
+        OutsideDomainError: names the part that is not.
+    """
+    trajectory, values = nlp.unpack(w, parameters)
+    check_costs(trajectory, values["running"], values["terminal"])
+
+
+def check_costs(trajectory: Trajectory, running: float, terminal: float) -> None:
+    """Costs of a first trajectory must be finite.
+
+    Raises:
+        OutsideDomainError: names the one that is not.
+    """
+    for name, value, where in (("running", running, "along"), ("terminal", terminal, "at the end of")):
+        if not np.isfinite(value):
+            last = np.array2string(trajectory.x[-1], precision=4, threshold=8)
+            remedy = "give another guess of controls or states, or bounds that keep the model in its domain"
+            if np.isfinite(trajectory.x).all() and not np.isfinite(trajectory.e).all():
+                remedy = (
+                    "the steps of the matrices are too long: use covariance_step='gauss', more substeps or intervals"
+                )
+            raise OutsideDomainError(
+                describe(
+                    f"The cost '{name}' is {value} {where} the initial guess.",
+                    expected="a finite cost where the solver starts",
+                    received=f"final state {last}, T = {trajectory.duration:g} s",
+                    remedy=remedy,
+                )
+            )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,24 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.closed_loop import ClosedLoop
+from covocp.convergence import complementary
 from covocp.curvature import smallest_curvature
 from covocp.extremal import Extremal
-from covocp.guess import quadrature_weights
+from covocp.fine import fine_trajectory, prolongation, refined
+from covocp.guess import state_jacobian
 from covocp.hamiltonian import (
     Costates,
     along,
     discrete_costates,
     duration_slope,
-    fine_trajectory,
     hamiltonian,
     integrated_costates,
     passage_end,
 )
 from covocp.matrices import Array
+from covocp.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.slope_terms import slope_sizes, slope_terms
+from covocp.steering import quadrature_weights
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
+# Costs below this count as zero.
+NO_COST = 1e-12
 # Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
 QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
 
@@ -41,6 +45,8 @@ class Optimality:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
             neighbourhood of a node), bounds' multipliers included; relative to the largest sum of the
             absolute terms of H_u (or |H_uu| |u|, where more).
+        complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
+            cost: a multiplier of a bound that is not active makes a slope look like none.
         control_slope: root mean square of H_u at the nodes with free controls; of the order of the square of the
             interval for piecewise-linear controls; same normalisation.
         costate_difference: largest difference between the costates of the multipliers and those integrated backward,
@@ -51,10 +57,11 @@ class Optimality:
         mesh_error: relative change of the cost by halving the integration steps.
         control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
-        curvature: smallest eigenvalue of the reduced Hessian, relative to its largest; None where it cannot be had.
-            Negative: the solution is a saddle.
-        cost_identity: relative difference of both forms of the expected cost, (E-1) from the covariances of the loop
-            and (E-20) from S; None without a closed loop.
+        curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
+            to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
+            had. Negative: the solution is a saddle.
+        cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
+            cost (E-1) from the covariances of the loop; None without a closed loop.
         cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
             without a closed loop.
         conservation: largest relative error of the variances E + Xhat that no control changes, such as those of unknown
@@ -70,6 +77,7 @@ class Optimality:
     control_error: float | None
     smallest_eigenvalue: float
     curvature: float | None
+    complementarity: float | None = None
     cost_identity: float | None = None
     cross_covariance: float | None = None
     conservation: float | None = None
@@ -92,6 +100,7 @@ def assess(
     mesh_error: float,
     smallest_eigenvalue: float,
     loop: ClosedLoop | None = None,
+    cost_identity: float | None = None,
 ) -> Optimality:
     """Evaluate all necessary conditions along an extremal.
 
@@ -101,6 +110,7 @@ def assess(
         mesh_error: estimated before.
         smallest_eigenvalue: of its covariances.
         loop: its closed loop.
+        cost_identity: difference of its cost and of that from the covariances of the loop.
 
     Returns:
         The record.
@@ -119,7 +129,7 @@ def assess(
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
         if not st.path.size:
             control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
-            control_error = _control_error(extremal, costates, free)
+            control_error = _control_error(extremal, costates, free[:-1] & free[1:])
     return Optimality(
         stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
         control_slope=control_slope / scale,
@@ -130,11 +140,37 @@ def assess(
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=_curvature(extremal),
+        complementarity=complementarity(extremal),
+        cost_identity=cost_identity,
         **_loop_identities(loop),
     )
 
 
-def identities(mesh_error: float, smallest_eigenvalue: float, loop: ClosedLoop | None) -> Optimality:
+def complementarity(extremal: Extremal) -> float:
+    """Sum of |multiplier| times distance from the bound, of controls, states, matrices and conditions, by the cost."""
+    extremal = refined(extremal)  # limits act at all its nodes
+    st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
+    columns = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    groups: list[tuple[Array, Array, Array, Array]] = [
+        (m.controls, t.u, *st.control_bounds),
+        (m.states, t.x, *st.state_bounds),
+        (m.matrices, t.e, st.matrix_lower, np.full(st.ne, np.inf)),
+    ]
+    for conditions, weights, at in ((st.path, m.path, slice(None)), (st.start, m.start, 0), (st.end, m.end, count - 1)):
+        if conditions.size:
+            rows = np.asarray(conditions.function.map(count)(*columns).full()).T
+            groups.append((weights, rows[at], conditions.lower, conditions.upper))
+    total = 0.0
+    for weights, values, lower, upper in groups:
+        kept, distance = complementary(weights, values, lower, upper)
+        total += float(np.sum(np.abs(kept) * distance))
+    return total / max(_absolute_cost(extremal), NO_COST)
+
+
+def identities(
+    mesh_error: float, smallest_eigenvalue: float, loop: ClosedLoop | None, cost_identity: float | None
+) -> Optimality:
     """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
     return Optimality(
         stationarity=None,
@@ -146,6 +182,7 @@ def identities(mesh_error: float, smallest_eigenvalue: float, loop: ClosedLoop |
         control_error=None,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=None,
+        cost_identity=cost_identity,
         **_loop_identities(loop),
     )
 
@@ -155,14 +192,10 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
     if loop is None:
         return {}
     tiny = np.finfo(float).tiny
-    identity = None
-    if loop.other_cost is not None:
-        identity = abs(loop.expected_cost - loop.other_cost) / max(abs(loop.other_cost), tiny)
     errors, estimates = (np.sqrt(np.diagonal(v, axis1=1, axis2=2).clip(0.0)) for v in (loop.E, loop.X))
     size = errors[:, :, None] * estimates[:, None, :]
     cross = np.abs(loop.Z) / np.where(size > tiny, size, np.inf)
     return {
-        "cost_identity": identity,
         "cross_covariance": float(cross.max(initial=0.0)),
         "conservation": loop.conservation,
     }
@@ -191,6 +224,8 @@ def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array,
 def _path_slopes(extremal: Extremal) -> Array:
     """Slopes by the control values of the path constraints times their multipliers."""
     st, mesh = extremal.statement, extremal.mesh
+    if mesh.points > 1:
+        return np.asarray(prolongation(mesh).T @ _path_slopes(refined(extremal)))
     result = np.zeros((mesh.control_nodes, st.nu))
     if not st.path.size:
         return result
@@ -211,8 +246,12 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
-    (not `free`, at the nodes) do not count; nan where H_uu is not positive definite.
+    (not `free`, of each interval) do not count; nan where H_uu is not positive definite.
     """
+    points = extremal.mesh.points
+    if points > 1:  # costates jump inside the intervals
+        fine = refined(extremal)
+        return _control_error(fine, discrete_costates(fine)[0], np.repeat(free, points, axis=0))
     st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
     values = fine_trajectory(extremal, 2 * mesh.substeps)
     h = np.diff(extremal.time)[:, None]
@@ -235,7 +274,7 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
             costate[:, st.nx :].T,
         )
         slope, curvature = (np.asarray(v.full()) for v in function(*arguments))
-        slopes.append(np.where(free[:-1] & free[1:], slope.T, 0.0))
+        slopes.append(np.where(free, slope.T, 0.0))
         curvatures.append(curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2))
     if (np.linalg.eigvalsh(curvatures)[..., 0] <= 0).any():
         return float("nan")
@@ -259,15 +298,30 @@ def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
     return np.hstack(along(function, extremal, costates))
 
 
-def _costate_difference(extremal: Extremal, costates: Costates) -> float:
-    """Largest relative difference to the costates that are integrated backward."""
-    other = integrated_costates(extremal, max(1, extremal.mesh.substeps))
+def _costate_difference(extremal: Extremal, costates: Costates) -> float | None:
+    """Largest relative difference to the costates that are integrated backward; None where that would take too long."""
+    pairs = _explicit_pairs(extremal)
+    if pairs is None:
+        return None
+    other = integrated_costates(extremal, pairs)
     largest = 0.0
     for one, two in ((costates.state, other.state), (costates.matrices, other.matrices)):
         size = np.abs(one).max(initial=0.0)
         if size > 0:
             largest = max(largest, float(np.abs(one - two).max() / size))
     return largest
+
+
+def _explicit_pairs(extremal: Extremal) -> int | None:
+    """Explicit steps an interval for the adjoint equations; None where a stiff nominal would need too many."""
+    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
+    if mesh.step != "rodas":
+        return max(1, mesh.substeps)
+    slopes = np.asarray(state_jacobian(st).map(n + 1)(*extremal.columns()).full())
+    matrices = slopes.reshape(st.nx, n + 1, st.nx).transpose(1, 0, 2)
+    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=1)
+    needed = float((np.maximum(rates[1:], rates[:-1]) * np.diff(extremal.time)).max()) / STIFFNESS_PER_STEP
+    return int(np.ceil(needed)) if needed <= LARGEST_SUBSTEPS else None
 
 
 def _variation(values: Array) -> float:
@@ -277,6 +331,9 @@ def _variation(values: Array) -> float:
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
     """k_T + slope of the end conditions + int H_T dt + H(T), relative to the largest terms of H."""
+    if extremal.mesh.points > 1:  # costates jump inside the intervals
+        extremal = refined(extremal)
+        costates = discrete_costates(extremal)[0]
     st, trajectory = extremal.statement, extremal.trajectory
     duration = ca.MX.sym("T")
     value = st.terminal(trajectory.x[-1], trajectory.e[-1], duration, extremal.parameters)
@@ -298,36 +355,6 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array) -> fl
 
 def _curvature(extremal: Extremal) -> float | None:
     result = smallest_curvature(extremal)
-    return None if result is None else result.value / max(result.largest, np.finfo(float).tiny)
-
-
-def path_violations(extremal: Extremal, points: int) -> Mapping[str, float]:
-    """Largest violations of path constraints and state bounds at `points` parts of each interval, by name."""
-    st, mesh = extremal.statement, extremal.mesh
-    factor = 2 * points if st.running_uses_matrices else points
-    values = fine_trajectory(extremal, factor)
-    n = mesh.intervals
-    u = extremal.controls
-    c = np.arange(factor + 1) / factor
-    after = u[:-1] if mesh.control == "constant" else u[1:]
-    controls = u[:-1, None, :] + c[None, :, None] * (after - u[:-1])[:, None, :]
-    time = extremal.time[:-1, None] + c[None, :] * np.diff(extremal.time)[:, None]
-    count = n * (factor + 1)
-    z = values.reshape(count, -1)
-    result: dict[str, float] = {}
-    groups = [(st.state_names, z[:, : st.nx], *st.state_bounds)]
-    if st.path.size:
-        arguments = (
-            z[:, : st.nx].T,
-            controls.reshape(count, st.nu).T,
-            z[:, st.nx :].T,
-            time.reshape(1, count),
-            np.full((1, count), extremal.trajectory.duration),
-            np.tile(extremal.parameters[:, None], (1, count)),
-        )
-        rows = np.asarray(st.path.function.map(count)(*arguments).full()).T
-        groups.append((st.path.names, rows, st.path.lower, st.path.upper))
-    for names, rows, lower, upper in groups:
-        excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=-np.inf)
-        result |= {name: float(v) for name, v in zip(names, excess, strict=True) if v > 0}
-    return result
+    if result is None or result.verdict == "flat":
+        return None if result is None else 0.0
+    return result.value / max(result.largest, np.finfo(float).tiny)

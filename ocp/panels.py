@@ -11,9 +11,10 @@ import numpy as np
 
 from covocp.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.errors import ProblemError, describe
-from covocp.lookup import name_of
+from covocp.lookup import block_of, name_of, sizes_of
 from covocp.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.matrices import Array, half_indices
+from covocp.paths import over_panels
 from covocp.solution import Solution
 from covocp.statement import Block, Statement, entry_names
 
@@ -27,6 +28,13 @@ class Quantity:
 
     word: str
     of: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """Keys that share a panel."""
+
+    keys: tuple[Any, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,10 +71,10 @@ def choose_panels(
     for key in keys:
         panels += _of_key(drawn, key, blocks, units)
     for key in keys if costates else ():
-        if isinstance(key, str) and blocks[key].kind in ("state", "matrix"):
-            panels += _costates(drawn, blocks[key])
+        if isinstance(key, str) and (block := _block(key, blocks)).kind in ("state", "matrix"):
+            panels += _costates(drawn, block)
     panels = _explained_once(panels)
-    return panels if over is None else _over(drawn, panels, _resolved(solutions, over))
+    return panels if over is None else over_panels(drawn, panels, _resolved(solutions, over), units)
 
 
 def _explained_once(panels: list[Panel]) -> list[Panel]:
@@ -90,7 +98,7 @@ def _usual(drawn: list[Drawn], blocks: Mapping[str, Block]) -> list[Any]:
 
 def _varies(drawn: Drawn, block: Block) -> bool:
     """Whether a state is uncertain."""
-    deviation = drawn.deviation(block) if block.name in drawn.names else None
+    deviation = drawn.deviation(block) if drawn.knows(block.name) else None
     return deviation is not None and bool(np.any(deviation))
 
 
@@ -112,21 +120,61 @@ def _of_key(drawn: list[Drawn], key: Any, blocks: Mapping[str, Block], units: Ma
         if len(panels) == 1:
             return [replace(panels[0], label=key.label)]
         return [replace(panel, label=f"{key.label}: {panel.label}") for panel in panels]
+    if isinstance(key, Together):
+        return [_shared([panel for part in key.keys for panel in _of_key(drawn, part, blocks, units)])]
     if isinstance(key, Quantity):
         return _quantity([d for d in drawn if knows(d.solution, key.word)], key, blocks, units)
     if isinstance(key, tuple):
         return _pair(drawn, key, units)
     if not isinstance(key, str):
         return _expression(drawn, key)
-    if blocks[key].kind == "matrix":
-        return _matrix([(d, d.t, d.sample[key]) for d in drawn if key in d.names], blocks[key], units)
-    return _vector(drawn, blocks[key], units)
+    block = _block(key, blocks)
+    if block.kind == "matrix":
+        return _matrix([(d, d.t, d.sample[key]) for d in drawn if d.knows(key)], block, units)
+    return _vector(drawn, block, units)
+
+
+def _shared(panels: list[Panel]) -> Panel:
+    """Several panels as one whose entries they are; the unit stands on the axis where it is the same.
+
+    Raises:
+        ProblemError: there are none.
+    """
+    if not panels:
+        raise ProblemError(
+            describe(
+                "A panel has nothing to show.",
+                expected="a list of names or symbols that share it",
+                received="an empty list",
+                remedy="name what is to be drawn, or leave the list out",
+            )
+        )
+    entries: list[str] = []
+    curves: list[Curve] = []
+    parts = [panel.label.rpartition(" [") if panel.label.endswith("]") else ("", "", panel.label) for panel in panels]
+    plain = [name or whole for name, _, whole in parts]
+    units = {unit if name else "" for name, _, unit in parts}
+    for panel, name in zip(panels, plain, strict=True):
+        curves += [replace(curve, entry=curve.entry + len(entries)) for curve in panel.curves]
+        own = name if len(units) == 1 else panel.label
+        entries += [own] if len(panel.entries) == 1 else list(panel.entries)
+    unit = units.pop() if len(units) == 1 else ""
+    label = shortened(", ".join(plain)) + (f" [{unit}" if unit else "")
+    bounds = tuple(dict.fromkeys(bound for panel in panels for bound in panel.bounds))
+    return Panel(label=label, entries=tuple(entries), curves=tuple(curves), bounds=bounds)
+
+
+def _block(name: str, blocks: Mapping[str, Block]) -> Block:
+    """Where a name that was found, or an entry of it, lies."""
+    found = block_of(name, blocks.values())
+    assert found is not None
+    return found
 
 
 def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Root mean squares, gains or covariances, of the solutions that have them."""
     if isinstance(key.of, str):
-        drawn = [d for d in drawn if key.of in d.names]
+        drawn = [d for d in drawn if d.knows(key.of)]
     if key.word in (GAIN, FILTER):
         return gain(drawn, key.word, key.of, units)
     if key.word == RMS:
@@ -149,6 +197,8 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
         if word and any(knows(solution, word) for solution in solutions) and not _declared(solutions, word):
             return Quantity(word=word, of=_uncertain(solutions, word, key[1]))
         return tuple(_resolved(solutions, part) for part in key)
+    if isinstance(key, list):
+        return Together(keys=tuple(_resolved(solutions, part) for part in key))
     error: ProblemError | None = None
     if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
         if any(knows(solution, key) for solution in solutions):
@@ -156,7 +206,8 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
         raise _unknown_word(key)
     for solution in solutions:
         try:
-            return name_of(key, solution.symbols, tuple(b.name for b in solution.blocks))
+            names = tuple(b.name for b in solution.blocks)
+            return name_of(key, solution.symbols, names, sizes=sizes_of(solution.blocks))
         except ProblemError as unknown:
             error = unknown
     if error is None or isinstance(key, ca.MX):
@@ -177,7 +228,7 @@ def _uncertain(solutions: list[Solution], word: str, key: Any) -> Any:
     if word == RMS:
         loops = [solution for solution in solutions if solution.loop is not None]
         names |= {b.name for solution in loops for b in solution.blocks if b.kind == "control" and b.name != GAIN}
-    if not isinstance(of, str) or of not in names:
+    if not isinstance(of, str) or not names & {of, of.split("[")[0]}:
         raise ProblemError(
             describe(
                 f"There is no ('{word}', {shortened(key)}).",
@@ -205,33 +256,6 @@ def _unknown_word(word: str) -> ProblemError:
             remedy="draw something else",
         )
     )
-
-
-def _over(drawn: list[Drawn], panels: list[Panel], key: Any) -> list[Panel]:
-    """The panels with another quantity than time as abscissa.
-
-    Raises:
-        ProblemError: it is not a scalar.
-    """
-    changed = []
-    for panel in panels:
-        curves = []
-        for curve in panel.curves:
-            solution = drawn[curve.order].solution
-            at_nodes = solution[key]
-            if at_nodes.ndim != 1:
-                raise ProblemError(
-                    describe(
-                        "The abscissa of a figure is one number at each time.",
-                        expected="a scalar state, control or expression",
-                        received=f"{shortened(key)}, {at_nodes[0].size} numbers",
-                        remedy="choose over= among the scalars, or one entry of it",
-                    )
-                )
-            smooth = solution.at(curve.t)[key] if isinstance(key, str) else np.interp(curve.t, solution.t, at_nodes)
-            curves.append(replace(curve, t=smooth))
-        changed.append(replace(panel, curves=tuple(curves)))
-    return changed
 
 
 def abscissa_label(solutions: list[Solution], over: Any, units: Mapping[str, str]) -> str:
@@ -265,13 +289,13 @@ def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
     """A state with its band and target, a control, an unknown or a parameter with its band."""
     curves = []
     for d in drawn:
-        if block.name not in d.names:
+        if not d.knows(block.name):
             continue
         own = d.solution.block(block.name)
         t, values = d.t, d.sample[block.name]
         steps = own.kind == "control" and d.solution.mesh.control == "constant"
         if steps:
-            t, values = d.solution.t, d.solution.values[block.name]
+            t, values = d.solution.t, d.solution[block.name]
         values = values.reshape(t.size, -1)
         deviation = d.deviation(own) if own.kind in ("state", "unknown", "control") else None
         target = d.target(own)
@@ -310,6 +334,7 @@ def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Array) ->
         Panel(
             label=entry + suffix,
             entries=(entry,),
+            key=entry,
             curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
             bounds=tuple(float(b) for b in bounds[:, i] if np.isfinite(b)),
         )
@@ -370,7 +395,7 @@ def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) ->
 
 def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
     """Costates of a state or a matrix, at the nodes."""
-    chosen = [d for d in drawn if block.name in d.names]
+    chosen = [d for d in drawn if d.knows(block.name)]
     name = f"costate of {block.name}"
     if block.kind == "state":
         curves = [

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.arguments import checked, either, optional, positives, sequence, text, texts_by_name, truth
 from covocp.curves import Panel
 from covocp.errors import ProblemError, describe, no_option
-from covocp.files import written_whole
+from covocp.files import check_target, written_whole
+from covocp.legends import fold_title, place_legend
 from covocp.panels import abscissa_label, choose_panels
+from covocp.paths import outline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +38,9 @@ TARGET: dict[str, Any] = {
     "markeredgecolor": "black",
     "markeredgewidth": 0.9,
 }
+START: dict[str, Any] = {"marker": "s", "markersize": 4.0, "markerfacecolor": "black", "markeredgecolor": "black"}
+ELLIPSE_WIDTH = 0.7
+PATH_MARGIN = 0.05  # of the range, on both sides
 BAND = 0.13  # opacity
 NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
 # Curves that change by less than this share of their size are drawn as constants: what is left is a solver's tolerance.
@@ -44,7 +50,6 @@ PANEL = (3.3, 2.15)  # width, height in inches
 LONGEST_LINE = 26  # characters along the height of a panel
 SINGLE = (4.8, 3.2)  # of a panel alone
 HEAD = 0.6  # inches for title and legend
-LEGEND_HANDLE, LEGEND_LETTER = 0.62, 0.067  # inches of a line with its blanks, and of a letter
 RESOLUTION = 200  # dots an inch
 # Backends of matplotlib that show nothing by themselves.
 SILENT = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
@@ -72,6 +77,15 @@ STYLE: Any = {
 }
 
 
+@checked(
+    "plot()",
+    labels=optional(either(text, sequence)),
+    costates=truth,
+    gains=truth,
+    sigmas=positives,
+    units=optional(texts_by_name),
+    title=optional(text),
+)
 def plot_solutions(
     solutions: Sequence[Solution],
     *names: Any,
@@ -88,8 +102,9 @@ def plot_solutions(
 
     Args:
         solutions: one or more, of the same problem or of problems with the same names.
-        names: what to draw: symbols or names of states, controls, unknowns and matrices, pairs of states and unknowns
-            (entries of the covariance of the actual deviations), other expressions of the problem's symbols. Besides
+        names: what to draw: symbols or names of states, controls, unknowns and matrices, or entries of them ("p[0]"),
+            pairs of states and unknowns (entries of the covariance of the actual deviations), other expressions of the
+            problem's symbols; a list of them shares a panel: plot(["x", "y"]). Besides
             "rms" (root mean squares), "C" and "K" (gains of feedback and filter), "X", "Xhat" and "Z" (covariances of
             the closed loop); ("rms", h), ("C", h), ("K", h) those of one symbol, or of an expression ("rms"). A dict
             gives labels: {"load factor [g]": expression}. None: states, controls and unknowns with bands, then
@@ -97,7 +112,9 @@ def plot_solutions(
         labels: of the solutions, for the legend; by default what tells them apart.
         costates: whether to draw the costates of the states and matrices drawn.
         gains: whether to add the gains of feedback and filter.
-        over: what is the abscissa: a scalar state, control or expression; None: time.
+        over: what is the abscissa: a scalar state, control or expression; None: time. Of one state over another the
+            figure is a path, with ellipses of their covariance in place of bands, and axes of the same scale where the
+            units agree.
         sigmas: widths of the bands in standard deviations, such as (1, 3); (): none. The bands are those of the actual
             states, of what the feedback adds to the controls, and of the estimates of the unknowns.
         units: by name, for the axes, such as {"y": "m"}, where the problem does not say or says something else.
@@ -113,6 +130,8 @@ def plot_solutions(
     """
     import matplotlib
 
+    if path is not None:
+        check_target(path, SUFFIXES)
     given = list(solutions)
     legend = _labels(given, labels)
     known = {block.name: block.unit for solution in given for block in solution.blocks}
@@ -226,7 +245,7 @@ def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: 
         if not s.converged
     ]
     if lines := [_plain(line) for line in (text, *failed) if line]:
-        figure.suptitle("\n".join(lines), fontsize=10, color=WARNING if failed else "black")
+        figure.suptitle(fold_title(figure, lines), fontsize=10, color=WARNING if failed else "black")
 
 
 def _legend(
@@ -249,23 +268,18 @@ def _legend(
         handles.append(
             Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths} standard deviation{plural}")
         )
+    if sigmas and any(panel.ellipses for panel in panels):
+        widths = " and ".join(f"{width:g}" for width in sigmas)
+        plural = "s" if sigmas[-1] != 1 else ""
+        label = f"ellipses of {widths} standard deviation{plural}"
+        handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=label))
+    if any(panel.path for panel in panels):
+        handles.append(Line2D([], [], linestyle="none", label="start", **START))
     if any(curve.target is not None for curve in curves):
         handles.append(Line2D([], [], linestyle="none", label="required at the end", **TARGET))
     if any(_near_bounds(panel) for panel in panels):
         handles.append(Line2D([], [], label="bound", **BOUND))
-    if handles:
-        labels = [str(handle.get_label()) for handle in handles]
-        ncols = _legend_columns(labels, figure.get_figwidth())
-        figure.legend(handles=handles, loc="outside lower center", ncols=ncols)
-
-
-def _legend_columns(labels: list[str], width: float) -> int:
-    """As many columns, filled one after the other, as fit into a width in inches."""
-    for columns in range(len(labels), 1, -1):
-        longest = [max(map(len, part)) for part in np.array_split(labels, columns)]
-        if sum(LEGEND_HANDLE + LEGEND_LETTER * n for n in longest) <= width:
-            return columns
-    return 1
+    place_legend(figure, handles)
 
 
 def _line(i: int) -> dict[str, Any]:
@@ -297,11 +311,17 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
             for edge in (low, high):
                 axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7, drawstyle=style)
         axes.plot(curve.t, curve.y, drawstyle=style, **line)
+    for ellipse in panel.ellipses:
+        for width in sigmas:
+            x, y = ellipse.centre[:, None] + outline(ellipse.covariance, width)
+            axes.plot(x, y, color=_line(ellipse.order)["color"], linewidth=ELLIPSE_WIDTH, alpha=0.8)
     _targets(axes, panel)
     for bound in _near_bounds(panel):
         axes.axhline(bound, zorder=1, **BOUND)
     axes.set_ylabel(_plain(_folded(panel.label)))
-    axes.margins(x=0)
+    axes.margins(x=PATH_MARGIN if panel.path else 0)
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="datalim")
     low, high = axes.dataLim.intervaly
     size = max(abs(low), abs(high))
     if 0 < high - low < CONSTANT * size:
@@ -311,8 +331,10 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
 
 
 def _targets(axes: Axes, panel: Panel) -> None:
-    """Circles where states must arrive."""
+    """Circles where states must arrive, and squares where paths start."""
     for curve in panel.curves:
+        if panel.path:
+            axes.plot(curve.t[:1], curve.y[:1], linestyle="none", zorder=5, **START)
         if curve.target is not None:
             axes.plot([curve.t[-1]], [curve.target], linestyle="none", clip_on=False, zorder=5, **TARGET)
 

@@ -7,6 +7,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.arguments import checked, text
+from covocp.boundary import check_free, end_value
 from covocp.checks import (
     as_expression,
     as_number,
@@ -14,7 +16,6 @@ from covocp.checks import (
     caller,
     check_bounds,
     check_constrains,
-    check_density,
     check_inside,
     check_kind,
     check_limits,
@@ -24,9 +25,9 @@ from covocp.checks import (
     check_symmetric,
     column,
     column_expression,
-    data_column,
     density_matrix,
     find_name,
+    is_scalar,
     is_symbolic,
     scale_column,
 )
@@ -51,10 +52,13 @@ from covocp.errors import ProblemError, describe
 from covocp.estimation import EstimationCovariance, augmented_names
 from covocp.expected import check_first_cost, derive, expected_cost
 from covocp.freeze import freeze
+from covocp.information import stated_noise
 from covocp.matrices import pack_symbolic
 from covocp.statement import Statement
+from covocp.threads import methods_one_at_a_time
 
 
+@methods_one_at_a_time
 class Problem:
     """An optimal control problem whose state holds vectors and symmetric (covariance) matrices.
 
@@ -86,6 +90,7 @@ class Problem:
         self.cost: tuple[ca.MX, ca.MX] | None = None
         self.expected: Expected | None = None
         self.expansion: Expansion | None = None
+        self._mentioned = False  # whether what may be forgotten in it was said
         self._frozen: Statement | None = None
 
     def __repr__(self) -> str:
@@ -105,6 +110,7 @@ class Problem:
         """Symbol of the terminal time [s], or its number where it is fixed."""
         return self._duration
 
+    @checked(unit=text)
     def state(
         self,
         name: str,
@@ -124,8 +130,9 @@ class Problem:
         Args:
             name: unique name.
             shape: number of components.
-            initial: start values, shape () or (shape,); numbers or expressions in parameters; None or NaN: free.
-            final: values to reach at the end; None or NaN: free.
+            initial: start values, shape () or (shape,); numbers or expressions in parameters; None, also in a sequence:
+                free.
+            final: values to reach at the end; None, also in a sequence such as [1.0, None]: free.
             lower: lower bounds along the path, at the nodes of the mesh.
             upper: upper bounds along the path, at the nodes of the mesh.
             guess: a number, an array over the nodes, or a function of s = t/T; None: simulated from the controls.
@@ -143,18 +150,14 @@ class Problem:
         size = self._declare(name, shape)
         low, high = bound_columns(name, lower, upper, size)
         check_bounds(name, low, high)
-        free = np.full(size, np.nan)
-        for what, value in (("initial", initial), ("final", final)):
-            if value is not None and not is_symbolic(value):
-                check_inside(name, what, column(name, f"{what} value", value, size, nan=True), low, high)
         declaration = State(
             name=name,
             symbol=ca.MX.sym(name, size),
             size=size,
             where=caller(),
             unit=unit,
-            initial=data_column(name, "initial value", free if initial is None else initial, size, nan=True),
-            final=data_column(name, "final value", free if final is None else final, size, nan=True),
+            initial=end_value(name, "initial", initial, low, high),
+            final=end_value(name, "final", final, low, high),
             lower=low,
             upper=high,
             guess=guess,
@@ -164,6 +167,7 @@ class Problem:
         self.states.append(declaration)
         return declaration.symbol
 
+    @checked(unit=text)
     def unknown(self, name: str, mean: Any, variance: Any, *, unit: str = "") -> ca.MX:
         """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
 
@@ -192,6 +196,7 @@ class Problem:
         self.unknowns.append(declaration)
         return declaration.symbol
 
+    @checked(unit=text)
     def parameter(self, name: str, value: Any, *, unit: str = "") -> ca.MX:
         """Declare a known number (or vector) that may change from solve to solve without rebuilding.
 
@@ -210,6 +215,7 @@ class Problem:
         self.parameters.append(declaration)
         return declaration.symbol
 
+    @checked(unit=text)
     def control(
         self,
         name: str,
@@ -246,6 +252,7 @@ class Problem:
         self.controls.append(declaration)
         return declaration.symbol
 
+    @checked(unit=text)
     def symmetric(
         self,
         name: str,
@@ -262,7 +269,7 @@ class Problem:
         Args:
             name: unique name.
             size: number of rows.
-            initial: matrix (size, size), or a scalar where size is 1; None or NaN entries: free.
+            initial: matrix (size, size), or a scalar where size is 1; None, or None for an entry: free.
             final: as `initial`; None: free.
             lower: lower bound of the diagonal entries at the nodes; 0 or more also declares it positive semidefinite.
             guess: a matrix, used where the matrix is an NLP variable and cannot be simulated; None: simulated.
@@ -276,6 +283,8 @@ class Problem:
                 initial matrix that is not positive semidefinite.
         """
         size = self._declare(name, size)
+        for what, value in (("initial value", initial), ("final value", final)):
+            check_free(name, what, value)
         lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
         if lower is not None and initial is not None and not is_symbolic(initial):
             diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
@@ -370,27 +379,33 @@ class Problem:
                     remedy="remove one of them",
                 )
             )
-        self.rates[name] = Dynamics(rate=value, noise=density, where=caller())
+        one = density is not None and is_scalar(noise)
+        self.rates[name] = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
         self._frozen = None
 
-    def measurement(self, name: str, expression: Any, noise: Any, *, unit: str = "") -> None:
+    @checked(unit=text)
+    def measurement(
+        self, name: str, expression: Any, noise: Any = None, *, information: Any = None, unit: str = ""
+    ) -> None:
         """Add a continuous measurement m = expression + v with white noise v.
 
         Args:
             name: unique name.
             expression: of states, unknowns, controls and time, shape (m, 1).
             noise: power spectral density of v: scalar, vector (diagonal) or matrix (correlated), positive definite.
+            information: its inverse in place of it: scalar or vector (diagonal), not negative. Where it is zero nothing
+                is measured: a sensor that a control switches off, information=w/U, w in [0, 1].
             unit: for exported code.
 
         Raises:
-            ProblemError: name used twice, density singular, negative or of the wrong size.
+            ProblemError: name used twice, singular, negative or of the wrong size, both or neither given.
         """
         value = column_expression(name, "measurement", expression)
         size = self._declare(name, value.shape[0])
-        density = density_matrix(name, "noise density", noise, size)
-        if density.is_constant():
-            check_density(name, "noise density", ca.evalf(density).full(), definite=True)
-        self.measurements.append(Measurement(name=name, expression=value, noise=density, unit=unit, where=caller()))
+        density, inverse = stated_noise(name, noise, information, size)
+        self.measurements.append(
+            Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
+        )
 
     def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].
@@ -426,7 +441,8 @@ class Problem:
         Args:
             running: L(x, u, t), scalar, cost per second.
             terminal: k(x(T), T), scalar.
-            terminal_weight: added to k_xx, by symbol or name: {x: 2.0}; what missing a prescribed final value costs.
+            terminal_weight: added to k_xx, by symbol or name, also of an entry: {x: 2.0, p[0]: 1.0}; what missing a
+                prescribed final value costs.
             control_weight: weight B of the deviations of the controls, by symbol or name, in place of L_uu; needed
                 where L_uu is not positive definite.
             gain: constraints on the gain C (structure, constancy, bounds); None: the best one.
@@ -443,9 +459,10 @@ class Problem:
     ) -> None:
         """Require lower <= expression <= upper.
 
-        Path constraints hold at the nodes of the mesh; `Solution.check_path` looks between them. With constant
-        controls a path constraint holds at each node with the control of the interval that starts there (at the last
-        node: the last control).
+        Path constraints hold at the nodes of the mesh, and at the ends of the integration steps where an interval has
+        several (`points=` of `solve`); `Solution.check_path` looks between them. With constant controls a path
+        constraint holds at each node with the control of the interval that starts there (at the last node: the last
+        control).
 
         Args:
             expression: of states, controls, matrix states, time; a column or a scalar.
@@ -458,7 +475,7 @@ class Problem:
             ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place.
         """
         label = name if name is not None else f"constraint {len(self.constraints) + 1}"
-        if at not in ("path", "initial", "final"):
+        if not isinstance(at, str) or at not in ("path", "initial", "final"):
             raise ProblemError(
                 describe(
                     f"'{label}' has an unknown place.",
@@ -488,7 +505,7 @@ class Problem:
     def _declare(self, name: str, size: Any) -> int:
         """Check that the name is new and the size sensible; forget the frozen statement."""
         check_name(name, self._declared)
-        self._frozen = None
+        self._frozen, self._mentioned = None, False
         return check_size(name, size)
 
     @property

@@ -60,6 +60,17 @@ class Progress:
         if self._status is not None:
             self._status.update(f"{self._title}: iteration {iteration}, cost {cost:.8g}, violation {violation:.1e}")
 
+    def say(self, what: str) -> None:
+        """Report what is being done where nothing is iterated; a Ctrl-C since the last report interrupts here.
+
+        Raises:
+            KeyboardInterrupt: it was pressed.
+        """
+        if self.stop:
+            raise KeyboardInterrupt
+        if self._status is not None:
+            self._status.update(f"{self._title}: {what}")
+
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.stop:
             raise KeyboardInterrupt

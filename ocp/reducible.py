@@ -1,8 +1,8 @@
 """Whether a problem meets the conditions under which the information of its parameters is quadratic in the control.
 
 The conditions of `reduction` and of the lower bound in `certify`. Expressions are examined by their structure: a
-Jacobian is constant where it contains no state and no control. So an expression that is affine only after cancellation,
-or only in a range, is refused.
+Jacobian is constant where it contains no state and no control, and the expression has no kinks or jumps in them. So an
+expression that is affine only after cancellation, or only in a range, is refused.
 """
 
 from __future__ import annotations
@@ -12,14 +12,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.kinks import kinked
 from covocp.matrices import Array, is_semidefinite, unpack, unpack_costate
 from covocp.reduction import Parts, parts
 from covocp.statement import Conditions, Statement
 
 # A correlation at the start, or a weight outside E_bb, counts as none below this share of the largest entry.
 NEGLIGIBLE = 1e-12
-# Times at which the running cost must be strictly convex in the control.
-CONVEXITY_TIMES = 11
+# Times at which the running cost must be strictly convex in the control, a prime number of intervals so that few waves
+# fall between them all, and the least values between which lower ones are looked for.
+CONVEXITY_TIMES = 2004
+CONVEXITY_MINIMA = 10
 
 
 def why_not(statement: Statement, parameters: Array) -> str:
@@ -72,12 +75,14 @@ def _start(statement: Statement, parameters: Array) -> str:
 
 def _varying(rows: Any, z: Any) -> list[int]:
     """Rows of a matrix that depend on state or control."""
-    return [i for i in range(rows.shape[0]) if ca.depends_on(rows[i, :], z)]
+    return [i for i in range(rows.shape[0]) if ca.depends_on(rows[i, :], z) or kinked(rows[i, :], z)]
 
 
 def _slopes_vary(rows: Any, z: Any) -> list[int]:
     """Rows of a matrix that are not affine in state and control."""
-    return [i for i in range(rows.shape[0]) if ca.depends_on(ca.jacobian(ca.vec(rows[i, :]), z), z)]
+    return [
+        i for i in range(rows.shape[0]) if ca.depends_on(ca.jacobian(ca.vec(rows[i, :]), z), z) or kinked(rows[i, :], z)
+    ]
 
 
 def _models(statement: Statement, given: Parts) -> str:
@@ -118,15 +123,19 @@ def _costs(statement: Statement, given: Parts, parameters: Array) -> str:
         return "the running cost depends on the covariance"
     nx, symbolic = statement.nx, statement.symbolic
     hessian = ca.hessian(given.running, given.z)[0]
+    if kinked(given.running, given.z):
+        return "the running cost has kinks or jumps in state or control"
     if ca.depends_on(hessian, given.z):
         return "the running cost is not quadratic in state and control"
     energy = ca.Function("energy", [given.z, given.time], [ca.densify(hessian[nx:, nx:])])
-    for t in np.linspace(0.0, statement.duration.guess, CONVEXITY_TIMES):
-        if np.linalg.eigvalsh(np.asarray(energy(0, t).full()))[0] <= 0:
-            return "the running cost is not strictly convex in the control"
+    at = _not_convex(energy, statement.duration.guess, ca.depends_on(hessian, given.time))
+    if at is not None:
+        return f"the running cost is not strictly convex in the control (at t = {at:.6g} s)"
     x, e = symbolic.sym("x", nx), symbolic.sym("e", statement.ne)  # type: ignore[attr-defined]
     arguments = [x, e, symbolic(statement.duration.guess), symbolic(ca.DM(parameters))]
     value = statement.terminal.call(arguments, True, False)[0]
+    if kinked(value, ca.vertcat(x, e)):
+        return "the terminal cost has kinks or jumps"
     if ca.depends_on(ca.gradient(value, e), ca.vertcat(x, e)):
         return "the terminal cost is not linear in the covariance"
     if ca.depends_on(ca.hessian(value, x)[0], x):
@@ -136,6 +145,32 @@ def _costs(statement: Statement, given: Parts, parameters: Array) -> str:
     if outside > NEGLIGIBLE * np.abs(C).max():
         return "the terminal cost weighs entries of the covariance other than those of the parameters"
     return "" if is_semidefinite(C) else "the weight of the parameters' covariance is not positive semidefinite"
+
+
+def _not_convex(energy: ca.Function, duration: float, varies: bool) -> float | None:
+    """A time at which L_uu is not positive definite; None where there is none.
+
+    Where it varies, many times are looked at, and between those where its smallest eigenvalue is least.
+    """
+
+    def smallest(t: float) -> float:
+        return float(np.linalg.eigvalsh(np.asarray(energy(0, t).full()))[0])
+
+    if not varies:
+        return None if smallest(0.0) > 0 else 0.0
+    from scipy.optimize import minimize_scalar  # here: importing scipy takes longer than all of covocp
+
+    times = np.linspace(0.0, duration, CONVEXITY_TIMES)
+    columns = np.asarray(energy.map(times.size)(np.zeros((energy.size1_in(0), times.size)), times[None, :]).full())
+    nu = columns.shape[0]
+    values = np.linalg.eigvalsh(columns.reshape(nu, times.size, nu).transpose(1, 0, 2))[:, 0]
+    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
+    for k in inner[np.argsort(values[inner])][:CONVEXITY_MINIMA]:
+        found = minimize_scalar(smallest, bounds=(times[k - 1], times[k + 1]), method="bounded")
+        if found.fun < values[k]:
+            times[k], values[k] = found.x, found.fun
+    least = int(np.argmin(values))
+    return float(times[least]) if values[least] <= 0 else None
 
 
 def _constraints(statement: Statement, parameters: Array) -> str:
@@ -173,6 +208,11 @@ def terminal_slopes(statement: Statement, parameters: Array, x: Array) -> tuple[
     hessian, gradient = ca.hessian(value, symbol)
     outputs = ca.Function("slopes", [symbol], [ca.densify(gradient), ca.densify(hessian)])(x)
     return np.asarray(outputs[0].full()).ravel(), np.asarray(outputs[1].full())
+
+
+def terminal_cost(statement: Statement, parameters: Array, x: Array) -> float:
+    """The terminal cost of a state, without the matrices."""
+    return float(statement.terminal(x, np.zeros(statement.ne), statement.duration.guess, parameters))
 
 
 def condition(statement: Statement, conditions: Conditions, parameters: Array) -> tuple[Any, Any, Any]:

@@ -17,7 +17,7 @@ they make of Lambda is still exactly quadratic in the values of the control.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -88,7 +88,7 @@ class Samples:
     """Coefficients at all steps and samples, leading axes (K, 5); affine functions of z as slope @ z + constant.
 
     rate (nx, nz) and (nx,); drift (nx, nb, nz) and (nx, nb); bias: M_b, (m, nb, nz) and (m, nb); noise (nx, nx); state:
-    M_x, (m, nx); density (m, m); running: Hessian (nz, nz) and gradient at z = 0 (nz,).
+    M_x, (m, nx); density (m, m); running: Hessian (nz, nz), gradient at z = 0 (nz,) and value there.
     """
 
     rate: tuple[Array, Array]
@@ -97,7 +97,7 @@ class Samples:
     noise: Array
     state: Array
     density: Array
-    running: tuple[Array, Array]
+    running: tuple[Array, Array, Array]
 
 
 def sample(given: Parts, times: Array) -> Samples:
@@ -108,6 +108,7 @@ def sample(given: Parts, times: Array) -> Samples:
     affine = [(v, ca.jacobian(ca.vec(v), z)) for v in (given.rate, given.drift, bias)]
     outputs = [entry for pair in affine for entry in pair]
     outputs += [given.noise, given.measured[:, :nx], given.density, hessian, gradient]
+    outputs.append(ca.substitute(given.running, z, ca.DM.zeros(z.shape[0])))
     function = ca.Function("coefficients", [z, given.time], [ca.densify(entry) for entry in outputs])
     count = times.size
     values = function.map(count)(np.zeros((z.shape[0], count)), times.reshape(1, -1))
@@ -118,7 +119,7 @@ def sample(given: Parts, times: Array) -> Samples:
         return np.asarray(np.moveaxis(numbers, range(2, numbers.ndim), range(numbers.ndim - 1, 1, -1)))
 
     nz, nb, m = z.shape[0], given.drift.shape[1], given.density.shape[0]
-    f, fz, d, dz, b, bz, noise, state, density, hess, grad = values
+    f, fz, d, dz, b, bz, noise, state, density, hess, grad, still = values
     return Samples(
         rate=(shaped(fz, nx, nz), shaped(f, nx)),
         drift=(shaped(dz, nx, nb, nz), shaped(d, nx, nb)),
@@ -126,29 +127,30 @@ def sample(given: Parts, times: Array) -> Samples:
         noise=shaped(noise, nx, nx),
         state=shaped(state, m, nx),
         density=shaped(density, m, m),
-        running=(shaped(hess, nz, nz), shaped(grad, nz)),
+        running=(shaped(hess, nz, nz), shaped(grad, nz), shaped(still)),
     )
+
+
+def resolved(statement: Statement, mesh: Mesh, parameters: Array) -> Mesh:
+    """The mesh with as many substeps as Runge-Kutta steps of the nominal need, whose own may be implicit ones."""
+    times = statement.duration.guess * mesh.nodes[:, None]
+    slopes = sample(parts(statement, parameters), times).rate[0][:, 0, :, : statement.nx]
+    fastest = float(np.abs(np.linalg.eigvals(slopes)).max(initial=0.0))
+    needed = int(np.ceil(fastest * statement.duration.guess * float(np.diff(mesh.nodes).max())))
+    return replace(mesh, substeps=max(mesh.substeps, needed))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """One step: everything affine in the control values has a last axis of columns.
+    """One step: everything affine in what it starts from has a last axis of columns.
 
-    x: state at the start (nx, columns). stages: (weight in the time integral, z, Hessian and gradient of the running
-    cost). products: (weight, P, R) whose sum of weight P' R is what Lambda grows by; P and R are (rows, nb, columns).
-    interval: number of the control interval, where the step is its first one; else None.
+    stages: (weight in the time integral, z, Hessian, gradient and value at z = 0 of the running cost). products:
+    (weight, P, R) whose sum of weight P' R is what Lambda grows by; P and R are (rows, nb, columns).
+    x: state at the end (nx, columns); S: (nx, nb, columns); filtered: Ebar (nx, nx).
     """
 
-    x: Array
-    stages: tuple[tuple[float, Array, Array, Array], ...]
+    stages: tuple[tuple[float, Array, Array, Array, float], ...]
     products: tuple[tuple[float, Array, Array], ...]
-    interval: int | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Last:
-    """At the end: x (nx, columns), S (nx, nb, columns), Ebar (nx, nx)."""
-
     x: Array
     S: Array
     filtered: Array
@@ -176,61 +178,44 @@ class Reduction:
         initial = unpack(half, size)
         self.filtered, self.prior = initial[:nx, :nx], np.linalg.inv(initial[nx:, nx:])
 
-    @property
-    def size(self) -> int:
-        """Number of control values V."""
-        return self.mesh.control_nodes * self.statement.nu
-
-    def values(self, k: int, c: float, u: Array | None) -> Array:
-        """The control at the fraction c of interval k: its values (nu, 1), or its map (nu, V + 1) of (u, 1)."""
-        nu, linear = self.statement.nu, self.mesh.control == "linear"
-        weights = ((k, 1 - c), (k + 1, c)) if linear else ((k, 1.0),)
-        if u is not None:
-            return np.asarray(sum(weight * u[node] for node, weight in weights))[:, None]
-        result = np.zeros((nu, self.size + 1))
-        for node, weight in weights:
-            result[np.arange(nu), node * nu + np.arange(nu)] = weight
-        return result
-
-    def march(self, u: Array | None = None) -> Iterator[Step | Last]:
-        """The steps one after the other, then the end.
+    def advance(self, k: int, x: Array, S: Array, filtered: Array, ends: tuple[Array, Array]) -> Iterator[Step]:
+        """The steps of control interval k.
 
         Args:
-            u: control values, shape (N + 1 or N, nu), for one column with their trajectory; None: V + 1 columns, the
-                affine map of (control values, 1).
+            k: its number.
+            x: state at its start, (nx, columns), an affine map whose last column is the constant.
+            S: (nx, nb, columns).
+            filtered: Ebar (nx, nx).
+            ends: control at its start and its end, (nu, columns) each.
         """
-        columns = 1 if u is not None else self.size + 1
-        nx, nb, per = self.statement.nx, self.prior.shape[0], self.mesh.substeps
-        one = np.zeros(columns)
+        per = self.mesh.substeps
+        one = np.zeros(x.shape[1])
         one[-1] = 1.0
-        x = self.start[:, None] * one
-        S, filtered = np.zeros((nx, nb, columns)), self.filtered
-        for i in range(self.steps.size):
-            k, j = divmod(i, per)
-            controls = [self.values(k, (j + c) / per, u) for c in SAMPLES]
+        for j in range(per):
+            i = k * per + j
+            controls = [ends[0] + (j + c) / per * (ends[1] - ends[0]) for c in SAMPLES]
             after, stages, slopes = self._nominal(i, x, controls, one)
             points = [
                 np.vstack([hermite(x, after, *slopes, c), controls[GAUSS + g]]) for g, c in enumerate(GAUSS_NODES)
             ]
             S, filtered, products = self._filter(i, S, filtered, points, one)
-            yield Step(x=x, stages=stages, products=products, interval=None if j else k)
             x = after
-        yield Last(x=x, S=S, filtered=filtered)
+            yield Step(stages=stages, products=products, x=x, S=S, filtered=filtered)
 
     def _nominal(self, i: int, x: Array, controls: list[Array], one: Array) -> tuple[Array, Any, tuple[Array, Array]]:
         """Classical Runge-Kutta step: state at the end, stages of the running cost, h times the slopes at the ends."""
         h, (slope, constant) = self.steps[i], self.samples.rate
-        hessian, gradient = self.samples.running
+        hessian, gradient, still = self.samples.running
 
         def rate(z: Array, at: int) -> Array:
             return np.asarray(slope[i, at] @ z + constant[i, at][:, None] * one)
 
-        stages: list[tuple[float, Array, Array, Array]] = []
+        stages: list[tuple[float, Array, Array, Array, float]] = []
         rates: list[Array] = []
         for (weight, at), reach in zip(STAGES, (0.0, 0.5, 0.5, 1.0), strict=True):
             z = np.vstack([x + h * reach * rates[-1] if rates else x, controls[at]])
             rates.append(rate(z, at))
-            stages.append((h * weight, z, hessian[i, at], gradient[i, at]))
+            stages.append((h * weight, z, hessian[i, at], gradient[i, at], float(still[i, at])))
         after = x + h * sum(weight * value for (weight, _), value in zip(STAGES, rates, strict=True))
         return after, tuple(stages), (h * rates[0], h * rate(np.vstack([after, controls[END]]), END))
 
@@ -274,52 +259,12 @@ class Reduction:
 
     def covariance(self, u: Array) -> tuple[Array, Array, Array]:
         """Ebar(T) (nx, nx), S(T) (nx, nb) and Lambda(T) (nb, nb) of control values u, (N + 1 or N, nu)."""
-        information = self.prior.copy()
-        for step in self.march(u):
-            if isinstance(step, Last):
-                return step.filtered, step.S[:, :, 0], 0.5 * (information + information.T)
-            for weight, P, R in step.products:
-                information += weight * P[:, :, 0].T @ R[:, :, 0]
-        raise AssertionError("the march ends with the end")
-
-    def forms(self, weight: Array) -> Forms:
-        """All quadratic forms of the control values, with tr(weight Lambda(T)) for a symmetric weight (nb, nb)."""
-        size = self.size + 1
-        information, running, energy = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
-        slope = np.zeros(size)
-        nodes, nx = [], self.statement.nx
-        for step in self.march():
-            if isinstance(step, Last):
-                break
-            pairs = [(w * np.einsum("abi,bc->aci", P, weight), R) for w, P, R in step.products]
-            left, right = (np.concatenate([pair[n].reshape(-1, size) for pair in pairs]) for n in (0, 1))
-            information += left.T @ right
-            for w, z, hessian, gradient in step.stages:
-                running += w * z.T @ hessian @ z
-                slope += w * gradient @ z
-                energy += w * z[nx:].T @ hessian[nx:, nx:] @ z[nx:]
-            if step.interval is not None:
-                nodes.append(step.x)
-        nodes.append(step.x)
-        return Forms(
-            information=information + information.T, running=running, slope=slope, energy=energy, nodes=np.array(nodes)
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Forms:
-    """Quadratic forms of w = (control values, 1), V + 1 entries.
-
-    Attributes:
-        information: tr(weight (Lambda - Lambda_0)) = w' information w / 2.
-        running: integral of the running cost = w' running w / 2 + slope w + constant.
-        slope: its linear part.
-        energy: int u' L_uu u dt = w' energy w.
-        nodes: x at the nodes as maps of w, shape (N + 1, nx, V + 1).
-    """
-
-    information: Array
-    running: Array
-    slope: Array
-    energy: Array
-    nodes: Array
+        information, nb = self.prior.copy(), self.prior.shape[0]
+        x, S, filtered = self.start[:, None], np.zeros((self.start.size, nb, 1)), self.filtered
+        for k in range(self.mesh.intervals):
+            ends = (u[k][:, None], u[k + (self.mesh.control == "linear")][:, None])
+            for step in self.advance(k, x, S, filtered, ends):
+                x, S, filtered = step.x, step.S, step.filtered
+                for weight, P, R in step.products:
+                    information += weight * P[:, :, 0].T @ R[:, :, 0]
+        return filtered, S[:, :, 0], 0.5 * (information + information.T)

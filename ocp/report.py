@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.errors import CovocpError
 from covocp.matrices import Array, half_indices
+from covocp.path_limits import NOTED
 from covocp.statement import Block, entry_names
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ SAME_OPTIMUM = 1e-5
 
 RESIDUALS = {
     "stationarity": "largest slope of the Lagrangian by a control (relative)",
+    "complementarity": "multipliers times the distance from their bounds (relative to the cost)",
     "control_slope": "H_u at the nodes, root mean square (relative)",
     "costate_difference": "costates: multipliers against backward integration (relative)",
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
@@ -42,10 +44,38 @@ RESIDUALS = {
     "mesh_error": "cost: change by halving the integration steps (relative)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
     "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
-    "cost_identity": "expected cost: from the covariances against from S(0) (relative)",
+    "cost_identity": "expected cost: as optimised against from the covariances (relative)",
     "cross_covariance": "correlation of the estimate and its error, zero in theory",
     "conservation": "variances E + Xhat that no control changes: error (relative)",
     "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
+}
+
+
+# Where to begin to worry about a residual, and what a large one means.
+WORRIES: dict[str, tuple[float, str]] = {
+    "stationarity": (1e-4, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
+    "costate_difference": (
+        1e-2,
+        "large: the costates change within an interval (a constraint takes hold, a stiff start or end); costs and "
+        "controls may be right all the same: worry if the mesh error is large, or if it stays on twice the intervals",
+    ),
+    "hamiltonian_variation": (
+        1e-2,
+        "large: the controls or costates change within an interval; worry if it stays on twice the intervals",
+    ),
+    "transversality": (1e-2, "LARGE: the duration is not the best one, or the mesh too coarse: more intervals"),
+    "control_slope": (
+        0.1,
+        "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
+    ),
+    "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
+    "control_error": (1e-3, "large: a freer control would cost that much less: more intervals, or control='linear'"),
+    "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
+    "cross_covariance": (
+        1e-2,
+        "large: the gains change faster than the steps that check them; worry if the expected costs differ as well",
+    ),
+    "conservation": (1e-3, "LARGE: the covariances are known to no more than this: more intervals"),
 }
 
 
@@ -139,12 +169,33 @@ def _costs(solution: Solution) -> str:
     if solution.loop is not None and DEVIATIONS in solution.cost_terms:
         ended, on_the_way = (number(solution.loop.cost[f"{DEVIATIONS} {where}"], 6) for where in PLACES)
         words.append(f"deviations: {ended} at the end, {on_the_way} on the way")
+        words += _left_out(solution)
     if solution.optimised:
         words += _gained(solution)
     missing = solution.stats.get("classical_missing")
     if missing:
         words.append(wrapped(f"There is no classical design to compare with: {missing}", ""))
     return "\n".join([text, *words])
+
+
+def _left_out(solution: Solution) -> list[str]:
+    """What the curvature of rates and measurements adds, which the linear covariance equations do not have."""
+    effect = solution.mean_effect
+    if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
+        return []
+    share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
+    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in entry_names((b,))]
+    spread = _roots(np.asarray(solution.loop.X))[-1] if solution.loop is not None else np.zeros(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
+    worst = int(np.argmax(moved))
+    return [
+        wrapped(
+            f"not in the cost: rates and measurements bend, which adds {effect.cost:+.2g}{share} through the mean "
+            f"of the deviations; at the end that of {names[worst]} is {effect.mean[-1, worst]:+.2g}, "
+            f"{moved[worst]:.2g} of its root mean square"
+        )
+    ]
 
 
 def _gained(solution: Solution) -> list[str]:
@@ -342,25 +393,28 @@ def _optimality(solution: Solution) -> str:
 
 
 def _verdict(solution: Solution, name: str, value: float) -> str:
-    """What a sign means; residuals speak for themselves."""
+    """What a sign means, and what a residual does that is larger than usual."""
     if name == "smallest_eigenvalue":
         return "semidefinite" if solution.semidefinite else "INDEFINITE"
     if name == "curvature" and solution.converged:
-        return "minimum" if value > 0 else "NOT A MINIMUM"
-    return ""
+        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
+    level, words = WORRIES.get(name, (np.inf, ""))
+    return words if solution.converged and abs(value) > level else ""
 
 
 def _between_nodes(solution: Solution) -> str:
-    """What happens to path constraints where nobody asked: a sentence, empty where they hold."""
+    """What happens to limits where nobody asked: a sentence, empty where they hold."""
     if solution.statement is None or not solution.converged:
         return ""
-    found = solution.check_path()
+    found = [entry for entry in solution.passed_limits() if entry.share > NOTED]
     if not found:
         return ""
-    name = max(found, key=lambda key: found[key])
+    worst = found[0]
+    where = "the nodes" if solution.mesh.points == 1 else f"{solution.mesh.points} points of each interval"
     text = (
-        f"path constraints hold at the nodes; between them they are violated by up to {found[name]:.2g} ({name}): "
-        "more intervals make it less, check_path() lists all"
+        f"limits are imposed at {where}; between them that of '{worst.name}' is passed by up to {worst.by:.2g}, "
+        f"{100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: points= or more intervals make it less, "
+        "check_path() lists all"
     )
     return wrapped(text)
 
@@ -374,7 +428,7 @@ def _effort(solution: Solution) -> str:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
-        _counted(mesh.intervals, "interval"),
+        _intervals(mesh.intervals, stats),
         f"controls piecewise {mesh.control}",
         _counted(mesh.substeps, "integration step") + " an interval",
         _counted(len(mesh.segments), "shooting segment"),
@@ -390,6 +444,15 @@ def _effort(solution: Solution) -> str:
         effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
     lines = [wrapped("mesh: " + ", ".join(words))]
     return "\n".join(lines + ([wrapped("effort: " + ", ".join(effort))] if effort else []))
+
+
+def _intervals(count: int, stats: Mapping[str, Any]) -> str:
+    """The number of intervals, and how the mesh that was asked for was graded."""
+    asked, added = stats.get("intervals_asked"), stats.get("nodes_added")
+    if asked is None or added is None:
+        return _counted(count, "interval")
+    places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
+    return f"{_counted(asked, 'interval')}, graded to {count} {places}"
 
 
 def _starts(costs: Any) -> str:

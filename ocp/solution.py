@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -15,11 +14,12 @@ from covocp.accuracy import mesh_error
 from covocp.along import filter_gain, rates_along
 from covocp.checks import as_number, is_whole
 from covocp.closed_loop import ClosedLoop, close_loop
+from covocp.dense import Dense, dense_output
 from covocp.errors import CovocpError, ProblemError, describe
 from covocp.extremal import Extremal, Outcome
+from covocp.fingerprint import Fingerprint
 from covocp.hamiltonian import Costates, discrete_costates
-from covocp.integrators import hermite
-from covocp.lookup import name_of, unknown_name
+from covocp.lookup import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.matrices import (
     Array,
     is_semidefinite,
@@ -27,9 +27,13 @@ from covocp.matrices import (
     unpack,
     unpack_costate,
 )
+from covocp.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.mesh import Mesh
-from covocp.optimality import Optimality, assess, identities, path_violations
+from covocp.optimality import Optimality, assess, identities
+from covocp.path_limits import Passed, limited, passed_limits
+from covocp.sample import Sample
 from covocp.statement import Block, Statement, entry_names
+from covocp.threads import cached, methods_one_at_a_time
 from covocp.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
@@ -38,24 +42,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """Values at some times, indexed like a solution (time first where several times were asked for)."""
-
-    t: Any
-    values: Mapping[str, Array] = field(repr=False)
-    symbols: Mapping[str, Any] = field(repr=False)
-
-    def __getitem__(self, key: Any) -> Array:
-        """The value of a symbol or name."""
-        return self.values[name_of(key, self.symbols, tuple(self.values))]
-
-    def __repr__(self) -> str:
-        """The values by name, on one line."""
-        shown = {"t": self.t, **{name: v for name, v in self.values.items() if name not in ("time", "duration")}}
-        return f"Sample({', '.join(f'{name} = {_in_line(value)}' for name, value in shown.items())})"
-
-
+@methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
     """An optimal control problem solved (or its last iterate: see `converged`).
@@ -85,6 +72,7 @@ class Solution:
         targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
         statement: the problem solved; None for a solution read from a file.
+        stored_problem: of a solution read from a file, what its problem was, to tell it from others.
     """
 
     name: str
@@ -109,7 +97,9 @@ class Solution:
     loop: ClosedLoop | None = None
     statement: Statement | None = None
     stored_costates: Costates | None = None
+    stored_dense: Dense | None = None
     stored_optimality: Optimality | None = None
+    stored_problem: Fingerprint | None = None
 
     @staticmethod
     def of(outcome: Outcome, method: str) -> Solution:
@@ -199,7 +189,7 @@ class Solution:
             multipliers=self.multipliers,
         )
 
-    @cached_property
+    @cached
     def costates(self) -> Costates:
         """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
         if self.stored_costates is not None:
@@ -209,21 +199,40 @@ class Solution:
             array.setflags(write=False)
         return costates
 
-    @cached_property
+    @cached
     def optimality(self) -> Optimality:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
         if self.stored_optimality is not None:
             return self.stored_optimality
         if not self.optimised:
-            return identities(self.mesh_error, self.smallest_eigenvalue, self.loop)
-        return assess(self.extremal, self.costates, self.mesh_error, self.smallest_eigenvalue, self.loop)
+            return identities(self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
+        known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
+        return assess(self.extremal, self.costates, *known)
 
-    @cached_property
+    @property
+    def cost_identity(self) -> float | None:
+        """Relative difference of the cost and of the expected cost from the loop's own covariances (E-1).
+
+        None without a closed loop, and where the cost is the latter one: under other statistics than the design's.
+        """
+        if self.loop is None or self.cost_terms.keys() == self.loop.cost.keys():
+            return None
+        own = self.loop.expected_cost
+        return abs(self.cost - own) / max(abs(own), float(np.finfo(float).tiny))
+
+    @cached
+    def mean_effect(self) -> MeanEffect | None:
+        """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
+        if self.loop is None or self.statement is None:
+            return remembered(self.stats)
+        return mean_effect(self.extremal, self.loop)
+
+    @cached
     def smallest_eigenvalue(self) -> float:
         """Smallest eigenvalue of the covariances at all nodes; inf without covariances."""
         return min((smallest_eigenvalue(matrix) for matrix in self._all_covariances()), default=np.inf)
 
-    @cached_property
+    @cached
     def semidefinite(self) -> bool:
         """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
         return all(is_semidefinite(matrix) for matrix in self._all_covariances())
@@ -239,10 +248,19 @@ class Solution:
         return unpack(self.trajectory.e[:, block.span], block.size)
 
     def block(self, name: str) -> Block:
-        """Where a name lies."""
-        return next(b for b in self.blocks if b.name == name)
+        """Where a name, or that of an entry of a vector, lies."""
+        found = block_of(name, self.blocks) if isinstance(name, str) else None
+        if found is None:
+            raise unknown_name(name, tuple(b.name for b in self.blocks))
+        return found
 
-    @cached_property
+    def _name(self, key: Any, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
+        """Name of a symbol, a name or an entry among some blocks; None: among all values."""
+        names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
+        sizes = sizes_of(self.blocks if blocks is None else blocks)
+        return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes)
+
+    @cached
     def values(self) -> Mapping[str, Array]:
         """Values of all symbols at the nodes by name; read-only."""
         values = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
@@ -269,14 +287,14 @@ class Solution:
         return result
 
     def __getitem__(self, key: Any) -> Array:
-        """Values at the nodes of a symbol, a name, or an expression of the problem's symbols.
+        """Values at the nodes of a symbol, a name, an entry of one, or an expression of the problem's symbols.
 
         Raises:
             ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
         """
-        found = name_of(key, self.symbols, tuple(self.values), missing_ok=isinstance(key, ca.MX))
+        found = self._name(key, missing_ok=isinstance(key, ca.MX))
         if found:
-            return self.values[found]
+            return entry_values(self.values, found)
         extremal = self.extremal
         try:
             function = extremal.statement.expression(key)
@@ -291,8 +309,8 @@ class Solution:
     def at(self, t: Any) -> Sample:
         """Values at other times than the nodes.
 
-        States and matrices by cubic Hermite polynomials (a matrix linearly where that would not be positive
-        semidefinite but its neighbours are), controls as they were transcribed.
+        States and matrices as the integrator computes them between the nodes (`dense`), controls as they were
+        transcribed.
 
         Args:
             t: a time or an array of times [s], within [0, duration].
@@ -314,34 +332,45 @@ class Solution:
                     remedy="stay within the duration of the solution",
                 )
             )
-        nodes = self.t
-        k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
-        h = (nodes[k + 1] - nodes[k])[:, None]
-        c = (times[:, None] - nodes[k][:, None]) / h
-        z = np.hstack([self.trajectory.x, self.trajectory.e])
-        smooth = hermite(z[k], z[k + 1], h * self.rates[k], h * self.end_rates[k], c)
-        straight = z[k] + c * (z[k + 1] - z[k])
+        z, u = self.dense.at(np.clip(times / self.duration, 0.0, 1.0)), self.controls_at(times)
         nx = self.trajectory.x.shape[1]
-        e = smooth[:, nx:]
-        for b in self._covariances():
-            for i, half in enumerate(e[:, b.span]):
-                if not is_semidefinite(unpack(half, b.size)):
-                    e[i, b.span] = straight[i, nx:][b.span]
-        u = self.controls
-        controls = u[k] if self.mesh.control == "constant" else u[k] + c * (u[k + 1] - u[k])
-        values = self._assemble(times, smooth[:, :nx], controls, e)
+        values = self._assemble(times, z[:, :nx], u, z[:, nx:])
         if np.ndim(t) == 0:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols=self.symbols)
 
+    def controls_at(self, times: Array) -> Array:
+        """Controls at some times [s], (K, nu); at a node where they jump those of the interval that starts there."""
+        nodes, u = self.t, self.controls
+        k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
+        if self.mesh.control == "constant":
+            return np.asarray(u[k])
+        c = (times - nodes[k]) / (nodes[k + 1] - nodes[k])
+        return np.asarray(u[k] + c[:, None] * (u[k + 1] - u[k]))
+
+    @cached
+    def dense(self) -> Dense:
+        """States and half-vectors between the nodes, read-only; computed when first asked for."""
+        if self.stored_dense is not None:
+            return self.stored_dense
+        dense = dense_output(self.extremal)
+        for array in (dense.knots, dense.values, dense.first, dense.last):
+            array.setflags(write=False)
+        return dense
+
+    @cached
+    def _dense_states(self) -> Dense:
+        """The same of the states alone, which costs less where there are matrices."""
+        return dense_output(self.extremal, matrices=False)
+
     def costate(self, symbol: Any) -> Array:
-        """Costate of a state, (K,) or (K, n), or of a matrix, the symmetric P of (K, n, n).
+        """Costate of a state or its entry, (K,) or (K, n), or of a matrix, the symmetric P of (K, n, n).
 
         Raises:
             ProblemError: where the symbol is neither.
         """
-        name = name_of(symbol, self.symbols, tuple(self.values))
-        b = next((b for b in self.blocks if b.name == name), None)
+        name = self._name(symbol)
+        b = block_of(name, self.blocks)
         if b is None or b.kind not in ("state", "matrix"):
             names = ", ".join(q.name for q in self.blocks if q.kind in ("state", "matrix"))
             raise ProblemError(
@@ -367,8 +396,9 @@ class Solution:
             key: the name of a constraint, or the symbol or name of a state or a matrix.
 
         Returns:
-            Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes; of terminal and
-            initial ones () or (rows,); of a state () or (n,); of a matrix (n, n).
+            Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes (what acts
+            between two nodes is shared between them); of terminal and initial ones () or (rows,); of a state () or
+            (n,); of a matrix (n, n).
 
         Raises:
             ProblemError: where there is no such constraint or symbol.
@@ -376,10 +406,9 @@ class Solution:
         for place, names in self.constraints.items():
             rows = [i for i, n in enumerate(names) if isinstance(key, str) and (n == key or n.startswith(f"{key}["))]
             if rows:
-                values = getattr(self.multipliers, place)[..., rows]
+                values = getattr(self.multipliers, "path_at_nodes" if place == "path" else place)[..., rows]
                 return np.asarray(values[..., 0] if len(rows) == 1 else values)
-        name = name_of(key, self.symbols, tuple(b.name for b in self.blocks if b.kind in ("state", "matrix")))
-        b = self.block(name)
+        b = self.block(self._name(key, tuple(b for b in self.blocks if b.kind in ("state", "matrix"))))
         if b.kind == "matrix":
             return unpack_costate(self.multipliers.final_matrices[b.span], b.size)
         values = self.multipliers.final[b.span]
@@ -392,7 +421,7 @@ class Solution:
         those of the design) in a closed loop.
 
         Args:
-            a: a state or an unknown, symbol or name.
+            a: a state or an unknown, or an entry of it, symbol or name: p, "p", p[0], "p[0]".
             b: another one; None: a itself.
 
         Raises:
@@ -413,7 +442,7 @@ class Solution:
         return np.asarray(full[:, rows, columns])
 
     def deviation(self, symbol: Any) -> Array:
-        """Standard deviation of a state or an unknown, (K,) or (K, n), in its unit."""
+        """Standard deviation of a state, an unknown or an entry of one, (K,) or (K, n), in its unit."""
         variances = np.diagonal(self.covariance(symbol), axis1=1, axis2=2)
         values = np.sqrt(np.maximum(variances, 0.0))
         return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
@@ -421,24 +450,31 @@ class Solution:
     def _augmented_span(self, key: Any) -> slice:
         offset = 0
         both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
-        candidates = [q for q in both if entry_names((q,))[0] in self.augmented]  # constants of a gain have no row
-        name = name_of(key, self.symbols, tuple(q.name for q in candidates))
+        candidates = tuple(q for q in both if entry_names((q,))[0] in self.augmented)  # constants of a gain have no row
+        rows = []
         for q in candidates:
-            if q.name == name:
-                return slice(offset, offset + q.size)
+            rows.append(replace(q, kind="state", offset=offset))
             offset += q.size
-        raise unknown_name(key, tuple(q.name for q in candidates))
+        found = block_of(self._name(key, candidates), rows)
+        assert found is not None
+        return found.span
 
     def check_path(self, points: int = 10) -> Mapping[str, float]:
-        """Largest violation of each path constraint and state bound between the nodes.
+        """Largest violation of each path constraint and state bound along the true path.
 
-        Path inequalities are imposed at the nodes only; this looks at `points` equal parts of each interval.
+        They are imposed at a few points of each interval (`points=` of `solve`); this looks at the ends of `points`
+        equal parts of it, and wherever the path bends sharply. Memory does not grow with the points.
 
         Args:
             points: parts of each interval.
 
         Returns:
-            Violation by name, in the unit of the constraint; only those that are violated.
+            Violation by name, in the unit of the constraint; only those that are violated by more than 1e-5 of their
+            limit, the accuracy of the path.
+
+        Raises:
+            ProblemError: where `points` is not a positive whole number.
+            CovocpError: where the solution was read from a file without its problem.
         """
         if not is_whole(points):
             raise ProblemError(
@@ -449,7 +485,15 @@ class Solution:
                     remedy="correct points",
                 )
             )
-        return path_violations(self.extremal, points)
+        return {entry.name: entry.by for entry in self.passed_limits(points)}
+
+    def passed_limits(self, points: int = 10) -> tuple[Passed, ...]:
+        """What `check_path` finds, with the share of the limit and the time, the worst first."""
+        extremal = self.extremal
+        if not limited(extremal):
+            return ()
+        whole = extremal.statement.path.uses_matrices or "dense" in self.__dict__ or self.stored_dense is not None
+        return passed_limits(extremal, self.dense if whole else self._dense_states, points)
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.plot_solutions`."""
@@ -484,18 +528,6 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
         return dict(terms)
     nominal = {name: loop.cost[name] for name in ("terminal", "running")}
     return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
-
-
-def _in_line(value: Any) -> str:
-    """Numbers on one line, six digits; of large arrays the corners."""
-    text = np.array2string(
-        np.asarray(value, dtype=float),
-        formatter={"float_kind": lambda number: f"{number:.6g}"},
-        threshold=20,
-        edgeitems=2,
-        separator=", ",
-    )
-    return " ".join(text.split())
 
 
 def _later(module: str) -> Any:

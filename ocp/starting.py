@@ -8,60 +8,68 @@ from typing import Any
 
 import numpy as np
 
+from covocp.candidates import own_start, ranked
 from covocp.errors import ProblemError, describe, spelling
 from covocp.extremal import Guess
-from covocp.guess import first_guess, quadrature_weights
 from covocp.lookup import name_of
 from covocp.matrices import Array, pack
 from covocp.mesh import Mesh
 from covocp.solution import Solution
 from covocp.statement import Block, Statement
+from covocp.steering import quadrature_weights
 from covocp.trajectory import Multipliers, Trajectory
 
 
 def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Guess:
-    """A guess on a mesh from what the user gave.
+    """The first of `make_guesses`."""
+    return next(make_guesses(statement, mesh, parameters, guess))
+
+
+def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Iterator[Guess]:
+    """Guesses on a mesh from what the user gave, the best first; the others are made when they are asked for.
 
     Raises:
         ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess, or a solution
             without any symbol of this problem.
     """
-    if guess is None:
-        return Guess(trajectory=first_guess(statement, mesh, parameters))
     if isinstance(guess, Trajectory):
-        return Guess(trajectory=guess)
-    if isinstance(guess, Solution):
-        return _from_solution(statement, mesh, parameters, guess)
-    if isinstance(guess, Mapping):
-        guesses = dict(statement.guesses)
-        for key, value in guess.items():
-            name = name_of(key, statement.symbols, tuple(guesses), missing_ok=True)
-            if not name:
-                raise ProblemError(
-                    describe(
-                        f"The guess names '{key}', which cannot be guessed.",
-                        expected="states, controls or matrices: " + ", ".join(guesses),
-                        received=str(key),
-                        remedy=spelling(key, guesses, "correct the name"),
-                    )
-                )
-            guesses[name] = value
-        return Guess(trajectory=first_guess(replace(statement, guesses=guesses), mesh, parameters))
-    raise ProblemError(
-        describe(
-            "The guess is of an unknown kind.",
-            expected="None, 'multistart', a Solution, or a dict of name to guess",
-            received=repr(guess)[:100],
-            remedy="correct guess=",
+        yield Guess(trajectory=guess)
+    elif isinstance(guess, Solution):
+        yield _from_solution(statement, mesh, parameters, guess)
+    elif guess is None or isinstance(guess, Mapping):
+        for trajectory in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
+            yield Guess(trajectory=trajectory)
+    else:
+        raise ProblemError(
+            describe(
+                "The guess is of an unknown kind.",
+                expected="None, 'multistart', a Solution, or a dict of name to guess",
+                received=repr(guess)[:100],
+                remedy="correct guess=",
+            )
         )
-    )
 
 
-def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, starts: int, seed: int) -> Iterator[Guess]:
-    """The problem's own start, then random ones."""
-    yield Guess(trajectory=first_guess(statement, mesh, parameters))
-    for child in np.random.SeedSequence(seed).spawn(starts):
-        yield Guess(trajectory=first_guess(statement, mesh, parameters, np.random.default_rng(child)))
+def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
+    """The statement with some of its guesses replaced by name.
+
+    Raises:
+        ProblemError: a name that cannot be guessed.
+    """
+    guesses = dict(statement.guesses)
+    for key, value in given.items():
+        name = name_of(key, statement.symbols, tuple(guesses), missing_ok=True)
+        if not name:
+            raise ProblemError(
+                describe(
+                    f"The guess names '{key}', which cannot be guessed.",
+                    expected="states, controls or matrices: " + ", ".join(guesses),
+                    received=str(key),
+                    remedy=spelling(key, guesses, "correct the name"),
+                )
+            )
+        guesses[name] = value
+    return replace(statement, guesses=guesses) if given else statement
 
 
 def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
@@ -74,7 +82,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     at_controls = sample
     if mesh.control == "constant":
         at_controls = solution.at(0.5 * (mesh.nodes[:-1] + mesh.nodes[1:]) * solution.duration)
-    plain = first_guess(statement, mesh, parameters)
+    plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     t, m = solution.trajectory, solution.multipliers
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
@@ -139,7 +147,7 @@ def _resample(values: Array, old: Array, new: Array) -> Array:
 
 def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
     """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
-    if np.array_equal(old.nodes, new.nodes) and old.control == new.control:
+    if np.array_equal(old.nodes, new.nodes) and (old.control, old.points) == (new.control, new.points):
         return multipliers
     before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
 
@@ -150,8 +158,10 @@ def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
     controls = _resample(multipliers.controls / quadrature_weights(old)[:, None], *places)
     return replace(
         multipliers,
-        path=at_nodes(multipliers.path),
-        states=at_nodes(multipliers.states),
+        path=at_nodes(multipliers.path_at_nodes),
+        states=at_nodes(multipliers.states_at_nodes),
+        inside_path=np.zeros((new.intervals, new.points - 1, multipliers.path.shape[1])),
+        inside_states=np.zeros((new.intervals, new.points - 1, multipliers.states.shape[1])),
         matrices=at_nodes(multipliers.matrices),
         controls=controls * quadrature_weights(new)[:, None],
     )

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from covocp.matrices import Array, half_indices, half_length
+from covocp.threads import cached
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
 
@@ -82,6 +82,8 @@ class Loop:
     running: (state, control, time, duration, parameters) -> L of the actual system.
     terminal: (state, duration, parameters) -> k of the actual system, S(T) (n, n).
     extra_control: (state, control, time, duration, parameters) -> B - L_uu (m, m): what the weights add to L.
+    by_parts: (all six) -> L + tr(S Q + C'B C E)/2, tr(S E)/2: over any time the running cost is the integral of the
+        first less the growth of the second [Schmidt E-20]; None where the gain is not the best one.
     """
 
     expansion: ca.Function
@@ -89,6 +91,7 @@ class Loop:
     running: ca.Function
     terminal: ca.Function
     extra_control: ca.Function
+    by_parts: ca.Function | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +125,8 @@ class Statement:
         measurement: (state, control, time, duration, parameters) -> measured values, H = their Jacobian by the
             augmented state, noise density; None without measurements.
         measurements: where each of them lies among the measured values.
+        information: (state, control, time, duration, parameters) -> the inverse densities that were stated as
+            information, which may be zero but not negative; None where none was.
         expression: a user's expression -> function of the six inputs.
     """
 
@@ -138,6 +143,7 @@ class Statement:
     riccati: tuple[ca.Function | None, ...]
     measurement: ca.Function | None
     measurements: tuple[Block, ...]
+    information: ca.Function | None
     path: Conditions
     start: Conditions
     end: Conditions
@@ -164,42 +170,42 @@ class Statement:
         """The blocks of one kind, in the order of their declaration."""
         return tuple(block for block in self.blocks if block.kind == kind)
 
-    @cached_property
+    @cached
     def states(self) -> tuple[Block, ...]:
         """Blocks of the nominal state."""
         return self.of_kind("state")
 
-    @cached_property
+    @cached
     def controls(self) -> tuple[Block, ...]:
         """Blocks of the control."""
         return self.of_kind("control")
 
-    @cached_property
+    @cached
     def matrices(self) -> tuple[Block, ...]:
         """Blocks of the matrix states."""
         return self.of_kind("matrix")
 
-    @cached_property
+    @cached
     def nx(self) -> int:
         """Entries of the nominal state."""
         return sum(block.length for block in self.states)
 
-    @cached_property
+    @cached
     def nu(self) -> int:
         """Entries of the control."""
         return sum(block.length for block in self.controls)
 
-    @cached_property
+    @cached
     def ne(self) -> int:
         """Entries of all half-vectors together."""
         return sum(block.length for block in self.matrices)
 
-    @cached_property
+    @cached
     def ahead(self) -> tuple[int, ...]:
         """Positions among `matrices` of those that run forward in time."""
         return tuple(i for i, block in enumerate(self.matrices) if not block.backward)
 
-    @cached_property
+    @cached
     def behind(self) -> tuple[int, ...]:
         """Positions among `matrices` of those that run backward in time."""
         return tuple(i for i, block in enumerate(self.matrices) if block.backward)
@@ -207,6 +213,12 @@ class Statement:
     def entries(self, positions: tuple[int, ...]) -> list[int]:
         """Entries of the stacked half-vectors that belong to some of the matrices."""
         return [k for i in positions for k in range(self.matrices[i].span.start, self.matrices[i].span.stop)]
+
+    @cached
+    def bounded_states(self) -> list[int]:
+        """Entries of the state with a bound."""
+        lower, upper = self.state_bounds
+        return [int(i) for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))]
 
     @property
     def np(self) -> int:
@@ -218,7 +230,7 @@ class Statement:
         values = self.boundary(parameters)
         return tuple(np.asarray(value.full()).ravel() for value in values)  # type: ignore[return-value]
 
-    @cached_property
+    @cached
     def matrix_names(self) -> tuple[str, ...]:
         """Names of the entries of the stacked half-vectors, such as 'E[x, b]'."""
         names: list[str] = []
@@ -227,12 +239,12 @@ class Statement:
             names += [f"{block.name}[{block.labels[i]}, {block.labels[j]}]" for i, j in zip(rows, columns, strict=True)]
         return tuple(names)
 
-    @cached_property
+    @cached
     def state_names(self) -> tuple[str, ...]:
         """Names of the entries of the state, such as 'y' or 'y[2]'."""
         return entry_names(self.states)
 
-    @cached_property
+    @cached
     def control_names(self) -> tuple[str, ...]:
         """Names of the entries of the control."""
         return entry_names(self.controls)

@@ -1,42 +1,54 @@
 """Solutions in files: numpy's .npz or JSON, nothing executed on reading; and as xarray datasets.
 
 A .npz file holds every array under its name ("trajectory.x", "mesh.nodes", ...) and the rest as JSON text in the entry
-"document"; a .json file holds all of it as text. Both keep every number to the last bit.
+"document"; a .json file holds all of it as text. Both keep every number to the last bit, and end with a checksum.
+Beside the solution a file holds the fingerprint of its problem, by which `load` tells it from others. Files of version
+1 and 2 had neither, and are refused.
 """
 
 from __future__ import annotations
 
-import io
-import json
-import math
+import stat
 import zipfile
 import zlib
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from covocp.archive import packed, unpacked
+from covocp.attaching import attached
 from covocp.checks import check_kind
-from covocp.encoding import DamagedFileError, decode, encode
+from covocp.encoding import DamagedFileError
 from covocp.errors import ExportError, ProblemError, describe
-from covocp.files import written_whole
+from covocp.files import check_target, written_whole
 from covocp.matrices import Array
 from covocp.solution import Solution
-from covocp.statement import Block, Statement
 from covocp.stored import from_tree, to_tree
+from covocp.threads import one_at_a_time
 
 if TYPE_CHECKING:
     from covocp.problem import Problem
 
 FORMAT = "covocp solution"
-VERSION = 2
+VERSION = 3
 SUFFIXES = (".npz", ".json")
-# Relative difference of the stored rates to those of a problem above which it is another problem; well above what
-# another version or compiler changes, well below what another number in the dynamics does.
-SAME_RATES = 1e-6
+REASON = 160  # letters of a reason that an error quotes
+# What the readers of both formats, and the checks of what they have read, raise for content that is none of a solution.
+FOREIGN = (
+    ValueError,  # also JSON and Unicode errors, and arrays of Python objects, which are never read
+    TypeError,
+    AttributeError,
+    LookupError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    RuntimeError,  # an encrypted or an unknown compression, too deep a nesting
+    SyntaxError,  # of the header of an array
+    MemoryError,
+    ArithmeticError,
+)
 
 
+@one_at_a_time
 def save(solution: Solution, path: str | Path) -> Path:
     """Write a solution, converged or not, to a file that is complete or not there.
 
@@ -51,6 +63,7 @@ def save(solution: Solution, path: str | Path) -> Path:
         ExportError: unknown suffix, the file cannot be written, or the solution holds something that is not
             plain data or does not fit together.
     """
+    check_target(path, SUFFIXES)
     tree = {"format": FORMAT, "version": VERSION, **to_tree(solution)}
     try:
         from_tree(tree)
@@ -64,88 +77,100 @@ def save(solution: Solution, path: str | Path) -> Path:
             )
         ) from error
     with written_whole(path, SUFFIXES) as part:
-        arrays: dict[str, Any] | None = None if part.suffix == ".json" else {}
-        encoded = {name: encode(value, name, arrays) for name, value in tree.items()}
-        text = json.dumps(encoded, allow_nan=False)
-        if arrays is None:
-            part.write_text(text, encoding="utf-8")
-        else:
-            with part.open("wb") as file:
-                np.savez_compressed(file, document=np.frombuffer(text.encode(), dtype=np.uint8), **arrays)
+        part.write_bytes(packed(tree, part.suffix))
     return Path(path)
 
 
+@one_at_a_time
 def load(path: str | Path, problem: Problem | None = None) -> Solution:
     """Read a solution that `save` wrote; nothing in the file is executed.
 
     Args:
         path: a .npz or .json file.
         problem: the problem that was solved, attached again: expressions of its symbols, `check_path` and everything
-            else that needs the model can then be asked for. Without it the solution knows names only.
+            else that needs the model can then be asked for. Without it the solution knows names only. It is compared
+            with the problem that was solved: symbols, duration, bounds, limits, initial and final values and variances,
+            declared parameters and means, and the values of equations, noises, costs and constraints at points kept in
+            the file. A parameter may also have the value that was solved for; guesses and scales may differ.
 
     Returns:
-        The solution, equal to the saved one to the last bit.
+        The solution, equal to the saved one to the last bit. With a problem, what its values at the nodes violate is
+        among its `violations`.
 
     Raises:
-        ProblemError: no such file, not a file of this format or version, damaged, or of another problem.
+        ProblemError: no such file, not a file of this format or version, damaged (a checksum tells), or of another
+            problem (says what differs).
     """
-    file = Path(path)
-    tree = _read(file)
-    if not isinstance(tree, dict) or tree.get("format") != FORMAT:
+    file = _checked_path(path)
+    tree, sealed = _read(file)
+    if not isinstance(tree, dict) or repr(tree.get("format")) != repr(FORMAT):
         raise _unreadable(file, "it is of another format", "give a file that Solution.save wrote")
-    if tree.get("version") != VERSION:
+    version = repr(tree.get("version"))
+    if version != repr(VERSION):
+        older = " and has no checksum" if version in ("1", "2") else ""
         raise _unreadable(
             file,
-            f"its version is {str(tree.get('version'))[:20]}",
+            f"its version is {version[:20]}{older}",
             "read it with the covocp that wrote it, or solve again",
+        )
+    if not sealed:
+        raise _unreadable(
+            file, "its checksum does not fit: it is damaged, or was changed", "take a copy, or solve and save again"
         )
     try:
         solution = from_tree(tree)
+    except FOREIGN as error:
+        raise _damaged(file, error) from error
     except DamagedFileError as error:
-        raise _unreadable(file, str(error), "solve and save again") from error
+        raise _unreadable(file, str(error)[:REASON], "solve and save again") from error
     if problem is None:
         return solution
     from covocp.problem import Problem  # here: reading a file needs no builder
 
     check_kind(problem, Problem, "give the problem that was solved, or load without one")
-    return _attached(solution, problem.statement())
+    return attached(solution, problem.statement())
 
 
-def _read(file: Path) -> Any:
-    """The decoded content of a file, whatever it is.
+def _checked_path(path: str | Path) -> Path:
+    """The path of a file that can be read as a whole.
 
     Raises:
-        ProblemError: no file, or neither a complete .npz nor a complete .json file.
+        ProblemError: nothing that can be a path, no file, a folder, a device.
     """
     try:
-        content = file.read_bytes()
-        if content[:2] != b"PK":
-            return decode(json.loads(content.decode("utf-8")))
-        with np.load(io.BytesIO(content), allow_pickle=False) as entries:
-            arrays = {name: entries[name] for name in entries.files}
-        if "document" not in arrays:
-            raise _unreadable(file, "it has no entry 'document'", "give a file that Solution.save wrote")
-        return decode(json.loads(arrays.pop("document").tobytes().decode()), arrays)
+        file = Path(path)
+        mode = file.stat().st_mode
+    except TypeError as error:
+        raise _unreadable(Path(repr(path)[:60]), "it is no path", "give the name of a file") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise _unreadable(file, "there is no such file", "check the path") from error
+    except (OSError, ValueError) as error:  # too long, a null byte, a folder that is closed to us
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise _unreadable(Path(repr(path)[:60]), str(reason), "check the path and its permissions") from error
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "no ordinary file"
+        raise _unreadable(file, f"it is {kind}", "give a file that Solution.save wrote")
+    return file
+
+
+def _read(file: Path) -> tuple[Any, bool]:
+    """The decoded content of a file, whatever it is, and whether its checksum fits.
+
+    Raises:
+        ProblemError: it cannot be read, or is neither a complete .npz nor a complete .json file.
+    """
+    try:
+        return unpacked(file.read_bytes())
     except OSError as error:
-        reason = str(error) if file.exists() else "there is no such file"
-        raise _unreadable(file, reason, "check the path and its permissions") from error
-    except ProblemError:
-        raise
-    except (
-        DamagedFileError,
-        ValueError,  # also JSON and Unicode errors, and arrays of Python objects, which are never read
-        TypeError,
-        AttributeError,
-        KeyError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-        RuntimeError,  # an encrypted or an unknown compression, too deep a nesting
-        MemoryError,
-        OverflowError,
-    ) as error:
-        reason = f"it is damaged or of another format ({type(error).__name__}: {str(error)[:80]})"
-        raise _unreadable(file, reason, "give a file that Solution.save wrote, or solve and save again") from error
+        raise _unreadable(file, str(error), "check the path and its permissions") from error
+    except (DamagedFileError, *FOREIGN) as error:
+        raise _damaged(file, error) from error
+
+
+def _damaged(file: Path, error: Exception) -> ProblemError:
+    kind = "" if isinstance(error, DamagedFileError) else f"{type(error).__name__}: "
+    reason = f"it is damaged or of another format ({kind}{str(error)[:REASON]})"
+    return _unreadable(file, reason, "give a file that Solution.save wrote, or solve and save again")
 
 
 def _unreadable(file: Path, reason: str, remedy: str) -> ProblemError:
@@ -157,57 +182,6 @@ def _unreadable(file: Path, reason: str, remedy: str) -> ProblemError:
             remedy=remedy,
         )
     )
-
-
-def _attached(solution: Solution, statement: Statement) -> Solution:
-    """The solution with its statement.
-
-    Raises:
-        ProblemError: symbols, numbers of constraints, durations or rates differ.
-    """
-    difference = _difference(solution, statement)
-    if difference is None:
-        return replace(solution, statement=statement)
-    what, stored, given = difference
-    raise ProblemError(
-        describe(
-            f"The stored solution of '{solution.name}' is not one of the given problem '{statement.name}': {what}.",
-            expected=f"{stored} (stored)",
-            received=f"{given} (given)",
-            remedy="give the problem that was solved, or load without one",
-        )
-    )
-
-
-def _difference(solution: Solution, statement: Statement) -> tuple[str, str, str] | None:
-    """What differs first, as stored and as given; None: nothing."""
-    if (solution.blocks, solution.augmented) != (statement.blocks, statement.augmented):
-        return "their symbols differ", _symbols(solution.blocks), _symbols(statement.blocks)
-    m = solution.multipliers
-    stored = [m.start.size, m.path.shape[1] if m.path.size else 0, m.end.size]
-    given = [statement.start.size, statement.path.size, statement.end.size]
-    if any(s not in (0, g) for s, g in zip(stored, given, strict=True)):
-        return "their numbers of constraints (start, path, end) differ", str(stored), str(given)
-    if not statement.duration.free and not math.isclose(statement.duration.guess, solution.duration):
-        return "their durations differ", f"{solution.duration:g} s", f"{statement.duration.guess:g} s"
-    attached = replace(solution, statement=statement).extremal
-    values = statement.rates.map(solution.mesh.nodes.size)(*attached.columns())
-    rates = np.hstack([np.asarray(value.full()).T for value in values[:2]])
-    scale = np.abs(solution.rates).max(axis=0, initial=0.0)
-    error = np.abs(rates - solution.rates) > SAME_RATES * np.maximum(scale, np.finfo(float).tiny)
-    if error.any():
-        node, entry = np.argwhere(error)[0]
-        name = (*statement.state_names, *statement.matrix_names)[entry]
-        return (
-            f"the rate of '{name}' at t = {solution.t[node]:g} s differs",
-            f"{solution.rates[node, entry]:g}",
-            f"{rates[node, entry]:g}",
-        )
-    return None
-
-
-def _symbols(blocks: tuple[Block, ...]) -> str:
-    return ", ".join(f"{b.kind} {b.name} ({b.size})" for b in blocks)
 
 
 def to_xarray(solution: Solution) -> Any:

@@ -30,6 +30,8 @@ class Multipliers:
     final_matrices: the same for the half-vectors, shape (ne,).
     end, start: of the terminal and initial inequalities.
     path: of the path inequalities at the nodes, shape (N + 1, rows).
+    inside_path, inside_states: of the path inequalities and the bounds on states at the other points of the intervals
+        where they are imposed, shapes (N, points - 1, rows), (N, points - 1, nx).
     states, matrices: of the bounds on states and half-vectors at the nodes, shapes (N + 1, nx), (N + 1, ne).
     controls: of the bounds on the controls, shape (N + 1 or N, nu).
     gaps: of the continuity at the ends of the shooting segments: the costates there, a row for each segment, shape
@@ -48,6 +50,8 @@ class Multipliers:
     matrices: Array = field(default_factory=lambda: np.zeros((0, 0)))
     controls: Array = field(default_factory=lambda: np.zeros((0, 0)))
     gaps: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    inside_path: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    inside_states: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @staticmethod
     def zero(statement: Statement, mesh: Mesh) -> Multipliers:
@@ -62,4 +66,28 @@ class Multipliers:
             states=np.zeros((nodes, statement.nx)),
             matrices=np.zeros((nodes, statement.ne)),
             controls=np.zeros((mesh.control_nodes, statement.nu)),
+            inside_path=np.zeros((mesh.intervals, mesh.points - 1, statement.path.size)),
+            inside_states=np.zeros((mesh.intervals, mesh.points - 1, statement.nx)),
         )
+
+    @property
+    def path_at_nodes(self) -> Array:
+        """Those of the path inequalities, with what acts inside an interval shared between its nodes, (N + 1, rows)."""
+        return _shared(self.path, self.inside_path)
+
+    @property
+    def states_at_nodes(self) -> Array:
+        """The same of the bounds on states, (N + 1, nx)."""
+        return _shared(self.states, self.inside_states)
+
+
+def _shared(nodes: Array, inside: Array) -> Array:
+    """Values at nodes, and at equally spread points between them by the lever rule."""
+    if not inside.size:
+        return nodes
+    points = inside.shape[1] + 1
+    later = np.arange(1, points)[:, None] / points
+    result = nodes.copy()
+    result[:-1] += ((1.0 - later) * inside).sum(axis=1)
+    result[1:] += (later * inside).sum(axis=1)
+    return result

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.accuracy import NO_COST
-from covocp.errors import CovocpError, ProblemError, describe, spelling
+from covocp.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
+from covocp.errors import CovocpError, Interrupted, ProblemError, describe, spelling
 from covocp.mesh import Options
 from covocp.methods import METHODS, Solver, check_problem, method_options
 from covocp.report import number, render_table, wrapped
 from covocp.solution import Solution
+from covocp.threads import methods_one_at_a_time, one_at_a_time
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,6 +49,7 @@ class Row:
     seconds: float
 
 
+@methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
     """Runs of one problem; prints as a table, indexed by label (the method's name by default) or number.
@@ -83,9 +86,9 @@ class Comparison:
         """
         labels = [row.label for row in self.rows]
         row = None
-        if isinstance(key, int) and -len(labels) <= key < len(labels):
+        if isinstance(key, int) and not isinstance(key, bool) and -len(labels) <= key < len(labels):
             row = self.rows[key]
-        elif key in labels:
+        elif isinstance(key, str) and key in labels:
             row = self.rows[labels.index(str(key))]
         if row is None or row.solution is None:
             raise ProblemError(
@@ -137,6 +140,8 @@ class Comparison:
         return "\n\n".join(part for part in parts if part)
 
 
+@one_at_a_time
+@checked(methods=either(text, sequence), progress=truth, method_options=optional(mapping))
 def compare(
     problem: Problem,
     methods: Sequence[Any] = DEFAULT,
@@ -185,6 +190,8 @@ def _run(problem: Problem, label: str, method: str, options: dict[str, Any], pro
     try:
         solution = Solver(problem, method, **options).solve(progress=progress, allow_failure=True, **starting)
         reason = "" if solution.converged else f"did not converge: {solution.message}"
+    except Interrupted as error:
+        solution, reason = error.solution, f"{INTERRUPTED}: {error}"
     except Exception as error:  # whatever a method raises: the other runs are wanted all the same
         text = " ".join(str(error).split())
         reason = text if isinstance(error, CovocpError) else f"{type(error).__name__}: {text}"
@@ -207,7 +214,9 @@ def _runs(
                 repr(label),
                 "give (label, method, options) with another label",
             )
-        chosen = {**shared, **by_method.get(method, {}), **own}
+        shared_by_method = by_method.get(method, {})
+        check_argument("compare()", "method_options", mapping, shared_by_method)
+        chosen = {**shared, **shared_by_method, **own}
         known = _option_names(method)
         for name in chosen:
             if name not in known:
@@ -222,7 +231,7 @@ def _runs(
         raise _wrong(
             "There are options for a method that is not compared.",
             "one of " + ", ".join(dict.fromkeys(run[1] for run in runs)),
-            ", ".join(unused),
+            ", ".join(map(str, unused)),
             "correct method_options=",
         )
     if not runs:

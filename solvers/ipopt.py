@@ -2,32 +2,48 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.checks import check_positive, is_whole
+from covocp.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
+from covocp.convergence import LIMIT
+from covocp.domain import needs_exact_bounds
 from covocp.errors import ProblemError, describe
-from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import choose_scales, quadrature_weights, stiffness
+from covocp.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
+from covocp.guess import choose_scales, resolve_mesh, starts
 from covocp.hamiltonian import without_passage
-from covocp.integrators import COMPILED_SOLVER
+from covocp.linear_solve import COMPILED_SOLVER
 from covocp.matrices import Array
-from covocp.mesh import Mesh, Options, choose_mesh, choose_step
-from covocp.nlp import NLP
+from covocp.mesh import Mesh, Options
+from covocp.nlp import NLP, Scales, check_finite
 from covocp.progress import Progress
-from covocp.shooting import transcribe
+from covocp.solvers.plugins import merged, silent
+from covocp.solvers.reached import (
+    FirstOrder,
+    Point,
+    Round,
+    Start,
+    carried,
+    not_zero,
+    reached_scales,
+    residuals,
+    similar,
+)
 from covocp.statement import Statement
+from covocp.steering import quadrature_weights
+from covocp.transcription import transcribe
 
 TOLERANCE = 1e-7
 MAX_ITERATIONS = 1000
+# What is left at a point is judged by residuals of the first order, larger than tolerances on slopes by this factor.
+LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
+# Runs from one start, each in the scales of the point that the last one reached.
+LARGEST_ROUNDS = 6
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
@@ -46,6 +62,13 @@ INSIDE: dict[str, dict[str, Any]] = {
     "free gain": {"mu_init": 1e-2, "bound_push": 1e-4, "bound_frac": 1e-4},
 }
 
+# A run that has not brought its largest violation below this share of the smallest one before, for so many iterations,
+# has lost its way, unless it violates (in the units of the NLP) less than this: then it may take its time.
+PATIENCE = 40
+PROGRESS = 0.9
+NEAR = 1e-3
+LOST = ("Infeasible_Problem_Detected", "Restoration_Failed", "Invalid_Number_Detected")
+
 MESSAGES = {
     "Solve_Succeeded": "solved",
     "Solved_To_Acceptable_Level": "solved to the acceptable level only: the tolerance asked for was not reached",
@@ -58,8 +81,24 @@ MESSAGES = {
     "Search_Direction_Becomes_Too_Small": "no further progress is possible at this accuracy",
     "Invalid_Number_Detected": "the model became NaN or inf: add bounds that keep it in its domain",
 }
+NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
 
 
+# Endings of Ipopt at points that may be stationary, whether it says so or not.
+JUDGED = ("Solved_To_Acceptable_Level", "Search_Direction_Becomes_Too_Small")
+STALE = "the tolerance was met in the scales of the start, but not in those of the point that was reached"
+REMEDY = "start closer (guess=), or give the magnitudes of states and controls (scale=)"
+
+
+@checked(
+    "the method 'ipopt'",
+    tolerance=optional(positive),
+    max_iterations=optional(whole(0)),
+    hessian=one_of("auto", "exact", "limited-memory"),
+    plugin=text,
+    plugin_options=optional(mapping),
+    compile=truth,
+)
 def prepare(
     statement: Statement,
     options: Options,
@@ -92,9 +131,7 @@ def prepare(
         ProblemError: an option is wrong, or the model is not finite where the solver starts.
     """
     _check_options(tolerance, max_iterations, hessian, plugin)
-    step = choose_step(statement, options)
-    stiff = stiffness(statement, options.nodes(), options.control, statement.values, matrices=step == "rk4")
-    mesh = choose_mesh(statement, options, stiff)
+    mesh = resolve_mesh(statement, options, statement.values)
     limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
     limited = limited and plugin == "ipopt"
     settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
@@ -110,24 +147,21 @@ def prepare(
         }
         if statement.loop is not None and not mesh.eliminated:
             settings["ipopt"] |= INSIDE["best gain" if statement.behind else "free gain"]
+        start, e0 = starts(statement, mesh, statement.values)
+        if needs_exact_bounds(statement, mesh, start, e0, statement.values):
+            settings["ipopt"]["bound_relax_factor"] = 0.0
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}
     if compile:
         settings |= JIT
         mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
-    for key, value in (plugin_options or {}).items():
-        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
-    return ShootingSolver(statement, mesh, plugin, settings, limited)
+    settings = merged(settings, plugin_options or {})
+    limit = max(LIMIT, LIMIT_PER_TOLERANCE * (TOLERANCE if tolerance is None else tolerance))
+    return ShootingSolver(statement, mesh, plugin, settings, limited, limit)
 
 
 def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: Any) -> None:
-    """Refuse options that mean nothing, or nothing to the plugin."""
-    if tolerance is not None:
-        check_positive("tolerance", tolerance)
-    if max_iterations is not None and not is_whole(max_iterations, 0):
-        raise _option_error("max_iterations", "a number of iterations: 0, 1, 2, ...", max_iterations)
-    if hessian not in ("auto", "exact", "limited-memory"):
-        raise _option_error("hessian", "'auto', 'exact' or 'limited-memory'", hessian)
+    """Refuse a plugin that is not there, and options that mean nothing to it."""
     if not ca.has_nlpsol(plugin):
         raise ProblemError(
             describe(
@@ -161,10 +195,13 @@ def _option_error(name: str, expected: str, received: Any) -> ProblemError:
 class ShootingSolver:
     """A transcribed problem with its NLP solver; the NLP is built at the first guess, which gives its scales."""
 
-    def __init__(self, statement: Statement, mesh: Mesh, plugin: str, settings: dict[str, Any], limited: bool) -> None:
-        """Keep the settings; see `prepare`."""
+    def __init__(
+        self, statement: Statement, mesh: Mesh, plugin: str, settings: dict[str, Any], limited: bool, limit: float
+    ) -> None:
+        """Keep the settings; see `prepare`. `limit`: of the residuals of a converged point."""
         self._statement, self._mesh = statement, mesh
-        self._plugin, self._settings, self._limited = plugin, settings, limited
+        self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
+        self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: _Monitor | None = None
         self._nlp: NLP | None = None
         self._cold: ca.Function | None = None
@@ -176,23 +213,96 @@ class ShootingSolver:
         return self._mesh
 
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
-        """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
+        """Solve for these parameters from this guess; the last iterate is returned whatever happens.
+
+        Where the run converged in the scales of the start, but not in those of the point it reached, it goes on from
+        there in new ones.
+        """
         begin = time.perf_counter()
-        with self._hushed(progress):
-            nlp, solver = self._build(parameters, guess)
-        bounds = nlp.bounds(parameters)
-        w0 = np.clip(nlp.pack(guess.trajectory), bounds["lbx"], bounds["ubx"])
-        scale = self._cost_scale(solver, w0, parameters)
-        arguments: dict[str, Any] = {"x0": w0, "p": np.append(parameters, scale), **bounds}
+        nlp, solver = self._build(parameters, guess, progress.shown)
+        built = time.perf_counter()
+        start = Start(w=nlp.pack(guess.trajectory))
         if guess.multipliers is not None and guess.costates is not None:
             lam_x, lam_g = nlp.pack_multipliers(guess.multipliers, guess.costates)
-            arguments |= {"lam_x0": lam_x / scale, "lam_g0": lam_g / scale}
-        built = time.perf_counter()
+            start = Start(w=start.w, lam_x=lam_x, lam_g=lam_g)
+        first = self._run(nlp, solver, start, parameters, progress, guess.tentative)
+        lost = self._lost_way(first.status)
+        if lost and guess.tentative:  # there are other starts
+            rounds = [self._judged(nlp, first, parameters)]
+        else:
+            rounds = self._rounds(nlp, first, parameters, progress)
+        last = rounds[-1]
+        counts = {
+            "iterations": sum(entry.point.iterations for entry in rounds) if last.point.iterations >= 0 else -1,
+            "build_seconds": built - begin,
+            "solve_seconds": time.perf_counter() - built,
+            "return_status": last.point.status,
+            "hessian": "limited-memory" if self._limited else "exact",
+        }
+        counts |= lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
+        return self._outcome(last, parameters, counts)
+
+    def _rounds(self, nlp: NLP, first: Point, parameters: Array, progress: Progress) -> list[Round]:
+        """The first run judged in the scale of the point it reached, and further ones from there until that holds.
+
+        A round that fails is followed by one without multipliers. The last entry is the one to return: a converged one,
+        or the best.
+        """
+        done = [self._judged(nlp, first, parameters)]
+        while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS:
+            best = min(done, key=lambda entry: entry.worst)
+            if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
+                break
+            nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
+            solver = self._warm_solver() if start.lam_x is not None else self._cold
+            assert solver is not None
+            point = self._run(nlp, solver, start, parameters, progress)
+            done.append(self._judged(nlp, point, parameters, again=True))
+        if not done[-1].converged:
+            done.append(done.pop(done.index(min(done, key=lambda entry: entry.worst))))
+        return done
+
+    def _judged(self, nlp: NLP, point: Point, parameters: Array, again: bool = False) -> Round:
+        """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
+        where = point.where
+        if not (point.success or point.status in JUDGED):
+            return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
+        assert self._cold is not None
+        first = FirstOrder(nlp, self._cold, self._plugin)
+        found = residuals(first, point, parameters, where, None)
+        if not found.hold(self._limit):  # an upper bound so far
+            found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
+        return Round(nlp=nlp, point=point, where=where, residuals=found, converged=found.hold(self._limit))
+
+    def _rescaled(self, last: Round, first: NLP, parameters: Array, dual: bool) -> tuple[NLP, Start]:
+        """The NLP in the scales of the point that a run reached, and that point in its units."""
+        nlp = last.nlp
+        scales = not_zero(nlp, reached_scales(nlp, last.where[0], parameters, again=nlp is not first))
+        if nlp is not self._nlp or not similar(nlp, scales):
+            self._transcribe(scales)
+        assert self._nlp is not None
+        return self._nlp, carried(last.point, nlp, self._nlp, dual=dual)
+
+    def _run(
+        self,
+        nlp: NLP,
+        solver: ca.Function,
+        start: Start,
+        parameters: Array,
+        progress: Progress,
+        tentative: bool = False,
+    ) -> Point:
+        """One run of the NLP solver; a tentative one may be given up."""
+        bounds = nlp.bounds(parameters)
+        w0 = np.clip(start.w, bounds["lbx"], bounds["ubx"])
+        scale = self._cost_scale(solver, w0, parameters)
+        arguments: dict[str, Any] = {"x0": w0, "p": np.append(parameters, scale), **bounds}
+        if start.lam_x is not None and start.lam_g is not None:
+            arguments |= {"lam_x0": start.lam_x / scale, "lam_g0": start.lam_g / scale}
         if self._monitor is not None:
-            self._monitor.attach(progress, scale, bounds)
+            self._monitor.attach(progress, scale, bounds, tentative)
         try:
-            with self._hushed(progress):
-                result = solver(**arguments)
+            result = solver(**arguments)
         except RuntimeError as error:  # a plugin that gives up by raising; its last iterate is lost, the start is not
             result = {"x": ca.DM(w0), "lam_x": ca.DM.zeros(w0.size), "lam_g": ca.DM.zeros(bounds["lbg"].size)}
             reason = str(error).strip().splitlines()[-1]
@@ -200,67 +310,91 @@ class ShootingSolver:
         else:
             stats = solver.stats()
         w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
-        counts = {
-            "iterations": int(stats.get("iter_count", -1)),
-            "build_seconds": built - begin,
-            "solve_seconds": time.perf_counter() - built,
-            "return_status": str(stats.get("return_status", "")),
-            "hessian": "limited-memory" if self._limited else "exact",
-        }
-        return self._outcome(nlp, w, scale * lam_x, scale * lam_g, parameters, bool(stats["success"]), counts)
+        success, status = bool(stats["success"]), str(stats.get("return_status", ""))
+        try:
+            where = nlp.unpack(w, parameters)
+        except RuntimeError:  # a solve inside the model that gives up: the last iterate is lost, the start is not
+            w, lam_x, lam_g, where = w0, 0.0 * lam_x, 0.0 * lam_g, nlp.unpack(w0, parameters)
+            success, status = False, NOT_EVALUABLE.format(status)
+        return Point(
+            w=w,
+            lam_x=scale * lam_x,
+            lam_g=scale * lam_g,
+            where=where,
+            success=success,
+            status=status,
+            iterations=int(stats.get("iter_count", -1)),
+        )
 
-    @contextmanager
-    def _hushed(self, progress: Progress) -> Iterator[None]:
-        """Other plugins than Ipopt print their iterations, each by options of its own: only where somebody watches."""
-        if self._plugin == "ipopt" or progress.shown:
-            yield
-            return
-        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
-            yield
+    def _lost_way(self, status: str) -> dict[str, Any]:
+        """Whether the run lost its way, as a count."""
+        if self._monitor is not None and self._monitor.wandered:
+            return {"wandered": STOPPED}
+        return {"wandered": ENDED} if status in LOST else {}
 
-    def _outcome(
-        self, nlp: NLP, w: Array, lam_x: Array, lam_g: Array, parameters: Array, success: bool, stats: dict[str, Any]
-    ) -> Outcome:
+    def _outcome(self, last: Round, parameters: Array, stats: dict[str, Any]) -> Outcome:
         """The iterate as data."""
-        trajectory, values = nlp.unpack(w, parameters)
+        nlp, point = last.nlp, last.point
+        trajectory, values = last.where
         extremal = Extremal(
             statement=self._statement,
             mesh=self._mesh,
             trajectory=trajectory,
             parameters=parameters,
-            multipliers=nlp.unpack_multipliers(lam_x, lam_g, trajectory, parameters),
+            multipliers=nlp.unpack_multipliers(point.lam_x, point.lam_g, trajectory, parameters),
         )
-        status = stats["return_status"]
         return Outcome(
             extremal=without_passage(extremal),
             cost_terms={"terminal": values["terminal"], "running": values["running"]},
-            converged=success,
-            message=self._message(success, status),
+            converged=last.converged,
+            message=self._message(last),
             violations=nlp.violations(values["g"], parameters),
             stats=stats,
         )
 
-    def _message(self, success: bool, status: str) -> str:
+    def _message(self, last: Round) -> str:
         """How the run ended, a sentence."""
-        if self._plugin == "ipopt" and status in MESSAGES:
-            return MESSAGES[status]
-        return "solved" if success else f"{self._plugin} ended with the status '{status}'"
+        status = last.point.status
+        if last.converged:
+            return MESSAGES.get(status, "solved") if last.point.success else "solved"
+        if last.residuals is not None and last.point.success:
+            return f"{STALE}: {last.residuals}; {REMEDY}"
+        if status.startswith(NOT_EVALUABLE.format("")):
+            return status
+        return MESSAGES.get(status, f"{self._plugin} ended with the status '{status}'")
 
-    def _build(self, parameters: Array, guess: Guess) -> tuple[NLP, ca.Function]:
-        """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts."""
+    def _build(self, parameters: Array, guess: Guess, watched: bool) -> tuple[NLP, ca.Function]:
+        """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts.
+
+        Other plugins than Ipopt print their iterations where somebody watches that call.
+        """
         if self._nlp is None or self._cold is None:
-            scales = choose_scales(self._statement, self._mesh, guess.trajectory, parameters)
-            if self._limited:
-                # in these units equal changes of two control values cost the same, however long their intervals are
-                weights = quadrature_weights(self._mesh)
-                units = np.sqrt(weights.mean() / weights)[:, None]
-                scales = replace(scales, x=STRETCH * scales.x, u=scales.u * units)
-            self._nlp = transcribe(self._statement, self._mesh, scales)
-            if self._plugin == "ipopt":
-                self._monitor = _Monitor(self._nlp)
-            self._cold = self._make({})
-        if not guess.warm or self._plugin != "ipopt" or guess.multipliers is None:
+            if self._plugin != "ipopt" and not watched:
+                self._settings = silent(self._plugin, self._settings)
+            self._transcribe(choose_scales(self._statement, self._mesh, guess.trajectory, parameters))
+        assert self._nlp is not None
+        assert self._cold is not None
+        if not guess.warm or guess.multipliers is None:
             return self._nlp, self._cold
+        return self._nlp, self._warm_solver()
+
+    def _transcribe(self, scales: Scales) -> None:
+        """The NLP in these scales, and its solver."""
+        if self._limited:
+            # in these units equal changes of two control values cost the same, however long their intervals are
+            weights = quadrature_weights(self._mesh)
+            units = np.sqrt(weights.mean() / weights)[:, None]
+            scales = replace(scales, x=STRETCH * scales.x, u=scales.u * units)
+        self._nlp = transcribe(self._statement, self._mesh, scales)
+        if self._plugin == "ipopt":
+            self._monitor = _Monitor(self._nlp)
+        self._cold, self._warm = self._make({}), None
+
+    def _warm_solver(self) -> ca.Function:
+        """The solver for starts with multipliers; other plugins than Ipopt have one for all."""
+        assert self._cold is not None
+        if self._plugin != "ipopt":
+            return self._cold
         if self._warm is None:
             shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
                 {} if self._limited else {"hess_lag": "nlp_hess_l"}
@@ -268,7 +402,7 @@ class ShootingSolver:
             self._warm = self._make(
                 {option: self._cold.get_function(name) for option, name in shared.items()}, warm=True
             )
-        return self._nlp, self._warm
+        return self._warm
 
     def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> ca.Function:
         nlp = self._nlp
@@ -306,9 +440,14 @@ class ShootingSolver:
         """
         if self._plugin != "ipopt":  # each plugin has functions of its own, and a scaling of its own
             return 1.0
-        gradient = solver.get_function("nlp_grad_f")
-        p = np.append(parameters, 1.0)
+        with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
+            return self._curvature_along(solver.get_function("nlp_grad_f"), w0, np.append(parameters, 1.0))
+
+    def _curvature_along(self, gradient: ca.Function, w0: Array, p: Array) -> float:
+        """|g' H g| / g' g of the cost, g its slopes, and what stands for it where it is no number."""
         value, first = (np.asarray(v.full()).ravel() for v in gradient(w0, p))
+        if not np.isfinite(value[0]) and self._nlp is not None:
+            check_finite(self._nlp, w0, p[:-1])
         size = float(np.linalg.norm(first))
         count = self._mesh.control_nodes * self._statement.nu + int(self._statement.duration.free)
         largest = max(abs(float(value[0])), float(np.abs(first[first.size - count :]).max(initial=0.0)))
@@ -330,11 +469,15 @@ class _Monitor(ca.Callback):
         self._progress: Progress | None = None
         self._scale, self._iteration = 1.0, 0
         self._bounds: dict[str, Array] = {}
+        self._impatient, self.wandered = False, False
+        self._least, self._since = np.inf, 0
         self.construct("progress", {})
 
-    def attach(self, progress: Progress, scale: float, bounds: dict[str, Array]) -> None:
-        """Report to this progress from now on."""
+    def attach(self, progress: Progress, scale: float, bounds: dict[str, Array], impatient: bool = False) -> None:
+        """Report to this progress from now on; an impatient one stops a run that has lost its way."""
         self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
+        self._impatient, self.wandered = impatient, False
+        self._least, self._since = np.inf, 0
 
     def get_n_in(self) -> int:
         """One for each output of the solver."""
@@ -368,6 +511,15 @@ class _Monitor(ca.Callback):
             violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
             self._progress.update(self._iteration, float(cost[0]) * self._scale, float(violation))
             self._iteration += 1
-            stop = self._progress.stop
+            stop = self._progress.stop or self._wanders(float(violation))
         np.frombuffer(res[0], dtype=float)[:] = stop
         return 0
+
+    def _wanders(self, violation: float) -> bool:
+        """Whether a run that need not be finished has made no progress for long."""
+        if not self._impatient:
+            return False
+        if violation < PROGRESS * self._least:
+            self._least, self._since = violation, self._iteration
+        self.wandered = violation > NEAR and self._iteration - self._since >= PATIENCE
+        return self.wandered

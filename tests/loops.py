@@ -6,6 +6,8 @@ from problems import graded
 
 import covocp as co
 from covocp.models import unknown_lag
+from covocp.simulation.actual import design_system
+from covocp.simulation.run_parts import Limits, Setting
 
 GRADED = graded(40)
 
@@ -49,3 +51,11 @@ def open_loop(rate=None, *, noise=0.2, measured=True, variance=0.5, initial=1.0,
     problem.estimation_covariance()
     problem.minimize(running=(u - 0.1) ** 2)
     return problem
+
+
+def setting_of(solution, kind="perturbation"):
+    """What `simulate` makes of a solution, without limits."""
+    design = design_system(solution)
+    free, domain = np.full(design.fed_back, np.inf), np.full(design.size, 1e300)
+    limits = Limits(lower=-free, upper=free, least=-free, most=free)
+    return Setting(solution=solution, design=design, actual=design, filter=kind, limits=limits, domain=domain)

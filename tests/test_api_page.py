@@ -26,15 +26,18 @@ CODE = re.compile(r"`([^`]+)`")
 # Classes that a user meets without making them.
 MET = {
     "EstimationCovariance": "covocp.estimation",
-    "Sample": "covocp.solution",
+    "Sample": "covocp.sample",
     "Optimality": "covocp.optimality",
     "ClosedLoop": "covocp.closed_loop",
     "Row": "covocp.solvers.compare",
+    "MeanEffect": "covocp.mean_effect",
+    "Count": "covocp.simulation.counts",
     "Verdict": "covocp.simulation.verdict",
     "Check": "covocp.export.package",
     "Timing": "covocp.export.package",
 }
-MADE = ("Free", "Gain", "Problem", "Solver", "SolveError")  # by the user: their data are set on construction
+# By the user: their data are set on construction.
+MADE = ("Free", "Gain", "Problem", "Solver", "SolveError", "Interrupted")
 HELD = ("Solution", "MonteCarlo", "CPackage", "Comparison", "Certificate", "Worth", "LawSimulation")
 
 
@@ -87,7 +90,7 @@ def made(name: str) -> set[str]:
     x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
     ocp.dynamics(x, u)
     ocp.minimize(running=u**2)
-    example = {"Problem": ocp, "SolveError": co.SolveError("")}
+    example = {"Problem": ocp, "SolveError": co.SolveError(""), "Interrupted": co.Interrupted("")}
     thing = Solver(ocp) if name == "Solver" else example.get(name)
     return {key for key in vars(thing) if not key.startswith("_")} if thing is not None else set()
 

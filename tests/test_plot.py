@@ -181,7 +181,8 @@ def test_large_vectors_and_matrices_share_panels():
 
 
 def test_a_loaded_solution_is_drawn_without_its_problem(lag, tmp_path):
-    known = replace(lag, stored_optimality=lag.optimality, stored_costates=lag.costates, statement=None)
+    stored = {"stored_optimality": lag.optimality, "stored_costates": lag.costates, "stored_dense": lag.dense}
+    known = replace(lag, **stored, statement=None)
     loaded = co.load(known.save(tmp_path / "solution.npz"))
     found, original = panels(loaded.plot("x", "E", costates=True)), panels(lag.plot("x", "E", costates=True))
     assert list(found) == list(original)

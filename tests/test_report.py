@@ -60,6 +60,19 @@ def test_every_residual_has_words_and_its_value(lag):
             assert numbers_after(text, RESIDUALS[name]) == [pytest.approx(value, rel=1e-2)]
 
 
+def test_large_residuals_say_what_they_mean(lag):
+    assert "worry" not in str(lag)
+    for name, value, words in (
+        ("costate_difference", 0.5, "worry if the mesh error is large"),
+        ("cross_covariance", 0.026, "worry if the expected costs differ"),
+        ("stationarity", 1e-2, "not yet stationary"),
+        ("curvature", 0.0, "flat: its sign is below its error"),
+    ):
+        text = str(replace(lag, stored_optimality=replace(lag.optimality, **{name: value})))
+        assert words in " ".join(text.split())
+        assert max(len(line) for line in text.splitlines()) <= 100
+
+
 def test_a_saddle_and_an_indefinite_covariance_are_called_so(lag):
     saddle = replace(lag, stored_optimality=replace(lag.optimality, curvature=-1.0))
     assert "NOT A MINIMUM" in summary(saddle)
@@ -242,6 +255,7 @@ def test_what_path_constraints_do_between_the_nodes():
     ocp.minimize(running=u.T @ u)
     middle = x - 0.5
     ocp.subject_to(0.01 - middle.T @ middle, name="obstacle")
-    solution = co.solve(ocp, intervals=5, progress=False)
-    assert "between them they are violated by up to 0.01 (obstacle)" in " ".join(str(solution).split())
+    with pytest.warns(co.CovocpWarning, match="the limit of 'obstacle' is passed by 0.01"):
+        solution = co.solve(ocp, intervals=5, progress=False)
+    assert "between them that of 'obstacle' is passed by up to 0.01" in " ".join(str(solution).split())
     assert "between them" not in str(co.solve(unknown_lag.problem(), intervals=50, progress=False))

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
 from covocp.errors import ProblemError, describe
@@ -66,6 +67,7 @@ def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
     return restored(stabilising(*weights(A, B, Q, R, cross), discrete=True), A)
 
 
+@checked(discrete=truth)
 def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
     """Solution X of A X + X A' + Q = 0, or of A X A' - X + Q = 0.
 
@@ -109,6 +111,7 @@ def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
     return restored(solution, A)
 
 
+@checked(discrete=truth)
 def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
     """Modes of A that are not stable and that B does not reach (Hautus: [A - mode I, B] loses rank).
 
@@ -127,6 +130,7 @@ def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
     return lost_modes(a, numeric("B", matrix("B", B, (a.shape[0], None))), discrete=discrete)
 
 
+@checked(discrete=truth)
 def undetectable(A: Any, H: Any, *, discrete: bool = False) -> Modes:
     """Modes of A that are not stable and that H does not see: those of the dual pair (A', H').
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, overload
 
+from covocp.arguments import a, check_argument
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import matrix, square
 
@@ -82,12 +83,13 @@ def dual(problem: Control | Estimation) -> Control | Estimation:
     Raises:
         ProblemError: shapes that do not fit.
     """
+    check_argument("dual()", "problem", a(Control, Estimation), problem)
     size = square("transition", problem.transition).shape[0]
     values: dict[str, Any] = {}
     for control, estimation, transposed in TABLE:
         here, there = (control, estimation) if isinstance(problem, Control) else (estimation, control)
         value = getattr(problem, here)
-        if value is None:
+        if value is None and here == "cross":
             continue
         if here == "measurement":
             value = row_matrix(here, value, size)

@@ -9,12 +9,14 @@ from typing import Any
 
 import casadi as ca
 
+from covocp.arguments import checked, whole
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.blocks.updates import Form, Missing, updating
 from covocp.blocks.values import is_symbolic, weight, wrong_argument
 
 
+@checked(substeps=whole(1, 10**4))
 def extended(
     f: ca.Function,
     h: ca.Function,
@@ -50,6 +52,8 @@ def extended(
     if step is None:
         moved = model.f(x, u)
         ahead = [ca.densify(moved), *apply(_covariance_after, P, ca.jacobian(moved, x), model.noise(x, u))]
+    elif is_symbolic(step):
+        raise wrong_argument("step", "a number [s]", f"an expression, {step}"[:80])
     else:
         rate, density = (_with_time(function, model) for function in (model.f, model.noise))
         ahead = propagated(rate, density, (x, P, ca.DM(0.0), u), bucy.time_step(step), substeps)

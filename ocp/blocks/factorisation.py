@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, whole
 from covocp.blocks import values
 from covocp.errors import ProblemError, describe
 
@@ -79,12 +81,13 @@ def as_states(states: Any, size: int) -> Array:
     Raises:
         ProblemError: another shape, NaN or inf.
     """
-    given = np.asarray(states, dtype=float) if not isinstance(states, values.SYMBOLIC) else states
-    if np.ndim(given) == 1:
-        given = np.reshape(given, (-1, size) if size == 1 else (1, -1))
+    given = values.array("states", states)
+    if given.ndim == 1:
+        given = given.reshape((-1, size) if size == 1 else (1, -1))
     return values.numeric("states", values.matrix("states", given, (None, size)))
 
 
+@checked(seed=whole(0, None))
 def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, seed: int = 0) -> None:
     """Whether (A0 + A(x)) x = f(x), checked at some states.
 
@@ -103,7 +106,7 @@ def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, 
     constant = values.numeric("A0", values.square("A0", A0))
     size = constant.shape[0]
     state, rest = dependence(x, A, size)
-    given = values.matrix("f", f(x) if callable(f) else f, (size, 1))
+    given = values.matrix("f", _at_state(f, x) if callable(f) else f, (size, 1))
     factor = ca.DM(constant) + rest
     sides: Any = [factor @ state, in_state("f", x, given, state), ca.fabs(factor) @ ca.fabs(state)]
     inputs: Any = [state]
@@ -121,6 +124,25 @@ def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, 
         sample, row = wrong[0]
         at = "(" + ", ".join(f"{value:.6g}" for value in tried[sample]) + ")"
         raise _wrong(f"component {row} of f, {right[sample, row]:.8g}, at x = {at}", f"{left[sample, row]:.8g}")
+
+
+def _at_state(f: Callable[[Any], Any], x: Any) -> Any:
+    """What a function returns for the symbol.
+
+    Raises:
+        ProblemError: it fails.
+    """
+    try:
+        return f(x)
+    except Exception as error:  # whatever the user's function raises
+        raise ProblemError(
+            describe(
+                "The function f fails for the symbol of the state.",
+                expected="a function of x, by CasADi's functions",
+                received=f"{type(error).__name__}: {error}"[:200],
+                remedy="call it by itself with that symbol",
+            )
+        ) from error
 
 
 def integral_states(x: Any, A0: Any, A: Any, B: Any, output: Any) -> tuple[Any, Any, Any, Any]:
@@ -156,7 +178,10 @@ def integral_states(x: Any, A0: Any, A: Any, B: Any, output: Any) -> tuple[Any, 
 
 def as_rows(value: Any) -> Any:
     """A matrix; one of one dimension as a row."""
-    return np.atleast_2d(value) if not isinstance(value, (ca.DM, *values.SYMBOLIC)) and np.ndim(value) == 1 else value
+    if isinstance(value, (ca.DM, *values.SYMBOLIC)):
+        return value
+    numbers = values.array("output", value)
+    return numbers[None, :] if numbers.ndim == 1 else value
 
 
 def _wrong(expected: str, received: str) -> ProblemError:

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, positive, share, whole
 from covocp.blocks import values
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric, unit
 from covocp.blocks.updates import Missing, check_choice, reading, updating
@@ -67,6 +68,7 @@ def recursive_least_squares(
     return values.restored(theta, estimate), values.restored(spread, covariance)
 
 
+@checked(forgetting=share)
 def least_squares_start(
     regressors: Any, outputs: Any, *, forgetting: float = 1.0, weight: Any = 1.0, missing: Missing = "raise"
 ) -> tuple[Array, Array]:
@@ -86,14 +88,14 @@ def least_squares_start(
         ProblemError: shapes that do not fit, NaN, samples that do not determine every parameter (says how many).
     """
     check_choice("missing", missing, get_args(Missing))
-    phi, y = np.asarray(regressors, dtype=float), np.asarray(outputs, dtype=float)
+    phi, y = values.array("regressors", regressors), values.array("outputs", outputs)
     phi, y = phi[..., None] if phi.ndim == 2 else phi, y[:, None] if y.ndim == 1 else y
     if phi.ndim != 3 or y.ndim != 2 or (phi.shape[0], phi.shape[2]) != y.shape:
         raise ProblemError(
             describe(
                 "The samples do not fit together.",
                 expected="regressors (N, n) with outputs (N,), or (N, n, p) with (N, p)",
-                received=f"{np.shape(regressors)} and {np.shape(outputs)}",
+                received=f"{phi.shape} and {y.shape}",
                 remedy="one row of each for a sample",
             )
         )
@@ -114,6 +116,7 @@ def least_squares_start(
     return _solved(np.vstack(rows), np.concatenate(right), phi.shape[1])
 
 
+@checked(size=whole(0, 10**4), alpha=positive)
 def diffuse_start(size: int, alpha: float = 1e6) -> tuple[Array, Array]:
     """Start of the recursion that knows nothing: estimate 0, covariance alpha I, alpha >> 1 (item 2).
 

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
@@ -86,6 +87,7 @@ class Augmented:
     reference: Any
 
 
+@checked(discrete=truth)
 def lqr(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None, discrete: bool = False) -> Regulator:
     """Regulator u = -K x of least cost: the integral (discrete: sum) of x'Q x + 2 x'N u + u'R u.
 
@@ -211,6 +213,7 @@ def _step_back(S: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Any, Any]:
     return symmetric(closed.T @ S @ closed + K.T @ R @ K + Q), K
 
 
+@checked(discrete=truth)
 def reference_input(A: Any, B: Any, output: Any, *, discrete: bool = False) -> ReferenceInput:
     """State and control of the steady state in which output x is r.
 

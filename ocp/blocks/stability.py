@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
 from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 from covocp.errors import ProblemError, describe
@@ -35,6 +36,7 @@ class LyapunovCertificate:
     reason: str
 
 
+@checked(discrete=truth)
 def lyapunov_certificate(
     closed_loop: Any, matrix: Any = None, *, decrease: Any = None, discrete: bool = False
 ) -> LyapunovCertificate:

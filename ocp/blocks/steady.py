@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks.algebraic import Words, frozen, sorted_modes, stabilising, weights
 from covocp.blocks.duality import Estimation, dual
 from covocp.blocks.updates import joseph_form
@@ -48,6 +49,7 @@ class Filter:
     eigenvalues: NDArray[np.complex128]
 
 
+@checked(discrete=truth)
 def steady_state(transition: Any, H: Any, noise: Any, R: Any, *, discrete: bool = True) -> Filter:
     """Steady state of the Kalman filter (item 4), discrete or continuous, by duality with the regulator.
 

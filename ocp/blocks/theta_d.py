@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks import theta_d_series as series
 from covocp.blocks import values
 from covocp.blocks.factorisation import as_rows, dependence, integral_states
@@ -35,6 +36,8 @@ from covocp.checks import is_whole
 
 Array = NDArray[np.float64]
 
+# Terms of the series beyond which its expressions fit into no memory.
+MOST_TERMS = 50
 FORMS = ("auto", "polynomial", "operator")
 
 
@@ -108,6 +111,7 @@ def regulator(
     return ca.Function("theta_d_regulator", inputs, [-built.gain(*inputs) @ inputs[0]], ["x", "t"], ["u"])
 
 
+@checked(printed=truth)
 def filter_gain(
     x: Any,
     A0: Any,
@@ -214,6 +218,7 @@ def expansion(
     return _expansion(x, (A0, A, B, Q, R), _Options(terms=terms, k=k, l=l, form=form), series.REGULATOR)
 
 
+@checked(printed=truth)
 def filter_expansion(
     x: Any,
     A0: Any,
@@ -289,11 +294,14 @@ def _polynomials(
 def _corrections(options: _Options) -> int:
     """Number of corrections, N."""
     terms = options.terms
-    if not is_whole(terms):
+    if not is_whole(terms, 1, MOST_TERMS):
         raise values.wrong_argument(
-            "terms", "a positive whole number", repr(terms), "give 1 for the linear law, 3 for the paper's"
+            "terms",
+            f"a positive whole number, at most {MOST_TERMS}",
+            repr(terms),
+            "give 1 for the linear law, 3 for the paper's",
         )
-    if options.form not in FORMS:
+    if not isinstance(options.form, str) or options.form not in FORMS:
         raise values.wrong_argument("form", "one of " + ", ".join(FORMS), repr(options.form), "correct the name")
     return int(terms) - 1
 

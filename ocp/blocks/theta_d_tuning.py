@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.arguments import checked, truth
 from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
@@ -98,6 +99,7 @@ def radius(A0: Any, direction: Any, B: Any, Q: Any, R: Any) -> float:
     return _radius(begin, matrix, _bounds(begin)(matrix))
 
 
+@checked(warn=truth)
 def convergence(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any, states: Any, *, warn: bool = True) -> Convergence:
     """Whether the series converges at some states, for epsilon = 1.
 

@@ -24,7 +24,7 @@ from covocp.blocks.arithmetic import (
     unit_triangular,
     where,
 )
-from covocp.blocks.values import SYMBOLIC, is_symbolic, matrix, restored, square, weight
+from covocp.blocks.values import SYMBOLIC, array, is_symbolic, matrix, restored, square, weight
 from covocp.errors import ProblemError, describe
 
 Form = Literal["joseph", "standard", "sequential", "information"]
@@ -58,7 +58,7 @@ def predict(estimate: Any, covariance: Any, transition: Any, noise: Any, *, drif
 
 def shift(drift: Any, size: int) -> Any:
     """What is added to a prediction as a column; the number 0 stands for nothing."""
-    nothing = not is_symbolic(drift) and np.ndim(drift) == 0 and float(drift) == 0.0
+    nothing = not is_symbolic(drift) and not array("drift", drift).ndim and float(drift) == 0.0
     return ca.DM.zeros(size, 1) if nothing else matrix("drift", drift, (size, 1))
 
 
@@ -137,8 +137,9 @@ def joseph(covariance: Any, gain: Any, H: Any, R: Any) -> Any:
 
 def row_matrix(name: str, value: Any, size: int) -> Any:
     """A measurement matrix of `size` columns; a flat array of that many numbers is one row."""
-    if not isinstance(value, (*SYMBOLIC, ca.DM)) and np.ndim(value) == 1 and np.size(value) == size:
-        value = np.asarray(value)[None, :]
+    if not isinstance(value, (*SYMBOLIC, ca.DM)):
+        numbers = array(name, value)
+        value = numbers[None, :] if numbers.shape == (size,) else value
     return matrix(name, value, (None, size))
 
 
@@ -151,7 +152,7 @@ def reading(name: str, value: Any, size: int, missing: Missing) -> Any:
     check_choice("missing", missing, get_args(Missing))
     if is_symbolic(value):
         return matrix(name, value, (size, 1))
-    numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+    numbers = array(name, value)
     gaps = ~np.isfinite(numbers)
     if gaps.any() and missing == "raise":
         raise ProblemError(
@@ -174,7 +175,7 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     Raises:
         ProblemError: another.
     """
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ProblemError(
             describe(
                 f"The argument '{name}' is unknown.",
@@ -192,6 +193,7 @@ def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
         ProblemError: an unknown form.
     """
     check_choice("form", form, tuple(FORMS))
+    check_choice("missing", missing, get_args(Missing))
     correct = FORMS[form]
 
     def measurement_update(x: Any, P: Any, y: Any, H: Any, R: Any) -> tuple[Any, Any]:

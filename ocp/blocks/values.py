@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.errors import ProblemError, describe
+from covocp.errors import ProblemError, describe, shown
+from covocp.matrices import real_numbers
 
 SYMBOLIC = (ca.SX, ca.MX)
 # Relative asymmetry, and relative size of a negative eigenvalue, that count as roundoff.
@@ -39,12 +40,7 @@ def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, 
     if isinstance(value, SYMBOLIC):
         result: Any = value
     else:
-        try:
-            numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise wrong_argument(
-                name, "numbers or a CasADi expression", f"{type(value).__name__}: {value!r}"[:100]
-            ) from error
+        numbers = array(name, value)
         if numbers.ndim > 2:
             raise wrong_argument(name, "a matrix", f"an array of {numbers.ndim} dimensions")
         if not np.isfinite(numbers).all():
@@ -54,6 +50,19 @@ def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, 
         wanted = " x ".join("n" if size is None else str(size) for size in shape)
         raise wrong_argument(name, f"shape {wanted}", " x ".join(str(size) for size in result.shape))
     return result
+
+
+def array(name: str, value: Any) -> NDArray[np.float64]:
+    """Numbers as an array of floats, NaN and inf among them.
+
+    Raises:
+        ProblemError: they are none.
+    """
+    try:
+        return real_numbers(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        received = f"{type(value).__name__}: {shown(value)}"[:100]
+        raise wrong_argument(name, "numbers or a CasADi expression", received) from error
 
 
 def square(name: str, value: Any, size: int | None = None) -> Any:

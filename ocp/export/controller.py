@@ -24,7 +24,8 @@ from covocp.export.history import History, Nominal
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.trajectory import times
-from covocp.integrators import COMPILED_SOLVER, GAUSS_NODES, linear_solve
+from covocp.integrators import GAUSS_NODES
+from covocp.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.matrices import Array
 from covocp.statement import Statement, entry_names
 

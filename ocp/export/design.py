@@ -27,6 +27,10 @@ class Design:
             noise density U (r, r).
         noise: (state, control, time) -> Q (n, n).
         gain: (state, control, half-vectors, time) -> C (m, n), E (n, n).
+        weights: (state, control, time) -> A (n, n), N (n, m), B (m, m): second derivatives of the expected running
+            cost by deviations of state and control.
+        final_weight: S(T) (n, n).
+        best_gain: whether C is the best gain, not one that was constrained.
         limits: lower and upper limits of the control, (m,) each.
         units: largest standard deviation of each row of the estimate on the way, (n,); 1 where it is zero.
         labels: names of the rows of the estimate.
@@ -39,6 +43,9 @@ class Design:
     linear: ca.Function
     noise: ca.Function
     gain: ca.Function
+    weights: ca.Function
+    final_weight: Array
+    best_gain: bool
     limits: tuple[Array, Array]
     units: Array
     labels: tuple[str, ...]
@@ -85,7 +92,7 @@ def design_of(solution: Solution, limits: Any) -> Design:
     sizes = (statement.nx, statement.nu, statement.ne, 1)
     x, u, e, t = (symbolic.sym(k, size) for k, size in zip("xuet", sizes, strict=True))
     rest = (t, solution.duration, ca.DM(solution.parameters))
-    F, G, _, _, _, Q = statement.loop.expansion(x, u, *rest)
+    F, G, A, B, N, Q = statement.loop.expansion(x, u, *rest)
     h, M, U = statement.measurement(x, u, *rest)
     slope = ca.jacobian(h, u)[:, :m]
     block = next(b for b in statement.matrices if b.estimation)
@@ -97,6 +104,9 @@ def design_of(solution: Solution, limits: Any) -> Design:
         linear=ca.Function("linear", [x, u, t], [ca.densify(v) for v in (F, G, h, M, slope, U)]),
         noise=ca.Function("noise", [x, u, t], [ca.densify(Q)]),
         gain=ca.Function("gain", [x, u, e, t], [ca.densify(C), ca.densify(E)]),
+        weights=ca.Function("weights", [x, u, t], [ca.densify(v) for v in (A, N, B)]),
+        final_weight=np.asarray(statement.loop.terminal(solution.trajectory.x[-1], *rest[1:])[1].full()),
+        best_gain=statement.loop.by_parts is not None,
         limits=control_limits(statement, m, limits),
         units=_units(solution, block),
         labels=statement.augmented,

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
+from covocp.arguments import checked, mapping, optional, positive, truth
 from covocp.errors import ExportError, describe, spelling, warn_user
 from covocp.export.building import Sources
 from covocp.export.casadi_code import Generated, Sizes, generate
@@ -28,13 +29,16 @@ from covocp.export.linking import Linking
 from covocp.export.names import check_name, package_name
 from covocp.export.package import CPackage
 from covocp.export.readme import cmake_lists, readme
-from covocp.export.sampled import sampled_law
+from covocp.export.sampled import discretised, sampled_law
 from covocp.export.self_test import self_test
 from covocp.export.solver import solver_law
 from covocp.export.source import source
+from covocp.export.spread import LARGEST_SPREAD, check_flight, sampled_flight
 from covocp.export.trajectory import sample_law
+from covocp.flight import interpolated_flight
 from covocp.problem import Problem
 from covocp.solution import Solution
+from covocp.threads import one_at_a_time
 
 PRECISIONS = {"double": "double", "single": "float"}
 # Largest relative deviation from Python that counts as agreement.
@@ -52,6 +56,13 @@ class Content:
     linking: Linking | None = None
 
 
+@one_at_a_time
+@checked(
+    overwrite=truth,
+    feedback=truth,
+    ranges=optional(mapping),
+    units=optional(mapping),
+)
 def export_c(
     what: Any,
     directory: str | os.PathLike[str],
@@ -62,6 +73,7 @@ def export_c(
     period: float | None = None,
     limits: Any = None,
     feedback: bool = True,
+    largest_spread: float = LARGEST_SPREAD,
     ranges: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
     tolerance: float | None = None,
@@ -87,6 +99,9 @@ def export_c(
             "bounds" (those of the problem), or a dict of control to (lower, upper). A nominal control outside of them
             is a warning.
         feedback: whether a solution with feedback is exported as a controller; False: its histories only.
+        largest_spread: of a controller: the largest factor between the standard deviations of the loop as it flies with
+            these gains (interpolated between the nodes, or held over a period) and those that the solution predicts;
+            where it is more, nothing is exported. float("inf"): whatever it is.
         ranges: of inputs of functions by name, (lower, upper): where C is compared with Python; None: normal numbers.
         units: of inputs and outputs of functions by name, for the comments.
         tolerance: largest relative deviation of C from Python; None: 1e-12, in single precision 1e-2, of solvers 1e-8.
@@ -97,16 +112,24 @@ def export_c(
         The package: `.build()`, `.check()`, `.time()`, `.python()`.
 
     Raises:
-        ExportError: something has no C code, a name, a precision or a folder is not possible.
+        ExportError: something has no C code, a name, a precision or a folder is not possible, the loop does not hold
+            what the solution predicts.
         ProblemError: options of the mesh that mean nothing.
     """
     target, package = check_settings(directory, name=name, precision=precision, overwrite=overwrite, period=period)
     allowed = TOLERANCES[precision] if tolerance is None else _positive("tolerance", tolerance)
     given = {"period": period, "limits": limits, "ranges": ranges, "units": units}
-    given |= {"feedback": None if feedback is True else feedback, "method": None if method == "sqpmethod" else method}
+    usual = isinstance(largest_spread, float) and largest_spread == LARGEST_SPREAD
+    given |= {
+        "largest_spread": None if usual else largest_spread,
+        "feedback": None if feedback is True else feedback,
+        "method": None if isinstance(method, str) and method == "sqpmethod" else method,
+    }
     if isinstance(what, Solution):
-        _check_options("a solution", {**given, **options}, ("period", "limits", "feedback"))
-        content = _solution(what, precision, allowed, period, limits, feedback)
+        _check_options("a solution", {**given, **options}, ("period", "limits", "feedback", "largest_spread"))
+        if not isinstance(largest_spread, (int, float)) or isinstance(largest_spread, bool) or not largest_spread >= 1:
+            raise _wrong_number("largest_spread", "a number >= 1, or inf", largest_spread)
+        content = _solution(what, precision, allowed, period, limits, feedback, largest_spread)
     elif isinstance(what, Problem):
         _check_options("a problem", given, ("method",))
         content = _problem(what, precision, method, options, tolerance)
@@ -182,7 +205,13 @@ def _written(
 
 
 def _solution(
-    solution: Solution, precision: str, tolerance: float, period: float | None, limits: Any, feedback: bool
+    solution: Solution,
+    precision: str,
+    tolerance: float,
+    period: float | None,
+    limits: Any,
+    feedback: bool,
+    largest_spread: float,
 ) -> Content:
     """The histories of a solution, and its controller where it has feedback."""
     if not solution.converged:
@@ -193,9 +222,12 @@ def _solution(
         design = design_of(solution, limits)
         warn_outside(design.statement, design.limits, tables)
         if period is None:
+            check_flight(interpolated_flight(solution), largest_spread, None)
             laws.append(controller_law(design, tables, tolerance))
         else:
-            laws.append(sampled_law(design, tables, _positive("period", period), tolerance))
+            samples = discretised(design, tables, _positive("period", period))
+            check_flight(sampled_flight(solution, samples), largest_spread, period)
+            laws.append(sampled_law(design, tables, samples, tolerance))
     elif period is not None or limits is not None:
         raise ExportError(
             describe(
@@ -283,17 +315,15 @@ def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
 
 def _positive(name: str, value: Any) -> float:
     """A positive, finite number."""
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
-    if not good:
-        raise ExportError(
-            describe(
-                f"The option '{name}' is not a positive number.",
-                expected="a number > 0" + (" [s]" if name == "period" else ""),
-                received=repr(value)[:100],
-                remedy=f"correct {name}=",
-            )
-        )
+    if positive(value):
+        raise _wrong_number(name, "a number > 0" + (" [s]" if name == "period" else ""), value)
     return float(value)
+
+
+def _wrong_number(name: str, expected: str, received: Any) -> ExportError:
+    """An option that is not the number that it must be."""
+    headline = f"The option '{name}' is not " + ("a positive number." if "> 0" in expected else "such a number.")
+    return ExportError(describe(headline, expected=expected, received=repr(received)[:100], remedy=f"correct {name}="))
 
 
 def _version() -> str:

@@ -1,4 +1,4 @@
-"""The nominal of a solution as a CasADi expression of the time: tables at the nodes, interpolated as `Solution.at`.
+"""The nominal of a solution as a CasADi expression of the time: tables at the knots of `Solution.at`, with its cubics.
 
 The tables are constants and are read by index, which CasADi writes as a pointer into a constant array: the C code has
 each number once and copies one column of a table a call.
@@ -15,13 +15,13 @@ import numpy as np
 from covocp.errors import ExportError, describe
 from covocp.export.laws import LARGEST, status_of
 from covocp.integrators import hermite
-from covocp.matrices import Array, is_semidefinite, unpack
+from covocp.matrices import Array
 from covocp.solution import Solution
 
 # Times this far outside, relative to the duration, count as inside: sums of steps end there.
 MARGINS = {"double": 1e-9, "single": 1e-6}
-# Points of an interval at which a covariance is looked at.
-LOOKS = 8
+# Distance of two knots, relative to the duration, that the clock of a machine of this precision resolves.
+RESOLVED = {"double": 1e-12, "single": 1e-5}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,12 +47,14 @@ class Clock:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class History:
-    """Tables at the nodes of a solution.
+    """Tables of a solution.
 
     Attributes:
-        nodes: times [s], (K,).
-        z: states and half-vectors, (K, nx + ne).
-        first: slopes of z at the starts of the intervals, (K - 1, nx + ne).
+        nodes: times of the nodes [s], (K,).
+        knots: times between which the states are cubic [s], (P + 1,); the nodes, and what lies between them where the
+            solution is steep.
+        z: states and half-vectors at the knots, (P + 1, nx + ne).
+        first: slopes of z at the starts of the pieces, (P, nx + ne).
         last: slopes at their ends.
         u: controls, (K, nu) where they are linear, (K - 1, nu) where they are constant.
         states: nx.
@@ -60,6 +62,7 @@ class History:
     """
 
     nodes: Array
+    knots: Array
     z: Array
     first: Array
     last: Array
@@ -85,32 +88,23 @@ class History:
 
     def at(self, time: Any) -> Nominal:
         """The nominal at a time within [0, T], an MX expression."""
-        k = self._interval(time)
-        nodes = ca.MX(ca.DM(self.nodes))
-        start, end = nodes[k], nodes[k + 1]
+        k = _piece(self.knots, time)
+        knots = ca.MX(ca.DM(self.knots))
+        start, end = knots[k], knots[k + 1]
         smooth = _hermite(self.z.shape[1])
         za, zb = _column(self.z, k), _column(self.z, k + 1)
         shared = np.array_equal(self.first[1:], self.last[:-1])
         slopes = np.vstack([self.first, self.last[-1:]]) if shared else self.first
         fa, fb = _column(slopes, k), _column(slopes, k + 1) if shared else _column(self.last, k)
         z = smooth(za, zb, fa, fb, start, end, time)
+        if not np.array_equal(self.knots, self.nodes):
+            k, nodes = _piece(self.nodes, time), ca.MX(ca.DM(self.nodes))
+            start, end = nodes[k], nodes[k + 1]
         u = _column(self.u, k)
         if self.u.shape[0] == self.nodes.size:
             u = _linear(self.u.shape[1])(u, _column(self.u, k + 1), start, end, time)
         x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
         return Nominal(x=x, u=u, e=e)
-
-    def _interval(self, time: Any) -> Any:
-        """Index of the interval that contains a time, from 0 to K - 2."""
-        intervals = self.nodes.size - 1
-        guess = np.floor(self.nodes * (intervals / self.duration) + 0.5)
-        if not np.array_equal(guess, np.arange(intervals + 1)):
-            return ca.low(ca.MX(ca.DM(self.nodes)), time, {"lookup_mode": "binary"})
-        # equal intervals: computed, and corrected by one where rounding or a graded grid moves a node
-        k = ca.fmin(ca.fmax(ca.floor(time * (intervals / self.duration)), 0.0), intervals - 1.0)
-        nodes = ca.MX(ca.DM(self.nodes))
-        k = k + (time >= nodes[k + 1]) - (time < nodes[k])
-        return ca.fmin(ca.fmax(k, 0.0), intervals - 1.0)
 
 
 def history(solution: Solution, precision: str) -> History:
@@ -119,10 +113,10 @@ def history(solution: Solution, precision: str) -> History:
     Raises:
         ExportError: where a value is NaN or infinite.
     """
-    trajectory = solution.trajectory
-    z = np.hstack([trajectory.x, trajectory.e])
-    first, last = solution.rates[:-1].copy(), solution.end_rates.copy()
-    for what, values in (("a state or a matrix", z), ("a control", trajectory.u), ("a rate", first), ("a rate", last)):
+    trajectory, dense = solution.trajectory, solution.dense
+    slopes = dense.first / solution.duration, dense.last / solution.duration
+    checked = (("a state or a matrix", dense.values), ("a control", trajectory.u), *(("a rate", v) for v in slopes))
+    for what, values in checked:
         if not np.isfinite(values).all():
             raise ExportError(
                 describe(
@@ -132,10 +126,11 @@ def history(solution: Solution, precision: str) -> History:
                     remedy="export a solution that converged",
                 )
             )
-    nodes = np.asarray(solution.t)
-    _straighten(solution, nodes, z, first, last)
+    times, least = dense.knots * solution.duration, RESOLVED[precision] * solution.duration
+    knots, z, first, last = _resolved(times, dense.values, slopes, least)
     return History(
-        nodes=nodes,
+        nodes=np.asarray(solution.t),
+        knots=knots,
         z=z,
         first=first,
         last=last,
@@ -145,26 +140,45 @@ def history(solution: Solution, precision: str) -> History:
     )
 
 
+def _piece(table: Array, time: Any) -> Any:
+    """Index of the piece between two entries of a table of times that contains a time, from 0."""
+    pieces, duration = table.size - 1, float(table[-1])
+    guess = np.floor(table * (pieces / duration) + 0.5)
+    times = ca.MX(ca.DM(table))
+    if not np.array_equal(guess, np.arange(pieces + 1)):
+        return ca.low(times, time, {"lookup_mode": "binary"})
+    # equal pieces: computed, and corrected by one where rounding or a graded grid moves an end
+    k = ca.fmin(ca.fmax(ca.floor(time * (pieces / duration)), 0.0), pieces - 1.0)
+    k = k + (time >= times[k + 1]) - (time < times[k])
+    return ca.fmin(ca.fmax(k, 0.0), pieces - 1.0)
+
+
 def time_status(clock: Clock) -> Any:
     """The status of a time."""
     return status_of(clock.conditions)
 
 
-def _straighten(solution: Solution, nodes: Array, z: Array, first: Array, last: Array) -> None:
-    """Make a covariance linear (in place) in the intervals where its cubic is indefinite somewhere."""
-    c = np.linspace(0.0, 1.0, LOOKS + 1)[None, 1:-1, None]
-    h = np.diff(nodes)[:, None]
-    offset = solution.trajectory.x.shape[1]
-    for block in solution.blocks:
-        if block.kind != "matrix" or not block.covariance:
-            continue
-        rows = slice(block.span.start + offset, block.span.stop + offset)
-        ends = (z[:-1, None, rows], z[1:, None, rows])
-        slopes = (h[:, :, None] * first[:, None, rows], h[:, :, None] * last[:, None, rows])
-        between = hermite(*ends, *slopes, c)
-        for k, values in enumerate(between):
-            if not is_semidefinite(unpack(values, block.size)):
-                first[k, rows] = last[k, rows] = (z[k + 1, rows] - z[k, rows]) / h[k]
+def _resolved(knots: Array, values: Array, slopes: tuple[Array, Array], least: float) -> tuple[Array, ...]:
+    """The polynomials without the knots that a clock of this precision cannot tell apart.
+
+    Where some fall away the piece becomes a chord: the slope of a fall that is over at once would carry it far below.
+
+    Args:
+        knots: times, (P + 1,).
+        values: there.
+        slopes: at the starts and the ends of the pieces.
+        least: distance of two knots [s].
+    """
+    kept = [0]
+    for i in range(1, knots.size - 1):
+        if knots[i] - knots[kept[-1]] >= least and knots[-1] - knots[i] >= least:
+            kept.append(i)
+    chosen = np.array([*kept, knots.size - 1])
+    first, last = slopes[0][chosen[:-1]].copy(), slopes[1][chosen[1:] - 1].copy()
+    merged = np.diff(chosen) > 1
+    chords = np.diff(values[chosen], axis=0) / np.diff(knots[chosen])[:, None]
+    first[merged] = last[merged] = chords[merged]
+    return knots[chosen], values[chosen], first, last
 
 
 def _column(table: Array, k: Any) -> Any:

@@ -13,10 +13,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from covocp.errors import ExportError, describe, spelling
+from covocp.errors import ExportError, describe, shown, spelling
 from covocp.export.header import struct_name
 from covocp.export.laws import CODES, STATUSES, Law, Port, span, stacked_size
-from covocp.matrices import Array
+from covocp.matrices import Array, real_numbers
+from covocp.threads import TURN
 
 NAMES = tuple(STATUSES)
 WHOLE = ("status", "index")  # fields of a struct that are int in C
@@ -33,7 +34,8 @@ def evaluated(law: Law) -> Backend:
     """A law evaluated by CasADi."""
 
     def call(row: Array) -> tuple[Array, int]:
-        values = law.values(row[None, :])[0]
+        with TURN:
+            values = law.values(row[None, :])[0]
         if law.kind == "function":
             finite = bool(np.isfinite(values).all())
             return values, CODES["OK" if finite else "RESULT_NOT_FINITE"]
@@ -235,9 +237,9 @@ class Call:
                 continue
             value = given[port.name]
             try:
-                array = np.asarray(value, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise self._unfit(f"{port.name}={value!r}", "give numbers") from error
+                array = real_numbers(value)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
             if array.size != port.size:
                 raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
             parts.append(array.ravel())

@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from covocp.arguments import MOST, checked, is_whole, positive, text, texts
 from covocp.errors import ExportError, describe
 from covocp.export.building import TIMEOUT, Build, Sources, build
 from covocp.export.laws import CODES, Law
 from covocp.export.library import Laws, Library, laws_of
 from covocp.export.self_test import POINTS, SEED, reference
+from covocp.threads import methods_one_at_a_time
 
 TIMED_SECONDS = 0.2  # of each law in `time`
 LEAST_CALLS, MOST_CALLS = 3, 2_000_000
@@ -110,6 +112,7 @@ class Timings(dict[str, Timing]):
         return "\n".join(f"{name}: {timing}" for name, timing in self.items())
 
 
+@methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True)
 class CPackage:
     """C sources that `export_c` has written.
@@ -133,6 +136,7 @@ class CPackage:
     tolerance: float | None = None
     _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
+    @checked(tool=text)
     def build(self, tool: str = "auto", flags: Sequence[str] = ()) -> Build:
         """Compile the package in its folder "build".
 
@@ -146,9 +150,10 @@ class CPackage:
         Raises:
             ExportError: no compiler, or it failed (with its message).
         """
-        if isinstance(flags, str):
+        if texts(flags):
             raise self._wrong("flags", "a list of flags, such as ['-Werror']", flags)
-        self._kept.pop("library", None)
+        for what in ("library", "build"):  # whose files are replaced, or lost where the compiler fails
+            self._kept.pop(what, None)
         self._kept["build"] = build(self.sources, tool, flags)
         built: Build = self._kept["build"]
         return built
@@ -167,7 +172,7 @@ class CPackage:
             ExportError: the package cannot be compiled or loaded.
         """
         for name, number, least in (("samples", samples, 1), ("seed", seed, 0)):
-            if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
+            if not is_whole(number, least, MOST if name == "samples" else None):
                 raise self._wrong(name, f"a whole number, {least} or more", number)
         library = self._library()
         results = {law.name: self._compared(law, library, int(samples), int(seed)) for law in self.laws}
@@ -186,6 +191,7 @@ class CPackage:
         """Whether the last `check` was passed; it is made where there was none."""
         return self._last_check.ok
 
+    @checked(seconds=positive)
     def time(self, seconds: float = TIMED_SECONDS) -> Timings:
         """Time the laws at their reference points.
 

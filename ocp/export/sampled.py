@@ -8,7 +8,9 @@ For the samples t_k = k period, with y the estimate of the deviation and w the c
 the control within the limits, where there are some.
 
 Phi, Gamma, g by the two-stage Gauss method between the nodes of the mesh. L_k = P- M' (M P- M' + U/period)^-1 is the
-gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period.
+gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period. C(t_k) is
+the gain of the control that is held over a period: the best one by the discrete Riccati recursion (`sampled_gain`), or
+that of the design where its gain was constrained.
 
 Of a measurement whose rows p are there the gain is P- M_p' (M_p P- M_p' + U_pp/period)^-1, P- of the full filter. As
 P- M' = L S with S = M P- M' + U/period, that is L S_.p S_pp^-1: the residuals that are missing are expected from the
@@ -38,11 +40,10 @@ from covocp.export.design import Design
 from covocp.export.history import History
 from covocp.export.laws import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.integrators import GAUSS_NODES
+from covocp.export.moves import WHOLE, Moves, nominal_values, stacked
+from covocp.export.sampled_gain import flown_covariances, sampled_gains
 from covocp.matrices import Array, pack, unpack_symbolic
 
-# A duration that is a whole number of periods to this accuracy ends with a sample.
-WHOLE = 1e-9
 MOST_SAMPLES = 200_000
 CONTINUE = -1.0
 HELD = {"estimate": "estimate", "last": "index", "held": "control"}
@@ -62,11 +63,14 @@ ABOUT = (
 class Samples:
     """Tables, a row for each sample from 0 to K: nominal and gains there, transition from the sample before.
 
-    parts: by name, (K + 1, rows, columns); period [s].
+    parts: by name, (K + 1, rows, columns); period [s]; times: of the samples (K + 1,) [s]; flown: covariance of the
+    deviation from the nominal there, as the loop flies with these gains, (K + 1, n, n).
     """
 
     parts: dict[str, Array]
     period: float
+    times: Array
+    flown: Array
 
     @property
     def count(self) -> int:
@@ -85,10 +89,10 @@ class Samples:
         return result
 
 
-def sampled_law(design: Design, tables: History, period: float, tolerance: float) -> Law:
+def sampled_law(design: Design, tables: History, samples: Samples, tolerance: float) -> Law:
     """The law (estimate, last sample, held control, measurement, time) -> control and all that the struct keeps."""
     n, m, r = design.sizes
-    samples = discretised(design, tables, period)
+    period = samples.period
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
     begun = ca.fmax(last, 0.0)  # a struct that was never set must not lead out of the tables
@@ -192,7 +196,10 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     t = np.minimum(np.arange(count + 1) * period, tables.duration)
     x, u, e, h, M, H, U, C = _at_samples(design, tables, t)
     E0 = np.asarray(design.gain(x[0], u[0], e[0], 0.0)[1].full())
-    moves = _Moves.of(design, tables, t)
+    held_on = tables.duration - t[-1] > WHOLE * period
+    moves = Moves.of(design, tables, np.append(t, tables.duration) if held_on else t)
+    if design.best_gain:
+        C = sampled_gains(moves, design.final_weight, t.size)
     n, m, r = design.sizes
     Phi, Gamma, g = np.zeros((count + 1, n, n)), np.zeros((count + 1, n, m)), np.zeros((count + 1, n, 1))
     Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
@@ -204,11 +211,14 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
         P = rest @ P @ rest.T + gain @ (U[k] / period) @ gain.T
         P = 0.5 * (P + P.T)
         gains.append(gain)
+    L = np.array(gains)
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
-    parts |= {"g": g, "L": np.array(gains)}
+    parts |= {"g": g, "L": L}
     if r > 1:
         parts["spread"] = _correlations(np.array(spreads))[:, :, None]
-    return Samples(parts=parts, period=period)
+    with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges is told by its numbers
+        flown = flown_covariances(moves, period, E0, C, L, M, H)
+    return Samples(parts=parts, period=period, times=t, flown=flown)
 
 
 def _correlations(spreads: Array) -> Array:
@@ -220,86 +230,12 @@ def _correlations(spreads: Array) -> Array:
     return pack(correlations)
 
 
-def _nominal(tables: History, t: Array) -> tuple[Array, Array, Array]:
-    """x, u, e at some times, rows."""
-    time = ca.MX.sym("time")
-    now = tables.at(time)
-    values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
-    x, u, e = (np.asarray(v.full()).T for v in values)
-    return x, u, e
-
-
-def _stacked(value: Any, count: int) -> Array:
-    """Matrices beside each other as (count, rows, columns)."""
-    array = np.asarray(value.full())
-    return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
-
-
 def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
     """x, u, e, h, M, H, U, C at the samples."""
-    x, u, e = _nominal(tables, t)
-    _, _, h, M, H, U = (_stacked(v, t.size) for v in design.linear.map(t.size)(x.T, u.T, t[None, :]))
-    C = _stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
+    x, u, e = nominal_values(tables, t)
+    _, _, h, M, H, U = (stacked(v, t.size) for v in design.linear.map(t.size)(x.T, u.T, t[None, :]))
+    C = stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
     return x, u, e, h, M, H, U, C
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Moves:
-    """Gauss steps between nodes and samples: h times F, G, G u, Q at both points of each; first step of each period."""
-
-    F: tuple[Array, Array]
-    G: tuple[Array, Array]
-    Gu: tuple[Array, Array]
-    Q: tuple[Array, Array]
-    first: Any
-
-    @staticmethod
-    def of(design: Design, tables: History, t: Array) -> _Moves:
-        """All steps between the first and the last sample."""
-        inside = tables.nodes[(tables.nodes > t[0]) & (tables.nodes < t[-1])]
-        grid = np.unique(np.concatenate([t, inside]))
-        near = np.diff(grid, prepend=-np.inf) <= WHOLE * np.median(np.diff(t))
-        grid = np.array([*grid[~near]])
-        h = np.diff(grid)
-        parts: dict[str, list[Array]] = {"F": [], "G": [], "Gu": [], "Q": []}
-        m = design.sizes[1]
-        for c in GAUSS_NODES:
-            at = grid[:-1] + c * h
-            x, u, _ = _nominal(tables, at)
-            F, G = (_stacked(v, at.size) for v in design.linear.map(at.size)(x.T, u.T, at[None, :])[:2])
-            Q = _stacked(design.noise.map(at.size)(x.T, u.T, at[None, :]), at.size)
-            for name, value in (("F", F), ("G", G), ("Gu", G @ u[:, :m, None]), ("Q", Q)):
-                parts[name].append(h[:, None, None] * value)
-        pairs = {name: (values[0], values[1]) for name, values in parts.items()}
-        return _Moves(**pairs, first=np.searchsorted(grid, t - 0.5 * h.min()))
-
-    def over(self, k: int, P: Array) -> tuple[Array, Array, Array, Array]:
-        """Phi, Gamma, g over period k, and the covariance P after it without a measurement."""
-        n, m = self.G[0].shape[1:]
-        z = np.hstack([np.eye(n), np.zeros((n, m + 1))])
-        for i in range(int(self.first[k]), int(self.first[k + 1])):
-            forcing = [np.hstack([np.zeros((n, n)), G[i], -Gu[i]]) for G, Gu in zip(self.G, self.Gu, strict=True)]
-            z = gauss_step((self.F[0][i], self.F[1][i]), z, (forcing[0], forcing[1]))
-            zero = np.zeros((n, n))
-            joint = [np.block([[-F[i].T, zero], [Q[i], F[i]]]) for F, Q in zip(self.F, self.Q, strict=True)]
-            D = gauss_step((joint[0], joint[1]), np.eye(2 * n), (np.zeros(()), np.zeros(())))
-            moved = np.linalg.solve(D[:n, :n].T, (D[n:, :n] + D[n:, n:] @ P).T)
-            P = np.asarray(0.5 * (moved + moved.T), dtype=float)
-        return z[:, :n], z[:, n : n + m], z[:, n + m :], P
-
-
-def gauss_step(H: tuple[Array, Array], z: Array, f: tuple[Array, Array]) -> Array:
-    """One step of the two-stage Gauss method for z' = H z + f, H and f at both points times the length of the step.
-
-    The elimination is that of `covocp.integrators.gauss_matrix`.
-    """
-    g = np.sqrt(3.0) / 6.0
-    a = 0.5 - 2.0 * g
-    unit = np.eye(z.shape[0])
-    left, right = unit - g * H[1], unit - g * H[0]
-    matrix = left @ right - a / 2 * (H[0] + H[1])
-    stage = np.linalg.solve(matrix, left @ (z + g * f[0]) + a / 2 * (f[0] + f[1]))
-    return np.asarray(z + (right @ stage - z - g * f[0]) / a)
 
 
 def _ports(design: Design) -> tuple[Port, ...]:

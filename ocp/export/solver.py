@@ -18,15 +18,16 @@ from covocp.export.laws import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.linking import PLUGINS, Linking
 from covocp.export.names import identifier
 from covocp.export.replanning import Replannable, replannable, stacked
-from covocp.guess import choose_scales, quadrature_weights
-from covocp.integrators import COMPILED_SOLVER
+from covocp.guess import choose_scales
+from covocp.linear_solve import COMPILED_SOLVER
 from covocp.matrices import Array
 from covocp.mesh import Options
 from covocp.methods import Solver
 from covocp.nlp import NLP
 from covocp.problem import Problem
-from covocp.shooting import transcribe
 from covocp.solution import Solution
+from covocp.steering import quadrature_weights
+from covocp.transcription import transcribe
 
 # In the NLP's own units: what counts as solved, and what the solvers are asked for. Interior-point methods end with a
 # barrier of a tenth of what they are asked for, which the cost has in it for each bound that is reached.
@@ -99,7 +100,7 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
         ProblemError: options of the mesh that mean nothing.
         SolveError: the problem itself has no solution.
     """
-    if method not in PLUGINS:
+    if not isinstance(method, str) or method not in PLUGINS:
         raise ExportError(
             describe(
                 f"The method {method!r} has no C code.",

@@ -44,7 +44,8 @@ def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
         name="sample",
         kind="sample",
         about=(
-            "Nominal at a time: states and matrices by cubic Hermite polynomials between the nodes, controls "
+            "Nominal at a time: states and matrices by cubic Hermite polynomials between the nodes, and between more "
+            "times where an interval holds a fast change; controls "
             + ("linear." if tables.u.shape[0] == tables.nodes.size else "constant in each interval."),
         ),
         core=core,
@@ -83,6 +84,6 @@ def times(tables: History, random: np.random.Generator, count: int) -> Array:
     end = tables.duration
     near = np.nextafter(tables.nodes[1:-1][:2], 0.0)
     edges = [0.0, end, -0.5 * end, 2.0 * end, np.nan, np.inf, -np.inf, np.nextafter(end, np.inf), -1e-12 * end]
-    edges += [*tables.nodes[1:4].tolist(), *near.tolist()]
+    edges += [*tables.nodes[1:4].tolist(), *near.tolist(), *tables.knots[1:4].tolist()]
     rest = random.uniform(-BEYOND * end, (1.0 + BEYOND) * end, max(0, count - len(edges)))
     return np.concatenate([edges, rest])[:count]

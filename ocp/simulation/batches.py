@@ -34,8 +34,10 @@ class Batch:
     cost: (runs,); NaN without an expected cost, and where the run left the domain.
     left: time at which the run left the domain [s], inf where it did not, (runs,).
     unanswered: time at which the law of the run first gave no finite control [s], inf where it always did, (runs,).
-    asked, outside: flags by run, (runs, m), (runs, bounded states and controls).
-    asking: number of runs that ask for more control than there is at a stored time, (K, m).
+    asked: flags by run, (runs, m); violated: those of the inequalities, at some instant of their place, (runs, rows);
+        at_end: at the end, those of a run that left the domain set.
+    asking: number of runs that ask for more control than there is at a stored time, (K, m); violating: that violate an
+        inequality there, (K, rows).
     count, mean, product, cube, fourth: sums over the runs inside the domain, by group: (groups, K), then of y
         (groups, K, 2n + m), of y y' and of the third and fourth powers of y.
     paths: y of the first runs of the simulation, (those in this batch, K, 2n + m), NaN after leaving the domain.
@@ -48,8 +50,10 @@ class Batch:
     left: Array
     unanswered: Array
     asked: Any
-    outside: Any
+    violated: Any
+    at_end: Any
     asking: Array
+    violating: Array
     count: Array
     mean: Array
     product: Array
@@ -115,7 +119,9 @@ class _Simulation:
         self.left, self.unanswered = np.full(width, np.inf), np.full(width, np.inf)
         self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
         rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
-        self.asking = np.zeros((times, plan.fed_back))
+        self.flags = np.zeros((times, plan.fed_back + len(plan.watched)))
+        self.kept = np.zeros((self._flagged.stop - self._flagged.start, width), dtype=bool)
+        self.seen = np.zeros((2, len(plan.watched), width), dtype=bool)
         self.count = np.zeros((groups, times))
         self.sums = [np.zeros((groups, times, rows)) for _ in range(3)]
         self.products = np.zeros((groups, times, rows, rows))
@@ -171,12 +177,14 @@ class _Simulation:
         """Note when runs leave the domain, and where they were before."""
         now = gone & np.isinf(self.left)
         self.left[now], self.last[:, now] = time, self.before[:, now]
+        self.kept[:, now] = self.step.inputs[0][self._flagged, now] > 0
         # Anywhere finite: what follows of these runs is not looked at.
         self.step.inputs[0][:, gone] = self.plan.start[:, None]
 
     def _noises(self, steps: int, stop: Callable[[], bool]) -> Iterator[tuple[int, Array]]:
         """Index and normal numbers (noises, width) of each step, from the stream of each run."""
-        rows, each = self.plan.noises, 2 if self.plan.pairs else 1
+        rows, pairing = self.plan.noises, self.plan.pairing
+        each = 1 if pairing is None else 2
         drawn = np.zeros((self.width, DRAWN * each * rows))
         for begin in range(0, steps, DRAWN):
             if stop():
@@ -185,8 +193,10 @@ class _Simulation:
             for i, stream in enumerate(self.streams):
                 drawn[i, : length * each * rows] = stream.standard_normal(length * each * rows)
             noise = np.ascontiguousarray(drawn.T).reshape(DRAWN, each, rows, self.width)
-            # Two halves of a step have the sum of their noises, of twice the variance.
-            whole = (noise[:, 0] + noise[:, 1]) / np.sqrt(2.0) if self.plan.pairs else noise[:, 0]
+            whole = noise[:, 0]
+            if pairing is not None:  # the sum of two has twice the variance
+                halves = noise.reshape(DRAWN, each * rows, self.width)
+                whole = (halves[:, pairing[:, 0]] + halves[:, pairing[:, 1]]) / np.sqrt(2.0)
             for j in range(length):
                 yield begin + j, whole[j]
 
@@ -202,7 +212,9 @@ class _Simulation:
         counted[self.runs :] = False
         kept = self.paths.shape[0]
         self.paths[:, place] = np.where(counted[:kept], y[:, :kept], np.nan).T
-        self.asking[place] = np.count_nonzero(np.where(counted, flags, 0.0), axis=1)
+        self.flags[place] = np.count_nonzero(np.where(counted, flags, 0.0), axis=1)
+        if place in (0, self.flags.shape[0] - 1):
+            self.seen[int(place > 0)] = flags[self.plan.fed_back :] > 0
         grouped = np.where(counted, y, 0.0).reshape(rows, -1, LANES)
         square = grouped * grouped
         self.count[:, place] = counted.reshape(-1, LANES).sum(axis=1)
@@ -219,7 +231,8 @@ class _Simulation:
         stayed = np.isinf(self.left[:runs])
         n = plan.size
         y = np.where(stayed, self.observe.outputs[0][: 2 * n, :runs], self.last[:, :runs]).T
-        flags: list[Any] = [z[plan.spans[name], :runs].T > 0 for name in ("asked", "outside")]
+        flags = np.where(stayed, z[self._flagged, :runs] > 0, self.kept[:, :runs]).T
+        violated, at_end = self._violated(flags[:, plan.fed_back :], stayed)
         return Batch(
             first=self.first,
             deviation=np.ascontiguousarray(y[:, :n]),
@@ -227,9 +240,11 @@ class _Simulation:
             cost=np.where(stayed, self._cost(), np.nan),
             left=self.left[:runs],
             unanswered=self.unanswered[:runs],
-            asked=flags[0],
-            outside=flags[1],
-            asking=self.asking,
+            asked=flags[:, : plan.fed_back],
+            violated=violated,
+            at_end=at_end,
+            asking=self.flags[:, : plan.fed_back],
+            violating=self.flags[:, plan.fed_back :],
             count=self.count,
             mean=self.sums[0],
             product=self.products,
@@ -237,6 +252,24 @@ class _Simulation:
             fourth=self.sums[2],
             paths=self.paths,
         )
+
+    @property
+    def _flagged(self) -> slice:
+        """The rows of the state with flags."""
+        return slice(self.plan.spans["asked"].start, self.plan.spans["violated"].stop)
+
+    def _violated(self, on_the_way: Any, stayed: Any) -> tuple[Any, Any]:
+        """Who violates each inequality at some instant of its place, and at the end, (runs, rows)."""
+        first, last = (flags[:, : self.runs].T for flags in self.seen)
+        at_end = last | ~stayed[:, None]
+        violated = np.zeros_like(at_end)
+        places, path = self.plan.watched, iter(range(on_the_way.shape[1]))
+        for i, place in enumerate(places):
+            if place == "path":
+                violated[:, i] = on_the_way[:, next(path)] | (last[:, i] & stayed)
+            else:
+                violated[:, i] = first[:, i] if place == "initial" else at_end[:, i]
+        return violated, at_end
 
     def _cost(self) -> Any:
         """Cost of each run."""

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.arguments import checked, optional, positives, text, texts_by_name
 from covocp.checks import as_number
 from covocp.errors import ProblemError, describe
-from covocp.files import written_whole
+from covocp.files import check_target, written_whole
+from covocp.legends import fold_title, place_legend
 from covocp.matrices import Array
+from covocp.paths import outline
 from covocp.plot import (
     BAND,
+    BOUND,
     COLOURS,
     HEAD,
     PANEL,
@@ -33,7 +37,8 @@ if TYPE_CHECKING:
 
     from covocp.simulation.monte_carlo import MonteCarlo
 
-PREDICTED, SAMPLE = COLOURS[0], COLOURS[1]
+PREDICTED, SAMPLE, ERROR = COLOURS[0], COLOURS[1], COLOURS[2]
+DOTTED: Any = (0, (1.2, 1.4))
 GREY = "#777777"
 # Half the width of a cloud's axes, in the larger of the predicted and the robust deviation.
 VIEW = 4.5
@@ -42,6 +47,7 @@ DOTS = 5000
 SQUARE = 2.9  # inches, of a cloud
 
 
+@checked("plot()", sigmas=positives, units=optional(texts_by_name), title=optional(text))
 def plot_monte_carlo(
     sample: MonteCarlo,
     *names: Any,
@@ -53,13 +59,13 @@ def plot_monte_carlo(
     """Draw a simulation: deviations from the nominal over time, and clouds at the end.
 
     A panel of deviations has the predicted standard deviation as a band, mean and standard deviation of the sample as
-    dashed lines, and some runs. A cloud has the runs at the end, the predicted ellipses and, dashed, those of the
-    sample.
+    dashed lines, and some runs; of states and unknowns also the errors of the filter, predicted and in the runs; of
+    controls their limits. A cloud has the runs at the end, the predicted ellipses and, dashed, those of the sample.
 
     Args:
         sample: what `simulate` returned.
-        names: symbols or names for panels of deviations, pairs of them for clouds; none: a panel for every state and
-            control, a cloud for every two successive states or unknowns.
+        names: symbols or names, or entries of them ("p[0]"), for panels of deviations, pairs of them for clouds; none:
+            a panel for every state, control and estimated unknown, a cloud for every two successive states or unknowns.
         sigmas: sizes of the ellipses in standard deviations.
         units: by name, for the axes, where the problem does not say.
         title: of the figure; by default the name of the problem. Where the prediction fails the verdict stands below.
@@ -77,6 +83,8 @@ def plot_monte_carlo(
     sizes = as_number("plot_monte_carlo", "sizes of the ellipses", list(sigmas)).ravel()
     if not (sizes > 0).all():
         raise _wrong("sigmas", "positive numbers of standard deviations", sigmas)
+    if path is not None:
+        check_target(path, SUFFIXES)
     known = {b.name: b.unit for b in sample.blocks} | dict(units or {})
     components, clouds = _chosen(sample, names)
     count = len(components) + len(clouds)
@@ -92,7 +100,11 @@ def plot_monte_carlo(
         for place in axes[count:]:
             place.set_visible(False)
         _title(figure, sample, title)
-        _legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()))
+        rows_shown = [row for _, _, row in components]
+        errors = sample.estimated and any(row < sample.size for row in rows_shown)
+        columns_shown = [row - 2 * sample.size for row in rows_shown if row >= 2 * sample.size]
+        limits = any(_limits(sample, column) for column in columns_shown)
+        _legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()), errors=errors, limits=limits)
         if path is not None:
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
@@ -112,14 +124,16 @@ def _chosen(sample: MonteCarlo, names: tuple[Any, ...]) -> tuple[list[tuple[str,
             labels = [block.name if block.size == 1 else f"{block.name}[{i}]" for i in range(block.size)]
             every[block.name] = [(label, block.name, rows.start + i) for i, label in enumerate(labels)]
     if not names:
-        moving = {b.name for b in sample.blocks if b.kind != "unknown"}
+        moving = {b.name for b in sample.blocks if b.kind != "unknown" or sample.estimated}
         components = [entry for name, entries in every.items() for entry in entries if name in moving]
         return components, [(i, i + 1) for i in range(0, n - 1, 2)] + ([(n - 2, n - 1)] if n % 2 and n > 2 else [])
     components = []
     clouds = []
     for name in names:
         if not isinstance(name, (tuple, list)):
-            components += every[sample.rows(name)[1].name]
+            block = sample.rows(name)[1]
+            owner = block.name if block.name in every else block.name.split("[")[0]
+            components += [entry for entry in every[owner] if block.name in (owner, entry[0])]
             continue
         if len(name) != 2:
             raise _wrong("names", "symbols, or pairs of them", name)
@@ -156,9 +170,29 @@ def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], 
     spread = np.sqrt(np.maximum(sample.moments.product[:, row, row] - mean**2, 0.0))
     for curve, width in ((mean, 1.4), (mean - spread, 1.0), (mean + spread, 1.0)):
         axes.plot(t, curve, color=SAMPLE, linestyle=(0, (5, 1.6)), linewidth=width)
+    if sample.estimated and row < n:
+        _draw_error(axes, sample, row)
+    for limit in _limits(sample, row - 2 * n) if row >= 2 * n else ():
+        axes.plot(t, limit, scalex=False, scaley=False, zorder=1, **BOUND)
+    axes.axhline(0.0, color="black", linewidth=0.6, zorder=1)
     axes.set_xlabel("time [s]")
     axes.set_ylabel(_folded(_label(label, units.get(name, ""))))
     axes.margins(x=0)
+
+
+def _draw_error(axes: Axes, sample: MonteCarlo, row: int) -> None:
+    """Standard deviation of the error of the estimate: as predicted, and of the runs."""
+    predicted = np.sqrt(sample.predicted_error[:, row, row].clip(0.0))
+    own = np.sqrt(np.maximum(sample.error_covariance(sample.augmented[row])[:, 0, 0], 0.0))
+    for sign in (-1.0, 1.0):
+        axes.plot(sample.t, sign * predicted, color=ERROR, linewidth=1.0)
+        axes.plot(sample.t, sign * own, color=ERROR, linewidth=1.4, linestyle=DOTTED)
+
+
+def _limits(sample: MonteCarlo, column: int) -> list[Array]:
+    """How far a control may deviate from its nominal, where there are limits."""
+    nominal = sample.nominal_control[:, column]
+    return [limit[column] - nominal for limit in sample.limits if np.isfinite(limit[column])]
 
 
 def _label(name: str, unit: str) -> str:
@@ -178,8 +212,8 @@ def _draw_cloud(
     axes.plot(shown[:, 0], shown[:, 1], linestyle="none", marker=".", markersize=1.8, color=GREY, alpha=0.5, zorder=1)
     own = values.T @ values / max(1, len(values))
     for k in sigmas:
-        axes.plot(*_ellipse(predicted, k), color=PREDICTED, linewidth=1.4, zorder=3)
-        axes.plot(*_ellipse(own, k), color=SAMPLE, linewidth=1.2, linestyle=(0, (5, 1.6)), zorder=3)
+        axes.plot(*outline(predicted, k), color=PREDICTED, linewidth=1.4, zorder=3)
+        axes.plot(*outline(own, k), color=SAMPLE, linewidth=1.2, linestyle=(0, (5, 1.6)), zorder=3)
     axes.set_xlim(-view[0], view[0])
     axes.set_ylim(-view[1], view[1])
     beyond = int(np.count_nonzero((np.abs(values) > view).any(axis=1))) + int(np.count_nonzero(~sample.stayed))
@@ -193,15 +227,6 @@ def _draw_cloud(
     axes.locator_params(nbins=5)
 
 
-def _ellipse(covariance: Array, size: float, points: int = 121) -> Array:
-    """Points (2, points) of the ellipse of a covariance at some standard deviations."""
-    scale = np.sqrt(np.diag(covariance).clip(np.finfo(float).tiny))  # components of unequal units
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
-    circle = np.vstack([np.cos(angle), np.sin(angle)])
-    return np.asarray(size * scale[:, None] * (vectors @ (np.sqrt(values.clip(0.0))[:, None] * circle)))
-
-
 def _title(figure: Figure, sample: MonteCarlo, title: str | None) -> None:
     """Name of the problem, and below it the verdict where the prediction fails."""
     flown = f", a law every {sample.period:.6g} s" if sample.filter == "law" else ""
@@ -209,10 +234,14 @@ def _title(figure: Figure, sample: MonteCarlo, title: str | None) -> None:
     verdict = sample.verdict
     lines = [line for line in (text, "" if verdict.holds else f"{verdict.headline}") if line]
     if lines:
-        figure.suptitle("\n".join(map(_plain, lines)), fontsize=10, color="black" if verdict.holds else WARNING)
+        figure.suptitle(
+            fold_title(figure, list(map(_plain, lines))), fontsize=10, color="black" if verdict.holds else WARNING
+        )
 
 
-def _legend(figure: Figure, bands: bool, clouds: bool, sigmas: tuple[float, ...]) -> None:
+def _legend(
+    figure: Figure, bands: bool, clouds: bool, sigmas: tuple[float, ...], *, errors: bool, limits: bool
+) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -221,8 +250,13 @@ def _legend(figure: Figure, bands: bool, clouds: bool, sigmas: tuple[float, ...]
     if bands:
         handles.append(Patch(color=PREDICTED, alpha=2 * BAND, linewidth=0, label="predicted standard deviation"))
         handles.append(Line2D([], [], color=SAMPLE, linestyle=dashes, label="mean and standard deviation of the runs"))
+    if errors:
+        handles.append(Line2D([], [], color=ERROR, linewidth=1.0, label="predicted error of the estimate"))
+        handles.append(Line2D([], [], color=ERROR, linestyle=DOTTED, label="error of the estimate in the runs"))
+    if limits:
+        handles.append(Line2D([], [], label="limit of the control", **BOUND))
     if clouds:
         widths = ", ".join(f"{k:g}" for k in sigmas)
         handles.append(Line2D([], [], color=PREDICTED, label=f"predicted ellipses ({widths} deviations)"))
         handles.append(Line2D([], [], color=SAMPLE, linestyle=dashes, label="ellipses of the runs"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2))
+    place_legend(figure, handles)

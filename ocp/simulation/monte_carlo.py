@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.arguments import checked, one_of
+from covocp.arguments import truth as a_truth
 from covocp.checks import as_number
 from covocp.errors import ProblemError, describe
-from covocp.lookup import name_of
+from covocp.lookup import name_of, split_entry
 from covocp.matrices import Array
+from covocp.simulation.constraints import Rows
+from covocp.simulation.counts import Count, count
 from covocp.simulation.sampling import Moments, degrees_of_freedom, mean_band, mean_square_band, robust_deviation
 from covocp.simulation.step_choice import StepChoice
 from covocp.simulation.verdict import Verdict, judge
 from covocp.simulation.workers import Failure
 from covocp.statement import Block
+from covocp.threads import cached, methods_one_at_a_time
 
 if TYPE_CHECKING:
     import matplotlib.figure
 
 
+@methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MonteCarlo:
     """Simulated runs of an actual system with its filter and feedback.
@@ -51,6 +56,8 @@ class MonteCarlo:
             predicted_error: of the error of the estimate; predicted_mean: mean of the deviation, (K, n);
             predicted_control: mean squares of the deviation of the controls fed back, (K, m, m).
         design, design_error: the same mean squares as the design expects them; they differ where there is a truth.
+        intended: mean squares of the deviation at the end that the solution itself promises, (n,); they differ from
+            those of the design where the mesh does not resolve its gains. NaN without feedback.
         deviations: at the end, (R, n); of a run that left the domain, just before it did.
         estimates: the filter's estimates of them, (R, n); those of a law at its last step, NaN where it has none.
         costs: of each run, (R,); NaN where it left the domain, or without an expected cost.
@@ -62,7 +69,11 @@ class MonteCarlo:
         asking: share of the runs that ask for more at each stored time, (K, m).
         limits: what counts as all the control there is, (lower, upper), (m,) each; limited: whether the actual control
             stays within them.
-        outside: whether a run left the bounds of a state or control at some instant, (R, bounds); bounded: their names.
+        inequalities: those that runs can violate, bounds of states and controls among them.
+        violated: whether a run violates each at some instant (of the start or end: there), (R, rows); at_end: whether
+            it does at the end, which a run that left the domain counts for, (R, rows).
+        violating: share of the runs that do at each stored time, (K, rows); promised: probability of it by the
+            predicted covariances, for normal deviations, (K, rows).
         paths: deviation, estimate and deviation of the control of the first runs, (runs, K, 2n + m).
         failed: runs that were not simulated because their task failed.
         interrupted: whether it was stopped before the last run.
@@ -89,6 +100,7 @@ class MonteCarlo:
     predicted_error: Array
     predicted_mean: Array
     predicted_control: Array
+    intended: Array
     design: Array
     design_error: Array
     deviations: Array
@@ -103,8 +115,11 @@ class MonteCarlo:
     asking: Array
     limits: tuple[Array, Array]
     limited: bool
-    outside: Any
-    bounded: tuple[str, ...]
+    inequalities: Rows
+    violated: Any
+    at_end: Any
+    violating: Array
+    promised: Array
     paths: Array
     failed: tuple[Failure, ...]
     interrupted: bool
@@ -146,6 +161,7 @@ class MonteCarlo:
         low, high = mean_band(values, variance, self.moments.count[:, None], self.level)
         return self._shaped(low, block), self._shaped(high, block)
 
+    @checked("covariance()", about=one_of("nominal", "mean"))
     def covariance(self, a: Any, b: Any = None, *, about: str = "nominal") -> Array:
         """Sample covariance of the deviations of two symbols, (K, size of a, size of b).
 
@@ -158,15 +174,6 @@ class MonteCarlo:
         product = self.moments.product[:, one, two]
         if about == "nominal":
             return product
-        if about != "mean":
-            raise ProblemError(
-                describe(
-                    "The covariance is about something unknown.",
-                    expected="about='nominal' or 'mean'",
-                    received=repr(about),
-                    remedy="correct about=",
-                )
-            )
         mean = self.moments.mean
         return np.asarray(product - mean[:, one, None] * mean[:, None, two])
 
@@ -267,19 +274,30 @@ class MonteCarlo:
     @property
     def outside_share(self) -> dict[str, float]:
         """Share of the runs that left the bounds of a state or control at some instant, by name."""
-        return {name: float(values.mean()) for name, values in zip(self.bounded, self.outside.T, strict=True)}
+        return {entry.name: entry.share for entry in self.violations.values() if entry.bound}
 
-    @cached_property
+    @cached
+    def violations(self) -> Mapping[str, Count]:
+        """How many runs violate each constraint, and each bound of a state or control, of the problem, by name.
+
+        Without equalities, which no noisy run meets, and what is the same in all runs: `inequalities.left_out`.
+        """
+        flags = self.violated, self.at_end, self.violating
+        found = count(self.inequalities.rows, *flags, self.promised, self.t, self.level)
+        return {entry.name: entry for entry in found}
+
+    @cached
     def verdict(self) -> Verdict:
         """Whether the linear prediction is inside the confidence bands at the end, and if not, why."""
         return judge(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain arrays, numbers and texts, by name."""
-        left_out = ("moments", "step", "failed", "blocks", "symbols", "limits")
+        left_out = {"moments", "step", "failed", "blocks", "symbols", "limits", "inequalities"}
         result = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
         result |= {f"moments.{f.name}": getattr(self.moments, f.name) for f in fields(self.moments)}
         result |= {"step": self.step.longest, "step_reason": self.step.reason, "failed": [str(f) for f in self.failed]}
+        result["inequalities"] = tuple(row.name for row in self.inequalities.rows)
         return result | {"limits.lower": self.limits[0], "limits.upper": self.limits[1]}
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
@@ -292,8 +310,9 @@ class MonteCarlo:
         """The summary that print shows."""
         return str(importlib.import_module("covocp.simulation.report").summary(self))
 
+    @checked(controls=a_truth)
     def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:
-        """Where a symbol lies among the rows of deviation, estimate and control (2n + m), and its block.
+        """Where a symbol, or an entry of one, lies among the rows (2n + m) of `moments`, and its block.
 
         Raises:
             ProblemError: where it is not among them.
@@ -309,7 +328,13 @@ class MonteCarlo:
             if block.offset < self.nominal_control.shape[1]:
                 start = 2 * self.size + block.offset
                 found[block.name] = (slice(start, start + block.size), block)
-        return found[name_of(key, self.symbols, tuple(found))]
+        name = name_of(key, self.symbols, tuple(found), sizes={n: b.size for n, (_, b) in found.items()})
+        entry = split_entry(name)
+        if name in found or entry is None:
+            return found[name]
+        rows, owner = found[entry[0]]
+        first = rows.start + entry[1]
+        return slice(first, first + 1), replace(owner, name=name, size=1, offset=owner.offset + entry[1])
 
     @staticmethod
     def _shaped(values: Array, block: Block) -> Array:

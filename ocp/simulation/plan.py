@@ -10,16 +10,10 @@ import casadi as ca
 import numpy as np
 
 from covocp.matrices import Array
+from covocp.simulation.constraints import Place, counted_rows
 from covocp.simulation.flown import Flown, sample_indices
-from covocp.simulation.run_step import (
-    Setting,
-    factor,
-    finish_function,
-    observe_function,
-    run_symbols,
-    start_of,
-    step_function,
-)
+from covocp.simulation.run_parts import Setting, factor, run_symbols
+from covocp.simulation.run_step import finish_function, observe_function, start_of, step_function
 from covocp.simulation.schedule import Grid, coefficients, table
 
 
@@ -38,9 +32,10 @@ class Plan:
     spans: where the parts of a run's state lie.
     noises: normal numbers that a step takes; states: rows of x; fed_back: controls m.
     seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
-    pairs: whether each noise is the sum of those of two half steps.
+    pairing: of which two noises of its halves each noise of a step is the sum, (noises, 2); None: it is none.
     paths: number of runs whose histories are kept.
     flown: the law of the user; samples: indices of the times at which it is stepped.
+    watched: the place of each inequality.
     """
 
     step: ca.Function
@@ -60,10 +55,11 @@ class Plan:
     fed_back: int
     seed: int
     pilot: bool
-    pairs: bool
+    pairing: Any
     paths: int
     flown: Flown | None
     samples: Any
+    watched: tuple[Place, ...]
 
     @property
     def estimates(self) -> bool:
@@ -101,7 +97,8 @@ def make_plan(
     chosen = coefficients(design, setting.filter)
     before, after = table(setting.solution, grid, chosen)
     varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
-    run = run_symbols(setting, chosen)
+    watched = counted_rows(design)
+    run = run_symbols(setting, chosen, len(watched.at("path")))
     return Plan(
         step=step_function(run, before[0], varying),
         observe=observe_function(run),
@@ -121,8 +118,9 @@ def make_plan(
         fed_back=design.fed_back,
         seed=seed,
         pilot=pilot,
-        pairs=pairs,
+        pairing=run.pairing if pairs else None,
         paths=paths,
         flown=setting.flown,
         samples=sample_indices(setting.flown, grid),
+        watched=tuple(row.place for row in watched.rows),
     )

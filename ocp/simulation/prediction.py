@@ -7,12 +7,15 @@ and 6.11, for any truth):
     dd = (Fa d - Ga C y + fa - f) dt + dn,
     dy = ((F - K M) y - (G - K hu) C y + K (Ma d - hau C y + ha - h)) dt + K dv.
 
+All of the actual system is taken at the nominal state and at the true means of the unknowns: fa - f and ha - h then
+contain what another mean does, so its part of d, which stands in the mean of d too, is taken off again.
+
 Where the truth is the design, the covariance of d is E + Xhat of (A-31 .. 33) and that of y - d is E.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -35,11 +38,14 @@ class Prediction:
     """Mean (K, 2n) and covariance (K, 2n, 2n) of deviation and estimate, stacked, at some times.
 
     rates: fastest rate of filter, loop and plant in each interval between these times [1/s], (K - 1,).
+    step_rates: what a step must resolve: the fastest rate of plant and loop, and that of the filter at its slower end
+        of the interval, because a transient of the filter is stepped as a whole.
     """
 
     mean: Array
     covariance: Array
     rates: Array
+    step_rates: Array
 
     @property
     def size(self) -> int:
@@ -63,11 +69,12 @@ class Prediction:
 
     def at(self, rows: Any) -> Prediction:
         """The prediction at some of its times; the fastest rates stay those of all intervals."""
-        return Prediction(mean=self.mean[rows], covariance=self.covariance[rows], rates=self.rates)
+        return replace(self, mean=self.mean[rows], covariance=self.covariance[rows])
 
     def _about_nominal(self, chosen: Array) -> Array:
-        mean = self.mean @ chosen.T
-        return np.asarray(chosen @ self.covariance @ chosen.T + mean[:, :, None] * mean[:, None, :])
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = self.mean @ chosen.T
+            return np.asarray(chosen @ self.covariance @ chosen.T + mean[:, :, None] * mean[:, None, :])
 
 
 def predict(solution: Solution, design: System, actual: System, grid: Grid) -> Prediction:
@@ -81,7 +88,7 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     """
     n = design.size
     joint = _joint(design, actual)
-    rates = _fastest_rates(solution, joint, grid, actual, n)
+    rates, step_rates = _fastest_rates(solution, joint, grid, actual, n)
     fine = grid.divided(np.minimum(grid.parts(STEP_PER_RATE / np.maximum(rates, 1e-300)), MOST_PARTS))
     kept = set(np.flatnonzero(np.isin(fine.t, grid.t)).tolist())
     sides = [_evaluate(solution, joint, fine.t[:-1] + c * fine.h, fine.interval, actual, n) for c in (0.0, 0.5, 1.0)]
@@ -89,12 +96,13 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     covariance = np.zeros((2 * n, 2 * n))
     covariance[:n, :n] = actual.variance
     means, covariances = [mean], [covariance]
-    for k, h in enumerate(fine.h.tolist()):
-        mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
-        if k + 1 in kept:
-            means.append(mean)
-            covariances.append(covariance)
-    return Prediction(mean=np.array(means), covariance=np.array(covariances), rates=rates)
+    with np.errstate(over="ignore", invalid="ignore"):  # gains that the mesh does not resolve: the verdict says it
+        for k, h in enumerate(fine.h.tolist()):
+            mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
+            if k + 1 in kept:
+                means.append(mean)
+                covariances.append(covariance)
+    return Prediction(mean=np.array(means), covariance=np.array(covariances), rates=rates, step_rates=step_rates)
 
 
 def control_spread(solution: Solution, design: System, prediction: Prediction, nominal: Nominal) -> Array:
@@ -114,13 +122,15 @@ def _joint(design: System, actual: System) -> ca.Function:
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np, other.np)
     x, u, e, t, T, p, q = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
     chosen = coefficients(design, "perturbation")
-    c = chosen.split(chosen.function(x, u, e, t, T, p))
+    c = chosen.split(chosen.function(x, u, e, t, T, p, 0))
     f, F, G, Q, h, M, Hu, U = actual.linear(x[: other.nx], u[: other.nu], t, T, q)
     C, K = c["C"], c["K"]
     rate = design.linear(x, u, t, T, p)[0]
-    drift = ca.blockcat([[F, -G @ C], [K @ M, c["drift"] - (c["input"] + K @ Hu) @ C]])
+    own = c["F"] - K @ c["M"] - (c["G"] - K @ c["Hu"]) @ C
+    drift = ca.blockcat([[F, -G @ C], [K @ M, own - K @ Hu @ C]])
     noise = ca.diagcat(Q, K @ U @ K.T)
-    offset = ca.vertcat(f - rate, K @ (h - c["h"]))
+    known = ca.DM(np.concatenate([np.zeros(design.states), (actual.start - design.start)[design.states :]]))
+    offset = ca.vertcat(f - rate - F @ known, K @ (h - c["h"] - M @ known))
     return ca.Function("joint", a, [ca.densify(value) for value in (drift, noise, offset)])
 
 
@@ -150,8 +160,8 @@ def _step(mean: Array, covariance: Array, h: float, sides: list[tuple[Array, ...
     return mean + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4), covariance + h / 6 * (p1 + 2 * p2 + 2 * p3 + p4)
 
 
-def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: System, n: int) -> Array:
-    """Largest absolute eigenvalue of the drift at either end of each step of a grid [1/s], (N,)."""
+def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: System, n: int) -> tuple[Array, Array]:
+    """`Prediction.rates` and `Prediction.step_rates` of each step of a grid, (N,)."""
     sides = [_evaluate(solution, joint, t, grid.interval, actual, n)[0] for t in (grid.t[:-1], grid.t[1:])]
     if not all(np.isfinite(side).all() for side in sides):
         raise ProblemError(
@@ -162,4 +172,12 @@ def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: S
                 remedy="simulate a solution that converged, or mend the truth",
             )
         )
-    return np.asarray(np.maximum(*(np.abs(np.linalg.eigvals(side)).max(axis=1) for side in sides)))
+    whole = [_fastest(side) for side in sides]
+    # With an estimate that is right the deviation goes by F - G C.
+    plant = [_fastest(matrix) for side in sides for matrix in (side[:, :n, :n], side[:, :n, :n] + side[:, :n, n:])]
+    return np.maximum(*whole), np.max([*plant, np.minimum(*whole)], axis=0)
+
+
+def _fastest(matrices: Array) -> Array:
+    """Largest absolute eigenvalue of each of some matrices, (N,)."""
+    return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=1))

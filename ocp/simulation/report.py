@@ -24,6 +24,7 @@ def summary(sample: MonteCarlo) -> str:
         _entries(sample, "deviation at T", sample.verdict.deviations, sample.design),
         _entries(sample, "error of the filter at T", sample.verdict.errors, sample.design_error),
         _cost(sample),
+        _violations(sample),
         _shares(sample),
         wrapped(f"{sample.verdict}{_expectations(sample)}", ""),
     ]
@@ -104,6 +105,33 @@ def _cost(sample: MonteCarlo) -> str:
     return wrapped(text + (f"; without the {gone} runs that left the domain" if gone else ""))
 
 
+def _violations(sample: MonteCarlo) -> str:
+    """Who violates the constraints of the problem; bounds that no run leaves are left out."""
+    shown = [entry for entry in sample.violations.values() if entry.runs or not entry.bound]
+    left_out = sample.inequalities.left_out.items()
+    text = [wrapped(f"Not counted: {', '.join(f'{name} ({why})' for name, why in left_out)}.", "")] if left_out else []
+    if not shown:
+        return "\n".join(text)
+    columns = ["runs that violate", "at", "at any time", "at T", "promised", "most at once", "at t [s]", "promised", ""]
+    rows = []
+    for entry in shown:
+        kind = "bounds" if entry.bound else {"initial": "start", "final": "end"}.get(entry.place, entry.place)
+        end = ["-", "-"] if entry.place == "initial" else [_share(entry.end_share), _share(entry.promised_end)]
+        rows.append([entry.name, kind, _share(entry.share), *end, _share(entry.most), number(entry.most_time, 4)])
+        rows[-1] += [_share(entry.promised_most), "" if entry.as_promised else "OUTSIDE"]
+    table = render_table(columns, rows, words=(0, 1, len(columns) - 1))
+    note = (
+        "Promised: by the predicted covariances, for normal deviations and to first order; OUTSIDE: beyond the band of "
+        f"{100 * sample.level:.4g} % about the share of the runs at the end (at the start)."
+    )
+    return "\n".join([table, wrapped(note, ""), *text])
+
+
+def _share(value: float) -> str:
+    """A share in percent, for a table."""
+    return "-" if np.isnan(value) else f"{100 * value:.3g} %"
+
+
 def _shares(sample: MonteCarlo) -> str:
     """Who left what, and what the columns mean."""
     factor = "inside the domain" if sample.left_share == 0 else "that stayed inside the domain"
@@ -124,8 +152,4 @@ def _shares(sample: MonteCarlo) -> str:
             f"{100 * sample.asked_share:.3g} % of the runs asked for more control than there is ({most:.3g} % at one "
             f"instant); {kept}."
         )
-    outside = {name: share for name, share in sample.outside_share.items() if share}
-    if outside:
-        listed = ", ".join(f"{name} {100 * share:.3g} %" for name, share in outside.items())
-        lines.append(f"Runs outside the bounds at some instant: {listed}.")
     return "\n".join(wrapped(line, "") for line in lines)

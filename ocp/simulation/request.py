@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from covocp.arguments import MOST, is_whole, positive
 from covocp.errors import ProblemError, describe
 from covocp.simulation.schedule import Filter
 from covocp.simulation.vectorised import padded
@@ -30,17 +29,16 @@ class Request:
     def __post_init__(self) -> None:
         """Refuse what means nothing."""
         for name, least in (("runs", 2), ("seed", 0), ("store", 2), ("paths", 0), ("batch", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise wrong_argument(name, f"a whole number, {least} or more", value)
-        if self.filter not in FILTERS:
+            value: Any = getattr(self, name)
+            if not is_whole(value, least, None if name == "seed" else MOST):
+                most = "" if name == "seed" or not is_whole(value, least, None) else f", at most {MOST:.0e}"
+                raise wrong_argument(name, f"a whole number, {least} or more{most}", value)
+        if not isinstance(self.filter, str) or self.filter not in FILTERS:
             raise wrong_argument("filter", " or ".join(map(repr, FILTERS)), self.filter)
-        for name, value, most in (("step", self.step, np.inf), ("level", self.level, 1.0)):
-            number = 0.5 if value is None and name == "step" else value
-            if isinstance(number, bool) or not isinstance(number, (int, float, np.number)) or not 0 < number < most:
-                raise wrong_argument(
-                    name, "a number between 0 and 1" if name == "level" else "a number > 0 [s], or None", value
-                )
+        if self.step is not None and positive(self.step):
+            raise wrong_argument("step", "a number > 0 [s], or None", self.step)
+        if positive(self.level) or not self.level < 1.0:
+            raise wrong_argument("level", "a number between 0 and 1", self.level)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.arguments import checked, truth
 from covocp.errors import ProblemError, SolveError, describe, warn_user
 from covocp.evaluate import evaluate
 from covocp.lookup import control_limits
@@ -15,21 +16,21 @@ from covocp.matrices import Array
 from covocp.progress import Progress
 from covocp.simulation.actual import System, actual_system, design_system
 from covocp.simulation.batches import Batch, StoppedError
+from covocp.simulation.constraints import counted_rows, promised
 from covocp.simulation.flown import flown_law, sample_indices
 from covocp.simulation.monte_carlo import MonteCarlo
 from covocp.simulation.plan import make_plan
 from covocp.simulation.prediction import Prediction, control_spread, predict
 from covocp.simulation.request import Request, wrong_argument
-from covocp.simulation.run_step import Limits, Setting, bounded_rows
+from covocp.simulation.run_parts import Limits, Setting
 from covocp.simulation.sampling import THREE_SIGMA, moments_of
 from covocp.simulation.schedule import Filter, Grid, Nominal, base_grid, nominal_at, stored_times
-from covocp.simulation.step_choice import StepChoice, choose_step, given_step
+from covocp.simulation.step_choice import StepChoice, choose_step, examined, given_step
+from covocp.simulation.verdict import LEFT
 from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution import Solution
-from covocp.statement import entry_names
+from covocp.threads import one_at_a_time
 
-# Multiple of the largest predicted deviation of a component beyond which a run has left the domain.
-DOMAIN = 100.0
 # What stands for no such limit; a number, so that a comparison finds inf and NaN.
 UNLIMITED = 1e300
 # Runs in a batch: wide enough that numpy's operations outweigh their calls, and tasks enough for some workers.
@@ -38,6 +39,8 @@ LARGEST_BATCH, LARGEST_TASK = 2048, 512
 UNDER_TRUTH = "evaluated under other statistics"
 
 
+@one_at_a_time
+@checked(progress=truth)
 def simulate(
     solution: Solution,
     runs: int,
@@ -117,7 +120,7 @@ def simulate(
         actual=actual,
         filter=filter if flown is None else "law",
         limits=_limits(design, limits),
-        domain=_domain(expected),
+        domain=_domain(solution, expected),
         flown=flown,
     )
     t, intervals = stored_times(base, store, sample_indices(flown, base))
@@ -125,10 +128,11 @@ def simulate(
         chosen = _step(setting, base, true, request, reporter)
         plan = make_plan(setting, chosen.grid, t, seed=int(seed), paths=paths)
         harvest = simulate_batches(plan, request.ranges, executor, lambda: reporter.stop, _reporting(reporter))
-    _tell(harvest, runs)
-    at = np.searchsorted(base.t, t)
-    kept = tuple(prediction.at(at) for prediction in (expected, true))
-    return _result(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, truth)
+        _tell(harvest, runs)
+        at = np.searchsorted(base.t, t)
+        kept = tuple(prediction.at(at) for prediction in (expected, true))
+        result = _result(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, truth)
+        return _told(result, setting, reporter)
 
 
 def _design(solution: Solution) -> System:
@@ -172,20 +176,22 @@ def _limits(design: System, limits: Any) -> Limits:
     )
 
 
-def _domain(expected: Prediction) -> Array:
-    """Largest deviations that count as inside."""
-    largest = np.sqrt(np.diagonal(expected.deviation, axis1=1, axis2=2).clip(0.0)).max(axis=0)
-    return np.asarray(np.where(largest > 0, DOMAIN * largest, UNLIMITED))
+def _domain(solution: Solution, expected: Prediction) -> Array:
+    """Largest deviations that count as inside: what the solution promises, whatever gains between its nodes do."""
+    spread = expected.deviation if solution.loop is None else solution.loop.X
+    squares = np.diagonal(spread, axis1=1, axis2=2)
+    squares = np.where(np.isfinite(squares), squares, 0.0).clip(0.0).max(axis=0)
+    return np.asarray(np.where(squares > 0, LEFT * np.sqrt(squares), UNLIMITED))
 
 
 def _step(setting: Setting, base: Grid, true: Prediction, request: Request, reporter: Progress) -> StepChoice:
     """The given step, or the one at which the statistics settle."""
     if request.step is not None:
-        return given_step(base, float(request.step))
+        return given_step(base, float(request.step), true.step_rates)
     try:
-        # A law would take long to fly the pilot runs; the system moves as fast under the design's own filter.
-        pilot = replace(setting, filter="perturbation", flown=None) if setting.flown else setting
-        chosen = choose_step(pilot, base, true.rates, runs=request.runs, seed=request.seed, stop=lambda: reporter.stop)
+        chosen = choose_step(
+            _pilot(setting), base, true.step_rates, runs=request.runs, seed=request.seed, stop=lambda: reporter.stop
+        )
     except StoppedError:
         raise KeyboardInterrupt from None  # nothing is simulated yet
     if not chosen.settled:
@@ -193,6 +199,25 @@ def _step(setting: Setting, base: Grid, true: Prediction, request: Request, repo
             f"The statistics did not settle: at a step of {chosen.longest:.3g} s {chosen.reason}. Give step=, smaller."
         )
     return chosen
+
+
+def _pilot(setting: Setting) -> Setting:
+    """What flies in pilot runs: a law would take long, and the system moves as fast under the design's own filter."""
+    return replace(setting, filter="perturbation", flown=None) if setting.flown else setting
+
+
+def _told(sample: MonteCarlo, setting: Setting, reporter: Progress) -> MonteCarlo:
+    """A result of which the step, where it was given and the prediction fails, is examined: it may be to blame."""
+    if not sample.step.given or sample.verdict.holds or sample.interrupted:
+        return sample
+    try:
+        step = examined(sample.step, _pilot(setting), runs=sample.runs, seed=sample.seed, stop=lambda: reporter.stop)
+    except StoppedError:
+        return sample
+    if not step.settled:
+        words = f"The given step of {step.longest:.3g} s is too long: {step.reason}."
+        warn_user(f"{words} Give a smaller one, or leave step= out.")
+    return replace(sample, step=step)
 
 
 def _reporting(reporter: Progress) -> Callable[[Batch], None]:
@@ -265,6 +290,7 @@ def _result(
         predicted_error=true.error,
         predicted_mean=true.mean[:, : design.size],
         predicted_control=control_spread(solution, design, true, nominal),
+        intended=_intended(solution, design),
         design=expected.deviation,
         design_error=expected.error,
         design_cost=costs[0],
@@ -272,7 +298,8 @@ def _result(
         domain=setting.domain,
         limits=(limits.least, limits.most),
         limited=bool(np.isfinite(limits.lower).any() or np.isfinite(limits.upper).any()),
-        bounded=_bounded(design),
+        inequalities=counted_rows(design),
+        promised=promised(solution, design, nominal, true),
         failed=harvest.failures,
         interrupted=harvest.interrupted,
         blocks=design.statement.blocks,
@@ -281,24 +308,22 @@ def _result(
     )
 
 
+def _intended(solution: Solution, design: System) -> Array:
+    """Mean squares of the deviations at the end that the solution promises; NaN where nothing is fed back."""
+    return np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy()
+
+
 def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     """What the result has for each run, and the sums over them."""
     names = {"deviations": "deviation", "estimates": "estimate", "costs": "cost"}
-    names |= {name: name for name in ("left", "unanswered", "asked", "outside", "paths")}
+    names |= {name: name for name in ("left", "unanswered", "asked", "violated", "at_end", "paths")}
     values = {name: np.concatenate([getattr(batch, own) for batch in batches]) for name, own in names.items()}
     values["numbers"] = np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches])
-    values["asking"] = np.sum([batch.asking for batch in batches], axis=0) / values["numbers"].size
+    for name in ("asking", "violating"):
+        values[name] = np.sum([getattr(batch, name) for batch in batches], axis=0) / values["numbers"].size
     for array in values.values():
         array.setflags(write=False)
     return {**values, "moments": moments_of(batches)}
-
-
-def _bounded(design: System) -> tuple[str, ...]:
-    """Names of the states and fed-back controls with bounds, in the order of the flags."""
-    st = design.statement
-    rows = bounded_rows(design)
-    names = entry_names(st.states), entry_names(st.controls)
-    return tuple(name[i] for name, chosen in zip(names, rows, strict=True) for i in chosen)
 
 
 def _predicted_costs(solution: Solution, truth: Any) -> tuple[float, float]:

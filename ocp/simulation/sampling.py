@@ -50,7 +50,7 @@ def moments_of(batches: Sequence[Batch]) -> Moments:
 
 def degrees_of_freedom(count: Any, square: Any, fourth: Any) -> Any:
     """Degrees of freedom of the chi-square law of a mean square, from the mean fourth power."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         kurtosis = fourth / np.square(square)
         kurtosis = np.where(np.isfinite(kurtosis), kurtosis, 3.0)
         return np.minimum(count, 2.0 * count / np.maximum(kurtosis - 1.0, np.finfo(float).tiny))
@@ -66,9 +66,27 @@ def mean_square_band(square: Any, freedom: Any, level: float) -> tuple[Any, Any]
 
 
 def mean_band(mean: Any, variance: Any, count: Any, level: float) -> tuple[Any, Any]:
-    """Confidence band of a mean, normal."""
-    width = special.ndtri((1.0 + level) / 2.0) * np.sqrt(np.maximum(variance, 0.0) / np.maximum(count, 1.0))
+    """Confidence band of a mean by Student's law: the deviation is that of the same few runs.
+
+    Args:
+        mean: of the sample.
+        variance: mean square about it, divided by the number of runs.
+        count: of the runs; below two the band is infinite.
+        level: probability of the band.
+    """
+    freedom = np.maximum(np.asarray(count, dtype=float) - 1.0, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.sqrt(np.maximum(variance, 0.0) / freedom)
+        width = np.where(freedom > 0, special.stdtrit(freedom, (1.0 + level) / 2.0) * error, np.inf)
     return mean - width, mean + width
+
+
+def share_band(count: Any, runs: int, level: float) -> tuple[Any, Any]:
+    """Confidence band of a probability of which `count` of some runs were hit, exact (Clopper and Pearson)."""
+    hits, tail = np.asarray(count, dtype=float), (1.0 - level) / 2.0
+    low = np.where(hits > 0, special.betaincinv(np.maximum(hits, 1.0), runs - hits + 1.0, tail), 0.0)
+    high = np.where(hits < runs, special.betaincinv(hits + 1.0, np.maximum(runs - hits, 1.0), 1.0 - tail), 1.0)
+    return low, high
 
 
 def robust_deviation(values: Array) -> Array:

@@ -12,6 +12,8 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from covocp.blocks.arithmetic import apply, definite_solve, symmetric
+from covocp.errors import ProblemError, describe
 from covocp.matrices import Array, pack, unpack_symbolic
 from covocp.riccati import inverse
 from covocp.simulation.actual import System
@@ -22,6 +24,7 @@ Estimator = Filter | Literal["law"]
 
 # A division is rounded up unless it is whole to this accuracy: 5 s into steps of 0.25 s are 20, not 21.
 WHOLE = 1e-9
+MOST_STEPS = 10**7  # of a run; their times alone fill a memory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,7 +57,17 @@ class Grid:
 
     def parts(self, length: Any) -> Any:
         """Into how many parts each step must be divided so that none is longer than `length`."""
-        return np.maximum(1, np.ceil(self.h / length - WHOLE)).astype(int)
+        needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
+        if not float(np.sum(needed)) <= MOST_STEPS:
+            raise ProblemError(
+                describe(
+                    "The simulation would need too many steps.",
+                    expected=f"at most {MOST_STEPS:.0e} steps a run",
+                    received=f"{float(np.sum(needed)):.1e} steps of {float(np.min(length)):.2g} s",
+                    remedy="correct the truth if it moves too fast, or give a longer step=",
+                )
+            )
+        return needed.astype(int)
 
 
 def base_grid(solution: Solution, points: int, step: float | None = None, samples: Array | None = None) -> Grid:
@@ -128,10 +141,11 @@ def _controls_at(solution: Solution, t: Array, interval: Any) -> Array:
 class Coefficients:
     """What filter and feedback use at one time, stacked in a column of `rows` entries.
 
-    function: (state, control, matrices, time, duration, parameters) -> the column.
-    shapes: of the parts by name, in their order: "t", the nominal "x", "u", the gain "C", "extra", the weights B - L_uu
-        of the feedback; for the perturbation filter its gain "K", "drift" F - K M, "input" G - K h_u, and "h", the
-        measurement that is expected along the nominal.
+    function: (state, control, matrices, time, duration, parameters, length h of the step) -> the column.
+    shapes: of the parts by name, in their order: "t", the nominal "x", "u" and, where a constraint uses them, the
+        matrices "e", the gain "C", "extra", the weights B - L_uu of the feedback; for the perturbation filter its gain
+        "K", its model "F", "G", "M", "Hu", "h", the measurement that is expected along the nominal, and "early",
+        E M'(M E M' + 2 U/h)^-1, its gain for what is measured during the first half of a step.
     """
 
     function: ca.Function
@@ -162,17 +176,20 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
         "t": t,
         "x": x,
         "u": u,
+        "e": e if any(c.uses_matrices for c in (st.path, st.start, st.end)) else symbolic.zeros(0, 1),
         "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
     }
+    step = symbolic.sym("step")
     if kind == "perturbation":
         _, F, G, _, h, M, Hu, U = design.linear(x, u, t, T, p)
-        K = filter_gain(estimation_half(st, e), n, M, U)
-        parts |= {"K": K, "drift": F - K @ M, "input": G - K @ Hu, "h": h}
+        half = estimation_half(st, e)
+        parts |= {"K": filter_gain(half, n, M, U), "F": F, "G": G, "M": M, "Hu": Hu, "h": h}
+        parts["early"] = early_gain(unpack_symbolic(half, n), M, U, step)
     shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
     assert shapes["C"] == (m, n)
     return Coefficients(
-        function=ca.Function("coefficients", a, [ca.veccat(*map(ca.densify, parts.values()))]), shapes=shapes
+        function=ca.Function("coefficients", [*a, step], [ca.veccat(*map(ca.densify, parts.values()))]), shapes=shapes
     )
 
 
@@ -187,6 +204,18 @@ def filter_gain(half: Any, size: int, M: Any, U: Any) -> Any:
     return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)
 
 
+def early_gain(E: Any, M: Any, U: Any, h: Any) -> Any:
+    """Gain E M'(M E M' + 2 U/h)^-1, (n, r), of what half a step measures, E known before it; bounded at any h."""
+    if not M.shape[0]:
+        return type(E).zeros(E.shape[0], 0)
+
+    def law(E: Any, M: Any, U: Any, h: Any) -> tuple[Any]:
+        seen = h * (M @ E)
+        return (definite_solve(symmetric(seen @ M.T) + 2 * U, seen, "noise of the innovation").T,)
+
+    return apply(law, E, M, ca.densify(U), h)[0]
+
+
 def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:
     """The columns at the starts and at the ends of all steps, (N, rows) each."""
     x, e = _states_at(solution, grid.t)
@@ -194,6 +223,7 @@ def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, 
     for part in (slice(0, -1), slice(1, None)):
         t = grid.t[part]
         at = Nominal(x=x[part], u=_controls_at(solution, t, grid.interval), e=e[part], t=t)
-        values = chosen.function.map(grid.steps)(*at.columns(solution.duration, solution.parameters))
+        columns = at.columns(solution.duration, solution.parameters)
+        values = chosen.function.map(grid.steps)(*columns, grid.h[None, :])
         sides.append(np.ascontiguousarray(values.full().T))
     return sides[0], sides[1]

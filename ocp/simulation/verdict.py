@@ -15,8 +15,12 @@ if TYPE_CHECKING:
 
 # A run that ends this many predicted deviations away counts as unstable: no normal one does.
 UNSTABLE = 10.0
+# And the domain ends this many of them away.
+LEFT = 100.0
 # A share of runs below this explains nothing.
 NOTICEABLE = 0.01
+# Share by which deviations as flown may differ from those that the solution promises: of quadratures, not of gains.
+AS_PROMISED = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +55,12 @@ class Verdict:
     deviations: of the states of the actual system from the nominal. errors: of the estimates of states and unknowns.
     left: share of the runs that left the domain. unstable: share that did, or ended more than `UNSTABLE` predicted
     deviations away. asked: share that asked for more control than there is. holds: whether the prediction is inside the
-    band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain.
-    law: whether a law of the user's flew. unanswered: share of the runs in which it once gave no finite control; they
-    do not count as unstable.
+    band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain,
+    and the prediction is what the solution promises. law: whether a law of the user's flew. unanswered: share of the
+    runs in which it once gave no finite control; they do not count as unstable.
+    too_long: what halving the given step changes, in words; "" where it is short enough. unpredicted: components of
+    which the prediction is no number. broken: (name, promised, predicted) standard deviations at the end where the
+    gains between the nodes do something else than the solution promises.
     """
 
     deviations: tuple[Entry, ...]
@@ -66,6 +73,9 @@ class Verdict:
     limited: bool
     law: bool = False
     unanswered: float = 0.0
+    too_long: str = ""
+    unpredicted: tuple[str, ...] = ()
+    broken: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def decisive(self) -> tuple[Entry, ...]:
@@ -75,7 +85,8 @@ class Verdict:
     @property
     def holds(self) -> bool:
         """Whether the linear prediction holds."""
-        return self.left == 0.0 and all(entry.inside for entry in self.decisive)
+        as_promised = not self.unpredicted and not self.broken
+        return self.left == 0.0 and as_promised and all(entry.inside for entry in self.decisive)
 
     @property
     def outside(self) -> tuple[str, ...]:
@@ -84,13 +95,16 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it does not hold: of "unanswered", "unstable", "saturated"; else "law" or "nonlinear"; () where it holds.
+        """Why it does not hold, () where it holds.
+
+        Of "step", "unpredicted", "gains", "unanswered", "unstable", "saturated"; else "law" or "nonlinear".
 
         Control that a law was given, because there were no limits, explains nothing.
         """
         if self.holds:
             return ()
-        found = ["unanswered"] if self.unanswered else []
+        causes = {"step": self.too_long, "unpredicted": self.unpredicted and not self.broken, "gains": self.broken}
+        found = [name for name, cause in {**causes, "unanswered": self.unanswered}.items() if cause]
         if self.unstable >= NOTICEABLE or self.left > self.unanswered:
             found.append("unstable")
         if self.asked >= NOTICEABLE and (self.limited or not self.law):
@@ -119,6 +133,16 @@ class Verdict:
         return text
 
     def _because(self, reason: str) -> str:
+        if reason == "step":
+            return f"the given step is too long: {self.too_long}"
+        if reason == "unpredicted":
+            return f"the linear prediction is no number for {', '.join(self.unpredicted)}, so nothing can be compared"
+        if reason == "gains":
+            listed = ", ".join(f"{name} {one:.3g} promised, {_number(two)} as flown" for name, one, two in self.broken)
+            return (
+                f"the gains between the nodes do not do what the solution promises ({listed}): the mesh does not "
+                "resolve them, give more nodes where they are steep (grid=)"
+            )
         if reason == "unanswered":
             return f"in {_percent(self.unanswered)} of the runs the law once gave no finite control"
         if reason == "unstable":
@@ -143,9 +167,15 @@ def judge(sample: MonteCarlo) -> Verdict:
     names, n = sample.augmented, sample.size
     states = min(states, n - sum(b.size for b in sample.blocks if b.kind == "unknown"))
     predicted, errors = (np.sqrt(np.diagonal(v[-1]).clip(0.0)) for v in (sample.predicted, sample.predicted_error))
-    distance = np.abs(sample.deviations[:, :states]) > UNSTABLE * predicted[:states]
+    flown, intended = (np.sqrt(v.clip(0.0))[:states] for v in (np.diagonal(sample.design[-1]), sample.intended))
+    broken = ~(np.abs(flown - intended) <= AS_PROMISED * intended) & (intended > 0)
+    # Deviations are measured by what is promised; a prediction that is no number, or far too large, excuses none.
+    reference = np.where(broken, np.fmin(predicted[:states], intended), predicted[:states])
+    reference = np.where(np.isfinite(reference), reference, sample.domain[:states] / LEFT)
+    distance = ~(np.abs(sample.deviations[:, :states]) <= UNSTABLE * reference)
     answered = np.isinf(sample.unanswered)
-    unstable = ((distance & (predicted[:states] > 0)).any(axis=1) | ~stayed) & answered
+    unstable = ((distance & (reference > 0)).any(axis=1) | ~stayed) & answered
+    numbers = predicted if sample.fed_back else errors
     return Verdict(
         deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
         errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level)
@@ -159,6 +189,9 @@ def judge(sample: MonteCarlo) -> Verdict:
         limited=sample.limited,
         law=sample.filter == "law",
         unanswered=float(1.0 - answered.mean()),
+        too_long="" if sample.step.settled or not sample.step.given else sample.step.reason,
+        unpredicted=tuple(name for name, value in zip(names, numbers, strict=True) if not np.isfinite(value)),
+        broken=tuple((names[i], float(intended[i]), float(flown[i])) for i in np.flatnonzero(broken).tolist()),
     )
 
 
@@ -183,6 +216,10 @@ def _entries(names: tuple[str, ...], predicted: Array, values: Array, stayed: Ar
             )
         )
     return tuple(result)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "beyond all numbers"
 
 
 def _percent(share: float) -> str:

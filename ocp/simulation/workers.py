@@ -11,6 +11,7 @@ from covocp.errors import ProblemError, describe
 from covocp.simulation.batches import Batch, StoppedError, run_batch
 from covocp.simulation.flown import LawFailedError
 from covocp.simulation.plan import Plan
+from covocp.threads import TURN
 
 # Seconds between two looks at the interrupt while an executor works.
 PATIENCE = 0.2
@@ -56,7 +57,8 @@ def simulate_batches(
     """
     if executor is None:
         return _here(plan, ranges, stop, report)
-    return _elsewhere(plan, ranges, executor, stop, report)
+    with TURN.handed_over():  # the executor may work in threads, whose laws may call CasADi
+        return _elsewhere(plan, ranges, executor, stop, report)
 
 
 def _here(

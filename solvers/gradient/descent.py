@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from covocp.matrices import Array
 from covocp.mesh import Mesh
+from covocp.solvers.gradient.memory import Metric
 
 ACTIVE_SET_PASSES = 30
 # Share of the largest eigenvalue of I_kk (rows scaled to ones on the diagonal) below which a combination of the
@@ -87,12 +87,12 @@ def with_extra(metric: Any, extra: Array) -> Any:
 
 
 def solve_step(
-    metric: Any, slope: Array, rows: Array, target: Array, lower: Array, upper: Array, active: Array | None = None
+    metric: Metric, slope: Array, rows: Array, target: Array, lower: Array, upper: Array, active: Array | None = None
 ) -> Step:
     """Minimise slope' d + d' metric d / 2 subject to rows d = target and bounds.
 
     Args:
-        metric: sparse, positive definite, (n, n).
+        metric: positive definite, (n, n).
         slope: (n,).
         rows: (q, n).
         target: (q,).
@@ -116,7 +116,7 @@ def solve_step(
 
 
 def _equality_step(
-    metric: Any, slope: Array, rows: Array, target: Array, bounds: Array, state: Array
+    metric: Metric, slope: Array, rows: Array, target: Array, bounds: Array, state: Array
 ) -> tuple[Array, Array, Array]:
     """The step with the active entries at their bounds: change, l, I_kk."""
     free = np.flatnonzero(state == 0)
@@ -124,9 +124,8 @@ def _equality_step(
     if not free.size:
         return change, np.zeros(target.size), np.zeros((target.size, target.size))
     held = metric @ change
-    factor = splu(metric[free][:, free].tocsc())
     right = np.column_stack([-(slope + held)[free], rows[:, free].T])
-    solved = factor.solve(right)
+    solved = metric.inverse(free)(right)
     gram = rows[:, free] @ solved[:, 1:]
     ell = solve_gram(gram, rows[:, free] @ solved[:, 0] - (target - rows @ change))
     change[free] = solved[:, 0] - solved[:, 1:] @ ell
@@ -175,7 +174,7 @@ def positive_definite(blocks: Array, scale: Array, unit: float, smallest: float)
     return np.asarray(made / (scale[:, None] * scale))
 
 
-def solve_tangent(metric: Any, slope: Array, rows: Array, active: Array) -> Array:
+def solve_tangent(metric: Metric, slope: Array, rows: Array, active: Array) -> Array:
     """metric^-1 slope within the directions that change neither the conditions nor the active entries, (n,)."""
     zero = np.zeros(slope.size)
     return _equality_step(metric, -slope, rows, np.zeros(rows.shape[0]), zero, active)[0]

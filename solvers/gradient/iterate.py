@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from covocp.convergence import VANISHING, Residuals
 from covocp.extremal import Guess
-from covocp.guess import choose_scales, quadrature_weights
+from covocp.guess import choose_scales
 from covocp.influence import (
     Run,
     Slopes,
@@ -26,7 +27,9 @@ from covocp.influence import (
 from covocp.matrices import Array
 from covocp.nlp import Scales
 from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
+from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
+from covocp.steering import quadrature_weights
 from covocp.trajectory import Multipliers, Trajectory
 
 # Eigenvalues of H_uu, in units of the control scales, are not taken below this share of the largest.
@@ -36,6 +39,8 @@ DIFFERENCE = 1e-4
 SMALLEST_EXTRA = 1e-3
 # T changes by no more than these shares of itself in one step.
 SHORTEN, LENGTHEN = 0.3, 0.5
+# Controls below this share of their scale at the start are zero.
+ZERO = 1e-12
 CHORD_STEPS = 60
 CHORD_TOLERANCE = 1e-13
 
@@ -66,6 +71,11 @@ class Linear:
     sizes: Array
     slopes: Slopes
 
+    @property
+    def finite(self) -> bool:
+        """Whether all slopes are numbers."""
+        return bool(np.isfinite(self.slope).all() and np.isfinite(self.rows).all())
+
     def lagrangian(self, ell: Array) -> Array:
         """h_u + H_u' l."""
         return np.asarray(self.slope + self.rows.T @ ell)
@@ -85,6 +95,19 @@ class Measures:
     slope: float
     miss: float
     transversality: float
+
+    @staticmethod
+    def unknown(linear: Linear) -> Measures:
+        """Of a point whose slopes are no numbers."""
+        count, conditions = linear.slope.size, linear.rows.shape[0]
+        return Measures(
+            ell=np.zeros(conditions),
+            residual=np.zeros(count),
+            active=np.zeros(count, dtype=bool),
+            slope=np.inf,
+            miss=np.inf,
+            transversality=np.nan,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +211,11 @@ class Space:
         """Sum of the absolute terms of the cost."""
         return abs(iterate.run.running) + abs(iterate.run.terminal)
 
+    def slope_size(self, linear: Linear) -> float:
+        """Sum of the absolute changes of the cost by the control values, each in its unit."""
+        count = self.controls
+        return float(np.abs(linear.slope[:count] * self.unit[:count]).sum())
+
     def violation(self, iterate: Iterate) -> Array:
         """Largest relative violation of each group of inequalities."""
         return violation(iterate.penalty, self.weights)
@@ -223,8 +251,38 @@ class Space:
             residual=residual,
             active=active,
             slope=max(slope, float(extra)),
-            miss=float((np.abs(iterate.run.miss) / self.miss_scale).max(initial=0.0)),
+            miss=float((np.abs(iterate.run.miss) / self._miss_scale(iterate, linear)).max(initial=0.0)),
             transversality=float(residual[count]) if self.sweeps.statement.duration.free else 0.0,
+        )
+
+    def _miss_scale(self, iterate: Iterate, linear: Linear) -> Array:
+        """Magnitudes of the terminal conditions along the run, where they are below those of the start."""
+        along = np.abs(linear.slopes.columns[-1][:, 1:]).T @ np.abs(iterate.run.z).max(axis=0)
+        return np.where(along > 0, np.minimum(along, self.miss_scale), self.miss_scale)
+
+    def reached(self, iterate: Iterate, linear: Linear, measures: Measures) -> Residuals:
+        """What is left, by changes of the controls and the other unknowns by their own magnitudes at this point."""
+        run, st = iterate.run, self.sweeps.statement
+        trajectory = Trajectory(x=run.z[:, : st.nx], u=run.u, e=run.z[:, st.nx :], duration=run.duration)
+        at_controls = choose_scales(st, self.sweeps.mesh, trajectory, self.parameters).u
+        at_controls = np.maximum(at_controls, ZERO * self.unit[: st.nu])
+        unit = np.concatenate([np.tile(at_controls, run.u.shape[0]), self.unit[self.controls :]])
+        slope = float(np.abs(np.where(measures.active, 0.0, measures.residual)) @ unit)
+        missed, rest = float(np.abs(measures.ell) @ np.abs(run.miss)), 0.0
+        penalty = iterate.penalty
+        for multipliers, excess, room in zip(penalty.multipliers, penalty.excess, penalty.room, strict=True):
+            missed += float(np.sum(np.abs(multipliers * excess)))
+            rest += float(np.sum(np.abs(multipliers * room)))
+        columns = linear.slopes.columns
+        curvature = control_curvature(self.sweeps, run, run.u, columns, measures.ell, self.parameters)
+        weights = quadrature_weights(replace(self.sweeps.mesh, control="linear")) * run.duration
+        change = float(np.einsum("kij,i,j,k->", np.abs(curvature), at_controls, at_controls, weights)) if st.nu else 0.0
+        size = max(self.cost_size(iterate), VANISHING * change, float(np.finfo(float).tiny))
+        return Residuals(
+            slope=slope / size,
+            complementarity=rest / size,
+            infeasibility=missed / size,
+            violation=measures.miss,
         )
 
     def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Any) -> Any:
@@ -235,7 +293,10 @@ class Space:
         st, mesh = self.sweeps.statement, self.sweeps.mesh
         if isinstance(weight, str):
             blocks = control_curvature(self.sweeps, run, u, linear.slopes.columns, ell, self.parameters)
-            unit = max(abs(run.running) + abs(run.terminal), np.finfo(float).tiny) / run.duration
+            # where the cost is zero its slopes tell its unit; where they too are zero any metric will do
+            size = max(abs(run.running) + abs(run.terminal), SMALLEST_CURVATURE * self.slope_size(linear))
+            unit = (size if size > np.finfo(float).tiny / np.finfo(float).eps else 1.0) / run.duration
+            blocks = np.where(np.isfinite(blocks).all(axis=(1, 2), keepdims=True), blocks, 0.0)
             blocks = positive_definite(blocks, self.scales.u, unit, SMALLEST_CURVATURE)
         else:
             given = np.asarray(weight, dtype=float)
@@ -272,7 +333,8 @@ class Space:
     def probe(self, iterate: Iterate, linear: Linear, metric: Any, ell: Array) -> float:
         """Curvature of the Lagrangian along the step that the metric would take, in units of the metric."""
         lower, upper = self.room(iterate)
-        step = solve_step(metric, linear.slope, linear.rows, np.zeros(self.conditions), lower, upper)
+        still = np.zeros(self.conditions)
+        step = solve_step(learnt(metric, ()), linear.slope, linear.rows, still, lower, upper)
         size = (np.abs(step.change) / self.unit).max(initial=0.0)
         if size == 0:
             return 1.0
@@ -281,7 +343,8 @@ class Space:
         if not other.run.finite:
             return 1.0
         turned = self.linearise(other).lagrangian(step.ell) - linear.lagrangian(step.ell)
-        value = abs(float(turned @ change)) / float(change @ (metric @ change))
+        along, squared = abs(float(turned @ change)), float(change @ (metric @ change))
+        value = along / squared if squared > 0 else 1.0  # a step so small that its square is nothing
         return value if np.isfinite(value) and value > 0 else 1.0
 
     def chord(self, iterate: Iterate, linear: Linear, active: Array | None) -> Step:
@@ -295,7 +358,7 @@ class Space:
         step = None
         u = iterate.run.u
         for _ in range(CHORD_STEPS):
-            metric = self._metric(iterate.run, u, linear, ell, "curvature", iterate.penalty.curvature)
+            metric = learnt(self._metric(iterate.run, u, linear, ell, "curvature", iterate.penalty.curvature), ())
             slope = present.slope.copy()
             slope[self.controls :] = linear.slope[self.controls :] + self.extra * total[self.controls :]
             step = solve_step(metric, slope, present.rows, target, lower - total, upper - total, active)

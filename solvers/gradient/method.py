@@ -9,10 +9,9 @@ and the coefficient of dT is that of h, not of H (appendix D). The multiplier of
 
 Beyond the source:
 
-- W = w H_uu (made positive definite), with w from predicted against actual changes: raised fourfold where the cost and
-  the terminal conditions do not change as predicted (merit J + sum nu |dz|, largest of the last values), else the
-  curvature seen along the last step, J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 1988, in the form ABBmin of
-  G. Frassoldati, L. Zanni and G. Zanghirati, J. Ind. Manag. Optim. 4, 2008.
+- W = w H_uu (made positive definite), w the curvature seen along the last step, and the metric of the step learns from
+  the last steps what W does not say of the curvature (`memory`). Both are raised fourfold where the cost and the
+  terminal conditions do not change as predicted (merit J + sum nu |dz|, largest of the last values).
 - The step is taken in the space of the controls (piecewise linear or constant): the projection of the source's step.
 - Bounds on the controls and on T: projection of the step in the metric W. Inequalities: penalties (`penalty`).
 - Terminal conditions on matrices and equalities between final values have influence functions like those on x.
@@ -32,26 +31,41 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from covocp.arguments import checked, one_of, positive, share, whole
 from covocp.checks import as_number
-from covocp.errors import ProblemError, describe
+from covocp.errors import OutsideDomainError, ProblemError, describe, shown
 from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import controls_guess, stiffness
+from covocp.guess import controls_guess, resolve_mesh, stiffness
 from covocp.influence import build_sweeps
 from covocp.matrices import Array
-from covocp.mesh import Mesh, Options, choose_mesh, choose_step
+from covocp.mesh import Mesh, Options
+from covocp.nlp import check_costs
 from covocp.progress import Progress
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.iterate import Iterate, Measures, Space, make_space
+from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings, Variant
 from covocp.statement import Statement
 from covocp.trajectory import Trajectory
 
 LARGEST_PAIRS = 64
-# Steps per interval of the backward integration: h times the rate of the costates stays below this (limit 2.78).
-STIFFNESS_PER_PAIR = 1.0
+# Steps per interval of the backward integration: h times the rate of the costates stays below this. The method ends
+# where its own slopes vanish: on a graded mesh steps of 1 (limit 2.78) cost 1e-5, steps of 1/4 1e-8 of the cost.
+STIFFNESS_PER_PAIR = 0.25
+# Relative difference of two entries of a metric that count as equal.
+SYMMETRIC = 1e-9
 
 
+@checked(
+    "the method 'gradient'",
+    variant=one_of("gradient", "chord"),
+    weight_factor=positive,
+    fraction=share,
+    tolerance=positive,
+    violation_tolerance=positive,
+    max_iterations=whole(1),
+)
 def prepare(
     statement: Statement,
     options: Options,
@@ -73,11 +87,12 @@ def prepare(
       space and on the bounds, l the least-squares multiplier in this metric;
     - |dJ/dT| T and |dJ/dx_i(0)| s_i of a free duration and of free initial values <= tolerance (|k| + |int L dt|);
     - the violation of every inequality / its magnitude <= violation_tolerance, and |dz_j| / (magnitude of z_j) <= a
-      hundredth of it.
+      hundredth of it;
+    - what is left in the scale of the point that was reached holds, complementarity included (`covocp.convergence`).
 
     Args:
         statement: the problem.
-        options: mesh; `segments` and `covariances` mean nothing here.
+        options: mesh; `segments` and `covariances` mean nothing here, and inequalities are met at the nodes only.
         variant: "gradient", or "chord": solve H_u(x, E, p, P, u_c) = 0 along the present x, E, p, P and step towards
             u_c [4.2-10].
         weight: W: "adaptive" (w H_uu, w from predicted and actual changes), "curvature" (H_uu, fixed factor), or a
@@ -97,13 +112,13 @@ def prepare(
     for name in ("segments", "covariances"):
         if getattr(options, name) != "auto":
             raise _option_error(name, "nothing: it belongs to shooting", getattr(options, name))
-    _check_options(statement, variant, weight, weight_factor, fraction)
-    step = choose_step(statement, options)
-    nodes = options.nodes()
-    stiff = stiffness(statement, nodes, options.control, statement.values, matrices=step == "rk4")
-    mesh = choose_mesh(statement, options, stiff)
-    mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True)
-    stiff = stiffness(statement, nodes, options.control, statement.values, matrices=True)
+    if options.points not in ("auto", 1):
+        raise _option_error("points", "'auto' or 1: its penalties act at the nodes; 'ipopt' has more", options.points)
+    mesh = resolve_mesh(statement, options, statement.values)
+    _check_weight(weight, statement.nu, mesh.nodes.size)
+    mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
+    found = stiffness(statement, options, statement.values)
+    stiff = max(found.nominal, found.matrices)
     pairs = int(np.clip(np.ceil(stiff / STIFFNESS_PER_PAIR), mesh.substeps, max(LARGEST_PAIRS, mesh.substeps)))
     settings = Settings(
         variant=variant,
@@ -117,25 +132,27 @@ def prepare(
     return GradientSolver(statement, mesh, pairs, settings)
 
 
-def _check_options(statement: Statement, variant: Any, weight: Any, weight_factor: Any, fraction: Any) -> None:
-    """Refuse options that mean nothing."""
-    if variant not in ("gradient", "chord"):
-        raise _option_error("variant", "'gradient' or 'chord'", variant)
+def _check_weight(weight: Any, nu: int, nodes: int) -> None:
+    """Refuse a metric W that is none."""
     if isinstance(weight, str):
         if weight not in ("adaptive", "curvature"):
             raise _option_error("weight", "'adaptive', 'curvature', a number or an array", weight)
-    else:
-        values = as_number("weight", "option", weight)
-        nu = statement.nu
-        shapes = (values.shape in ((), (nu,), (nu, nu))) or (values.ndim == 3 and values.shape[1:] == (nu, nu))
-        if not shapes or not np.isfinite(values).all() or (values.ndim < 2 and (values <= 0).any()):
-            raise _option_error(
-                "weight", f"positive numbers of shape (), ({nu},), ({nu}, {nu}) or (N + 1, {nu}, {nu})", weight
-            )
-    if not weight_factor > 0:
-        raise _option_error("weight_factor", "a positive number", weight_factor)
-    if not 0 < fraction <= 1:
-        raise _option_error("fraction", "a number in (0, 1]", fraction)
+        return
+    values = as_number("weight", "option", weight)
+    shapes = values.shape in ((), (nu,), (nu, nu), (nodes, nu, nu))
+    if not shapes or not np.isfinite(values).all() or not _definite(values):
+        expected = (
+            f"positive numbers of shape () or ({nu},), positive definite ones ({nu}, {nu}) or ({nodes}, {nu}, {nu})"
+        )
+        raise _option_error("weight", expected, weight)
+
+
+def _definite(values: Array) -> bool:
+    """Whether numbers are positive, or matrices symmetric and positive definite."""
+    if values.ndim < 2:
+        return bool((values > 0).all())
+    symmetric = np.allclose(values, np.swapaxes(values, -1, -2), rtol=SYMMETRIC, atol=0.0)
+    return symmetric and bool((np.linalg.eigvalsh(values) > 0).all())
 
 
 def _option_error(name: str, expected: str, received: Any) -> ProblemError:
@@ -143,7 +160,7 @@ def _option_error(name: str, expected: str, received: Any) -> ProblemError:
         describe(
             f"The option '{name}' of the gradient method has an unknown value.",
             expected=expected,
-            received=repr(received)[:100],
+            received=shown(received),
             remedy=f"correct {name}=",
         )
     )
@@ -169,8 +186,10 @@ class GradientSolver:
         space = self.space(parameters, guess)
         built = time.perf_counter()
         current = space.first(guess)
+        if np.isfinite(current.run.z).all():
+            check_costs(self._trajectory(current), current.run.running, current.run.terminal)
         if not current.run.finite:
-            raise ProblemError(
+            raise OutsideDomainError(
                 describe(
                     "The trajectory of the first control is NaN or inf.",
                     expected="a first control along which the model stays in its domain",
@@ -206,17 +225,21 @@ class GradientSolver:
             self._groups = penalty_groups(self._statement, self._mesh, self._sweeps.terminal.rows)
         return make_space(self._sweeps, self._groups, parameters, guess)
 
+    def _trajectory(self, iterate: Iterate) -> Trajectory:
+        """The run of an iterate as data."""
+        run, nx = iterate.run, self._statement.nx
+        return Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
+
     def _outcome(
         self, space: Space, last: Iterate, measures: Measures, message: str, converged: bool, stats: dict[str, Any]
     ) -> Outcome:
         """The last iterate as data."""
-        run, nx = last.run, self._statement.nx
-        trajectory = Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
+        run = last.run
         return Outcome(
             extremal=Extremal(
                 statement=self._statement,
                 mesh=self._mesh,
-                trajectory=trajectory,
+                trajectory=self._trajectory(last),
                 parameters=space.parameters,
                 multipliers=space.multipliers(last, measures),
             ),
@@ -277,7 +300,7 @@ def one_iteration(
     n = space.controls
     inner = metric[:n][:, :n].tocsc()
     target = -fraction * current.run.miss
-    step = solve_step(metric, linear.slope, linear.rows, target, *space.room(current))
+    step = solve_step(learnt(metric, ()), linear.slope, linear.rows, target, *space.room(current))
     following = space.at(current.point + step.change)
     solved = splu(inner).solve(np.column_stack([linear.slope[:n], linear.rows[:, :n].T]))
     return Iteration(

@@ -39,7 +39,8 @@ class Group:
     """Rows of one kind: at which nodes they count, with which weights of the nodes.
 
     function: (z, u, s, T, p, weights, shifts) -> penalty, its slopes by z, u and T, multipliers, violations,
-    second slopes by u (Gauss and Newton's part), sizes of the slopes by z and u in the given scales.
+    second slopes by u (Gauss and Newton's part), distances from the bound that has a multiplier, sizes of the slopes by
+    z and u in the given scales.
     """
 
     kind: str
@@ -59,6 +60,7 @@ class Penalty:
     duration: float
     multipliers: tuple[Array, ...]
     excess: tuple[Array, ...]
+    room: tuple[Array, ...]
     curvature: Array
 
 
@@ -143,6 +145,14 @@ def _group(
         under = [lower[i] - rows[i] if np.isfinite(lower[i]) else -1.0 for i in range(count)]
         return ca.vertcat(*(ca.fmax(o, 0) - ca.fmax(b, 0) for o, b in zip(over, under, strict=True)))
 
+    def room(rows: Any, multipliers: Any) -> Any:
+        left = []
+        for i in range(count):
+            above = ca.fmax(upper[i] - rows[i], 0) if np.isfinite(upper[i]) else 0.0
+            below = ca.fmax(rows[i] - lower[i], 0) if np.isfinite(lower[i]) else 0.0
+            left.append(ca.if_else(multipliers[i] > 0, above, ca.if_else(multipliers[i] < 0, below, 0.0)))
+        return ca.vertcat(*left)
+
     shifted = excess(value + shifts)
     penalty = ca.dot(weights, shifted**2)
     by_control = ca.jacobian(value, u)
@@ -155,6 +165,7 @@ def _group(
         2 * weights * shifted,
         excess(value),
         by_control.T @ (ca.repmat(active, 1, nu) * by_control),
+        room(value, shifted),
         ca.fabs(ca.jacobian(value, z)),
         ca.fabs(by_control),
     ]
@@ -200,7 +211,7 @@ def evaluate_penalty(groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters
     nodes, nu = mesh.intervals + 1, run.u.shape[1]
     value, by_duration = 0.0, 0.0
     jumps, control, curvature = np.zeros_like(run.z), np.zeros((nodes, nu)), np.zeros((nodes, nu, nu))
-    multipliers, excess = [], []
+    multipliers, excess, room = [], [], []
     for group, d, shift in zip(groups, weights.weights, weights.shifts, strict=True):
         outputs = _evaluate(group, mesh, run, parameters, d, shift)
         value += float(outputs[0].sum())
@@ -209,6 +220,7 @@ def evaluate_penalty(groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters
         by_duration += float(outputs[3].sum())
         multipliers.append(outputs[4].T)
         excess.append(outputs[5].T)
+        room.append(outputs[7].T)
         curvature[group.nodes] += outputs[6].reshape(nu, group.nodes.size, nu).transpose(1, 0, 2)
     return Penalty(
         value=value,
@@ -217,16 +229,23 @@ def evaluate_penalty(groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters
         duration=by_duration,
         multipliers=tuple(multipliers),
         excess=tuple(excess),
+        room=tuple(room),
         curvature=curvature,
     )
 
 
 def violation(penalty: Penalty, weights: Weights) -> Array:
-    """Largest violation of each group, in units of the magnitudes of the rows."""
+    """Largest violation of each group, of the bound or of complementarity, in units of the magnitudes of the rows.
+
+    The multiplier m' = 2 d (what c + m/(2d) exceeds) is right where m'/(2d) - m/(2d) = 0: c is on its bound, or it is
+    inside and m = 0.
+    """
     return np.array(
         [
-            float((np.abs(excess) / scale).max(initial=0.0))
-            for excess, scale in zip(penalty.excess, weights.scales, strict=True)
+            float((np.abs(np.where(d > 0, m / (2 * np.where(d > 0, d, 1.0)) - shift, excess)) / scale).max(initial=0.0))
+            for m, d, shift, excess, scale in zip(
+                penalty.multipliers, weights.weights, weights.shifts, penalty.excess, weights.scales, strict=True
+            )
         ]
     )
 

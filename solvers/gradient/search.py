@@ -11,13 +11,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from covocp.convergence import LIMIT, Residuals
 from covocp.errors import ProblemError, describe
 from covocp.matrices import Array
 from covocp.progress import Progress
-from covocp.solvers.gradient.descent import Step, solve_step, solve_tangent, unreachable
+from covocp.solvers.gradient.descent import Step, solve_gram, solve_step, solve_tangent, unreachable
 from covocp.solvers.gradient.iterate import Iterate, Linear, Measures, Space
+from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
 from covocp.solvers.gradient.penalty import next_weights
 
+# On the slopes, unless the user gives another.
+TOLERANCE = 1e-6
 Variant = Literal["gradient", "chord"]
 # The share of the predicted decrease that must come true (Armijo), the number of past values that count as the largest.
 SUFFICIENT = 1e-4
@@ -27,8 +31,8 @@ TRIALS = 15
 # Changes of the cost below this share of it are lost in the integration errors: there the merit is not asked.
 COST_ACCURACY = 1e-7
 SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-4, 1e8
-# ABBmin: the larger curvature is taken where the ratio of the two is below this.
-CURVATURE_RATIO, CURVATURE_MEMORY = 0.8, 5
+# Past steps whose change of slope the metric remembers.
+PAIRS = 20
 # The multiplier's weight in the merit.
 MERIT_FACTOR = 2.0
 # What the bounds may leave of the change of the miss that a step owes: a share of the miss, or this in its scale.
@@ -43,6 +47,7 @@ RAISE_WEIGHT = "raise the weight, or weight_factor"
 # A fixed W that is too small lets the cost grow; above this multiple of the first cost there is no way back.
 DIVERGED = 1e8
 FIRST_PASS_TOLERANCE = 1e-2
+INFINITE_SLOPES = "the slopes are NaN or inf where the cost is not: bound what the model cannot be differentiated at"
 PASS_FACTOR = 0.1
 
 
@@ -66,12 +71,13 @@ class Settings:
 
 @dataclass(kw_only=True)
 class _Control:
-    """What the step control remembers: w, d, curvatures, merit weights, past values of cost and miss."""
+    """What the step control remembers: w, its increase, d, past steps, merit weights, past costs and misses."""
 
     weight: float
     fraction: float
     merit: Array
-    curvatures: list[float] = field(default_factory=list)
+    raised: float = 1.0
+    pairs: list[Pair] = field(default_factory=list)
     past: list[tuple[float, Array]] = field(default_factory=list)
     iterations: int = 0
     nearest: tuple[float, int] = (np.inf, 0)
@@ -85,19 +91,22 @@ class Search:
         self.space, self.settings, self.progress = space, settings, progress
         self.control = _Control(weight=1.0, fraction=settings.fraction, merit=np.zeros(space.conditions))
         self.passes = 0
+        self.reached: Residuals | None = None
 
     def run(self, current: Iterate) -> tuple[Iterate, Measures, str, bool]:
         """All passes; returns the last iterate, its measures, how it ended, whether it converged."""
         space, settings = self.space, self.settings
         tolerance = settings.tolerance if not space.groups else max(settings.tolerance, FIRST_PASS_TOLERANCE)
         before = np.full(len(space.groups), np.inf)
+        limit = LIMIT * max(1.0, settings.tolerance / TOLERANCE)
         while True:
             current, measures, message, done = self._pass(current, tolerance)
             self.passes += 1
             worst = space.violation(current)
             if not done or not space.groups:
                 return current, measures, message, done
-            if worst.max(initial=0.0) <= settings.violation_tolerance and tolerance <= settings.tolerance:
+            tight = tolerance <= settings.tolerance and worst.max(initial=0.0) <= settings.violation_tolerance
+            if tight and self.reached is not None and self.reached.hold(limit):
                 return current, measures, message, True
             if self.passes >= LARGEST_PASSES:
                 return current, measures, "the penalties do not remove the violations: they may contradict", False
@@ -107,11 +116,14 @@ class Search:
             before = worst
             current = space.at(current.point)
             self.control.past.clear()
+            self.control.pairs.clear()
 
     def _pass(self, current: Iterate, tolerance: float) -> tuple[Iterate, Measures, str, bool]:
         """Gradient steps for the present penalties."""
         space, settings, control = self.space, self.settings, self.control
         linear = space.linearise(current)
+        if not linear.finite:
+            return current, Measures.unknown(linear), INFINITE_SLOPES, False
         measures = space.measure(current, linear)
         ell = measures.ell
         self._check_reachable(current, linear)
@@ -122,23 +134,37 @@ class Search:
         active: Array | None = None
         while True:
             self._record(current, measures)
-            if measures.slope <= tolerance and measures.miss <= TERMINAL_SHARE * settings.violation_tolerance:
+            if self._arrived(current, linear, measures, tolerance):
                 return current, measures, "solved", True
             if self.progress.stop:
                 return current, measures, "interrupted by the user", False
             message = self._hopeless(measures)
             if message:
                 return current, measures, message, False
-            metric = space.metric(current, linear, ell, settings.weight)
+            base = space.metric(current, linear, ell, settings.weight)
+            metric = learnt(control.weight * base, control.pairs)
             trial = self._try(current, linear, metric, ell, active)
             if isinstance(trial, str):
                 return current, measures, trial, False
             following, step = trial
             after = space.linearise(following)
-            self._learn(following.point - current.point, linear, after, step, metric)
+            if not after.finite:
+                return current, measures, INFINITE_SLOPES, False
+            self._learn(following.point - current.point, linear, after, step, metric, base)
             current, linear, ell, active = following, after, step.ell, step.active
             measures = space.measure(current, linear)
             control.iterations += 1
+
+    def _arrived(self, current: Iterate, linear: Linear, measures: Measures, tolerance: float) -> bool:
+        """The stop test of a pass: in the scales of the start, and in those of the point that was reached.
+
+        What inequalities still leave is for the passes.
+        """
+        if measures.slope > tolerance or measures.miss > TERMINAL_SHARE * self.settings.violation_tolerance:
+            return False
+        self.reached = self.space.reached(current, linear, measures)
+        left = replace(self.reached, complementarity=0.0, infeasibility=0.0) if self.space.groups else self.reached
+        return left.hold(LIMIT * max(1.0, tolerance / TOLERANCE))
 
     def _hopeless(self, measures: Measures) -> str:
         """Why to give up, if so."""
@@ -187,7 +213,7 @@ class Search:
         control.weight = float(np.clip(settings.weight_factor * value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
 
     def _try(
-        self, current: Iterate, linear: Linear, metric: Any, ell: Array, active: Array | None
+        self, current: Iterate, linear: Linear, metric: Metric, ell: Array, active: Array | None
     ) -> tuple[Iterate, Step] | str:
         """A step that changes cost and miss about as predicted; raises w and lowers d until there is one."""
         space, control, miss = self.space, self.control, current.run.miss
@@ -218,10 +244,10 @@ class Search:
                     control.fraction /= 2
             else:
                 control.fraction /= 2
-            control.weight = min(RAISE * control.weight, LARGEST_WEIGHT)
+            control.raised = min(RAISE * control.raised, LARGEST_WEIGHT)
         return "no step lowers the cost as predicted: the slopes may be wrong at this mesh; use more intervals"
 
-    def _reaching_step(self, current: Iterate, linear: Linear, metric: Any, active: Array | None) -> Step:
+    def _reaching_step(self, current: Iterate, linear: Linear, metric: Metric, active: Array | None) -> Step:
         """A step that the bounds leave most of what it owes the terminal conditions, with w raised as needed.
 
         Where the cost pulls the controls and T onto their bounds nothing is left for the conditions, and the merit
@@ -232,13 +258,13 @@ class Search:
         step = self._step(current, linear, metric, active)
         if not settings.adaptive or settings.variant == "chord":
             return step
-        first, weight = step, control.weight
+        first, raised = step, control.raised
         for _ in range(REACHING_TRIALS):
             if self._reaches(current, linear, step):
                 return step
-            control.weight = min(REACHING_RAISE * control.weight, LARGEST_WEIGHT)
+            control.raised = min(REACHING_RAISE * control.raised, LARGEST_WEIGHT)
             step = self._step(current, linear, metric, active)
-        control.weight = weight
+        control.raised = raised
         return first
 
     def _reaches(self, current: Iterate, linear: Linear, step: Step) -> bool:
@@ -247,36 +273,42 @@ class Search:
         left = np.abs(linear.rows @ step.change + self.control.fraction * miss) / scale
         return not left.size or bool(left.max() <= max(UNREACHED * (np.abs(miss) / scale).max(), UNREACHED_ANYWAY))
 
-    def _step(self, current: Iterate, linear: Linear, metric: Any, active: Array | None) -> Step:
+    def _step(self, current: Iterate, linear: Linear, metric: Metric, active: Array | None) -> Step:
         """Steps 5 and 6 of 4.2, or the chord step."""
         control, space = self.control, self.space
         lower, upper = space.room(current)
         if self.settings.variant == "chord":
-            share = min(1.0, 1.0 / control.weight)
+            share = min(1.0, 1.0 / (control.weight * control.raised))
             step = space.chord(current, linear, active)
             return replace(step, change=share * step.change)
         target = -control.fraction * current.run.miss
-        return solve_step(control.weight * metric, linear.slope, linear.rows, target, lower, upper, active)
+        return solve_step(control.raised * metric, linear.slope, linear.rows, target, lower, upper, active)
 
-    def _learn(self, change: Array, before: Linear, after: Linear, step: Step, metric: Any) -> None:
-        """w for the next step: the curvature of the Lagrangian seen along this one, in units of the metric."""
+    def _learn(self, change: Array, before: Linear, after: Linear, step: Step, metric: Metric, base: Any) -> None:
+        """The curvature of the Lagrangian seen along this step: for w, and remembered with the step.
+
+        Only what keeps the terminal conditions is remembered: across them, an unstable plant is stiffer by the square
+        of its growth, and the conditions say where to go.
+        """
         control = self.control
         if not self.settings.adaptive:
             return
+        plain = learnt(base, ())
+        turned = after.lagrangian(step.ell) - before.lagrangian(step.ell)
+        solved = plain.inverse(np.arange(change.size))(np.column_stack([turned, after.rows.T]))
+        gram = after.rows @ solved[:, 1:]
+        change = change - solved[:, 1:] @ solve_gram(gram, after.rows @ change)
+        turned = turned - after.rows.T @ solve_gram(gram, after.rows @ solved[:, 0])
         free = step.active == 0
-        moved = np.where(free, change, 0.0)
-        turned = np.where(free, after.lagrangian(step.ell) - before.lagrangian(step.ell), 0.0)
-        along, size = float(moved @ turned), float(moved @ (metric @ moved))
+        moved, seen = np.where(free, change, 0.0), np.where(free, turned, 0.0)
+        along, size = float(moved @ seen), float(moved @ (base @ moved))
         if size <= 0 or not np.isfinite(along):
             return
-        if along <= 0:  # concave along the step: longer steps
-            control.weight = max(control.weight / RAISE, SMALLEST_WEIGHT)
-            return
-        tangent = solve_tangent(metric, turned, after.rows, step.active)
-        smaller, larger = along / size, max(float(turned @ tangent) / along, along / size)
-        control.curvatures = [*control.curvatures[1 - CURVATURE_MEMORY :], larger]
-        value = max(control.curvatures) if smaller < CURVATURE_RATIO * larger else smaller
-        control.weight = float(np.clip(value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
+        control.raised = max(1.0, control.raised / RAISE)
+        if along > 0:
+            value = max(float(seen @ solve_tangent(plain, seen, after.rows, step.active)) / along, along / size)
+            control.weight = float(np.clip(value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
+        control.pairs = [*control.pairs[1 - PAIRS :], (change, damped(change, turned, metric @ change))]
 
     def _record(self, current: Iterate, measures: Measures) -> None:
         worst = float(self.space.violation(current).max(initial=0.0))
@@ -288,7 +320,7 @@ class Search:
                 "miss": measures.miss,
                 "transversality": measures.transversality,
                 "violation": worst,
-                "weight": self.control.weight,
+                "weight": self.control.weight * self.control.raised,
                 "fraction": self.control.fraction,
             }
         )

@@ -14,7 +14,7 @@ from exports import FOLDER
 
 import covocp as co
 from covocp.export import export_c
-from covocp.integrators import COMPILED_SOLVER, linear_solve
+from covocp.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.models import (
     brachistochrone,
     bryson_denham,

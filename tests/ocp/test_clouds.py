@@ -7,7 +7,7 @@ from loops import steered
 from matplotlib.figure import Figure
 
 from covocp.errors import ProblemError
-from covocp.simulation.clouds import PREDICTED, SAMPLE, plot_monte_carlo
+from covocp.simulation.clouds import ERROR, PREDICTED, SAMPLE, plot_monte_carlo
 from covocp.simulation.runs import simulate
 
 
@@ -23,7 +23,7 @@ def lines(axes, colour):
 def test_a_panel_for_what_moves_and_a_cloud_for_every_pair(sample):
     figure = sample.plot()
     assert isinstance(figure, Figure)
-    assert list(panels(figure)) == ["deviation of x", "deviation of u", "deviation of b at T"]
+    assert list(panels(figure)) == ["deviation of x", "deviation of u", "deviation of b", "deviation of b at T"]
     assert figure.get_suptitle().startswith(sample.name)
 
 
@@ -35,7 +35,8 @@ def test_bands_are_the_numbers(sample):
     mean, low, high = (line.get_ydata() for line in lines(axes, SAMPLE))
     np.testing.assert_allclose(mean, sample.bias("x"))
     np.testing.assert_allclose((high - low) / 2, sample.deviation("x", about="mean"))
-    assert len(axes.lines) == 5 + 5  # runs
+    assert len(lines(axes, ERROR)) == 4
+    assert len(axes.lines) == 5 + 5 + 4 + 1  # runs, errors of the estimate, the nominal
 
 
 def test_ellipses_are_those_of_the_covariances(sample):

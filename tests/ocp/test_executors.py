@@ -14,7 +14,19 @@ from covocp.errors import CovocpWarning, ProblemError, SolveError
 from covocp.simulation.runs import simulate
 
 RUNS, BATCH = 300, 64
-ARRAYS = ("deviations", "estimates", "costs", "left", "asked", "outside", "asking", "paths", "numbers")
+ARRAYS = (
+    "deviations",
+    "estimates",
+    "costs",
+    "left",
+    "asked",
+    "violated",
+    "at_end",
+    "violating",
+    "asking",
+    "paths",
+    "numbers",
+)
 MOMENTS = ("count", "mean", "product", "cube", "fourth")
 
 

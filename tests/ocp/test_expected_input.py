@@ -98,7 +98,7 @@ def test_terminal_condition_without_weight():
     d = Declared()
     refused(lambda: d.expect(terminal_weight={d.b: 1.0}), "'x'", "terminal_weight")
     ocp = co.Problem(duration=1.0)
-    x, u = ocp.state("x", 2, initial=0.0, final=[np.nan, 1.0], variance=1.0), ocp.control("u")
+    x, u = ocp.state("x", 2, initial=0.0, final=[None, 1.0], variance=1.0), ocp.control("u")
     ocp.dynamics(x, ca.vertcat(x[1], u))
     ocp.minimize_expected(running=u**2, terminal=x[0] ** 2)
     refused(ocp.statement, "'x'", "terminal_weight")

@@ -211,6 +211,7 @@ def test_condition_on_a_terminal_variance(covariances):
     assert found.optimality.costate_difference < 1e-4
 
 
+@pytest.mark.filterwarnings("ignore:'condition' contains E")
 def test_condition_on_a_variance_along_the_path():
     """Matrices become states by themselves; the multipliers add up to the slope of the cost by the limit."""
     free = solve(steered(variance=0.2), intervals=30)

@@ -279,7 +279,7 @@ def test_order_of_the_nominal_and_its_cost():
     exact = solve_ivp(rate, (0, 3), [1.0, 0.0, 0.0], **TIGHT).y[:, -1]
     counts, errors = [10, 20, 40, 80], []
     for n in counts:
-        interval = nominal_interval(statement, 1).mapaccum("run", n)
+        interval = nominal_interval(statement, 1, "rk4").mapaccum("run", n)
         columns = common_columns(mesh_of(n, "rk4"), ca.DM(np.linspace(0.5, -0.5, n + 1)).T, 3.0, ca.DM(0, 1))
         ends, _, cost = interval([1.0, 0.0], *columns)
         found = np.append(np.asarray(ends.full())[:, -1], np.sum(cost.full()))

@@ -111,7 +111,7 @@ def test_first_order_change_is_the_slope_along_the_direction(problem, nominal):
 def pendulum():
     """Its terminal condition is not linear in the control."""
     ocp = co.Problem(2.0, name="pendulum")
-    x = ocp.state("x", 2, initial=[0.0, 0.0], final=[2.5, np.nan], variance=0.1)
+    x = ocp.state("x", 2, initial=[0.0, 0.0], final=[2.5, None], variance=0.1)
     k = ocp.unknown("k", mean=2.0, variance=1.0)
     u = ocp.control("u")
     ocp.dynamics(x, ca.vertcat(x[1], -k * ca.sin(x[0]) + u), noise=[0.0, 0.2])

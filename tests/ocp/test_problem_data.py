@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+import pytest
 from problems import solve
-from refusals import empty, lag, simple, wrong
+from refusals import empty, lag, refused, simple, wrong
 
 import covocp as co
 
@@ -324,9 +325,11 @@ def test_covariance_rate_that_is_inf():
     solve(ocp)
 
 
-@wrong("cost 'terminal'", "inf at the initial guess")
-def test_cost_that_is_inf():
-    solve(simple(terminal=lambda x: 1 / x)[0])
+@pytest.mark.parametrize("method", ["ipopt", "gradient"])
+def test_cost_that_is_no_number_at_the_end_of_the_guess(method):
+    problem = simple(terminal=lambda x: ca.sqrt(-1 - x**2))[0]
+    refused(lambda: solve(problem, method=method), "cost 'terminal'", "nan at the end of the initial guess")
+    refused(lambda: co.evaluate(problem, nominal={"u": 1.0}), "cost 'terminal'", "nan at the end")
 
 
 @wrong("constraint 'above'", "inf at the initial guess")

@@ -297,7 +297,7 @@ def test_free_initial_state():
 def test_vectors_partly_free():
     """Two independent copies of it, one with its start fixed instead of its end: x = cosh(1 - t)/cosh(1)."""
     ocp = co.Problem(duration=1.0)
-    x, u = ocp.state("x", 2, initial=[np.nan, 1.0], final=[1.0, np.nan]), ocp.control("u", 2)
+    x, u = ocp.state("x", 2, initial=[None, 1.0], final=[1.0, None]), ocp.control("u", 2)
     ocp.dynamics(x, u)
     ocp.minimize(running=0.5 * ca.sumsqr(u) + 0.5 * ca.sumsqr(x))
     solution = solve(ocp)

@@ -2,16 +2,12 @@
 
 import numpy as np
 import pytest
-from loops import GRADED, linear_quadratic, open_loop, steered
+from loops import GRADED, linear_quadratic, open_loop, setting_of, steered
 from scipy import special, stats
 
 import covocp as co
 from covocp.errors import CovocpWarning, ProblemError
-from covocp.simulation.actual import design_system
-from covocp.simulation.batches import run_batch
-from covocp.simulation.plan import make_plan
 from covocp.simulation.prediction import predict
-from covocp.simulation.run_step import Limits, Setting
 from covocp.simulation.runs import simulate
 from covocp.simulation.sampling import THREE_SIGMA
 from covocp.simulation.schedule import base_grid
@@ -163,7 +159,7 @@ def test_linear_gains_do_not_hold_unstable_plants(variance, predicted, beyond):
 
 
 def test_nothing_is_said_where_every_run_leaves(lag, monkeypatch):
-    monkeypatch.setattr("covocp.simulation.runs.DOMAIN", 1e-6)
+    monkeypatch.setattr("covocp.simulation.runs.LEFT", 1e-6)
     sample = simulate(lag, 64, 1, step=0.5, store=5, **OPTIONS)
     assert sample.left_share == 1.0
     assert sample.share_beyond("x", 1e9) == 1.0
@@ -211,32 +207,12 @@ def test_without_feedback_the_covariance_of_the_estimate_is_validated():
 # --- the step -------------------------------------------------------------------------------------------------------
 
 
-def setting_of(solution):
-    """What `simulate` makes of a solution, without limits."""
-    design = design_system(solution)
-    free, domain = np.full(design.fed_back, np.inf), np.full(design.size, 1e300)
-    limits = Limits(lower=-free, upper=free, least=-free, most=free)
-    return Setting(solution=solution, design=design, actual=design, filter="perturbation", limits=limits, domain=domain)
-
-
-def test_additive_noise_has_moments_of_second_order(oscillator):
-    # The same paths with steps h, h/2 and h/4: the change of the second moments falls by four.
-    setting, base = setting_of(oscillator), base_grid(oscillator, 2)
-
-    def moment(parts, pairs):
-        plan = make_plan(setting, base.divided(parts), base.t[[0, -1]], seed=4, pilot=True, pairs=pairs)
-        return np.mean(run_batch(plan, 0, 4096).deviation ** 2, axis=0)
-
-    changes = [np.abs(moment(k, True) - moment(2 * k, False)) for k in (1, 2)]
-    assert (changes[1] < 0.4 * changes[0]).all()
-
-
 def test_a_coarse_start_is_refined_and_says_so(lag, oscillations):
     assert oscillations.step.change <= 0.2
     assert "sampling error" in oscillations.step.reason
     # More runs have a smaller sampling error, and need a smaller step.
     setting, base = setting_of(lag), base_grid(lag, 2)
-    rates = predict(lag, setting.design, setting.design, base).rates
+    rates = predict(lag, setting.design, setting.design, base).step_rates
     few, many = (choose_step(setting, base, rates, runs=runs, seed=1, stop=lambda: False) for runs in (100, 100_000))
     assert few.settled
     assert many.settled

@@ -42,7 +42,10 @@ def test_linear_theory_fails_for_the_bang_bang_design_and_says_why():
     assert "no classical design to compare with" in str(solution)  # without noise the cost depends on nothing
     sample = simulate(solution, RUNS, 1, step=0.5, store=62, progress=False)
     found = ratios(sample)
-    np.testing.assert_allclose(found, (1.010, 1.648, 0.954, 1.137), rtol=ERROR)
+    # These runs have heavy tails: each ratio is as uncertain as the sample's own band says, in both programs.
+    error = np.sqrt(2) * np.array([(e.high - e.low) / (2 * e.sample) for e in sample.verdict.deviations[:4]])
+    assert (error < 0.13).all()
+    assert (np.abs(found / (1.010, 1.648, 0.954, 1.137) - 1) < error).all()
     assert not sample.verdict.holds
     assert "theta" in sample.verdict.outside
     assert sample.verdict.reasons == ("saturated",)

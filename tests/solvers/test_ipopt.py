@@ -268,21 +268,27 @@ INTERRUPTED = """
     ocp.measurement("m", x, noise=1.0)
     E = ocp.estimation_covariance()
     ocp.minimize(0.5 * u**2, 10 * E[b, b])
-    solution = co.solve(ocp)
-    print(solution.converged, solution.status)
+    for attempt in range(3):
+        try:
+            co.solve(ocp, allow_failure=True)
+        except Exception as error:
+            print("swallowed", error)
+        except co.Interrupted as error:
+            solution = error.solution
+            break
+    print(attempt, solution.converged, solution.status)
     print(solution.stats["iterations"], np.isfinite(solution["E"]).all(), solution.t.size)
 """
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-def test_interrupt_returns_the_last_iterate():
-    """It is what was asked for, so no error; but it warns and does not look like a solution."""
+def test_interrupt_ends_a_loop_of_solves_and_carries_the_last_iterate():
+    """No `except Exception` swallows the KeyboardInterrupt, and what it carries does not look like a solution."""
     command = [sys.executable, "-c", textwrap.dedent(INTERRUPTED), "4"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 0, run.stderr
-    assert "CovocpWarning: Interrupted" in run.stderr
     first, second = run.stdout.strip().splitlines()
-    assert first == "False NOT CONVERGED: interrupted by the user"
+    assert first == "0 False NOT CONVERGED: interrupted by the user"
     iterations, finite, size = second.split()
     assert 4 <= int(iterations) <= 6
     assert (finite, size) == ("True", "101")

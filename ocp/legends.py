@@ -1,0 +1,64 @@
+"""Legends and titles of figures that are never cut: as many columns as fit, and the height that they need."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
+
+# Inches of a figure that are kept for title and legend when its size is chosen: one line of each.
+LINE = 0.3
+LETTERS = 11.5  # of a title, an inch
+LEAST_LETTERS = 12
+EDGE = 0.97  # share of the width that a legend may take
+
+
+def place_legend(figure: Figure, handles: list[Any]) -> None:
+    """A legend below all panels, in as many columns as fit into the width; long labels are folded.
+
+    Constrained layout takes its height from the panels, so the figure grows by what a line of it does not hold.
+    """
+    if not handles:
+        return
+    for columns in range(len(handles), 0, -1):
+        legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+        if _size(figure, legend)[0] <= EDGE * figure.get_figwidth():
+            break
+        legend.remove()
+    else:
+        legend = _folded(figure, handles)
+    height = _size(figure, legend)[1]
+    if height > LINE:
+        figure.set_figheight(figure.get_figheight() + height - LINE)
+
+
+def _folded(figure: Figure, handles: list[Any]) -> Legend:
+    """A legend of one column with its labels on several lines."""
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    for letters in range(longest, LEAST_LETTERS - 1, -1):
+        labels = [textwrap.fill(str(handle.get_label()), letters) for handle in handles]
+        legend = figure.legend(handles=handles, labels=labels, loc="outside lower center", ncols=1)
+        if _size(figure, legend)[0] <= EDGE * figure.get_figwidth() or letters == LEAST_LETTERS:
+            return legend
+        legend.remove()
+    return figure.legend(handles=handles, loc="outside lower center", ncols=1)
+
+
+def _size(figure: Figure, legend: Legend) -> tuple[float, float]:
+    """Width and height of a legend in inches."""
+    canvas: Any = figure.canvas
+    renderer = canvas.get_renderer() if hasattr(canvas, "get_renderer") else None
+    box = legend.get_window_extent(renderer)
+    return box.width / figure.dpi, box.height / figure.dpi
+
+
+def fold_title(figure: Figure, lines: list[str]) -> str:
+    """Lines of a title, folded where they are longer than the figure is wide; it grows by the lines that are added."""
+    letters = max(LEAST_LETTERS, int(LETTERS * figure.get_figwidth()))
+    folded = [textwrap.fill(line, letters) for line in lines]
+    more = sum(text.count("\n") for text in folded)
+    figure.set_figheight(figure.get_figheight() + more * LINE / 2)
+    return "\n".join(folded)

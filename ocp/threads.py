@@ -1,0 +1,117 @@
+"""One thread at a time: CasADi's solvers and its linear algebra hold memory of their own and end the process otherwise.
+
+MUMPS inside Ipopt has static data, CasADi's OpenBLAS waits for ever when several threads call it, and a CasADi function
+that two threads share may write where the other reads. So whatever covocp offers that calls CasADi takes its turn:
+several threads may use the same problem, solver or solution and get the same numbers as one after the other. Processes
+run in parallel.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from types import FunctionType
+from typing import Any, Generic, ParamSpec, Self, TypeVar, overload
+
+P = ParamSpec("P")
+R = TypeVar("R")
+C = TypeVar("C", bound=type)
+
+
+class _Turn:
+    """A lock that a thread may take again while it has it, and can hand over while it waits for other threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._held = threading.local()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self._held.depth = self._depth + 1
+
+    def __exit__(self, *_: object) -> None:
+        self._held.depth = self._depth - 1
+        self._lock.release()
+
+    @property
+    def _depth(self) -> int:
+        return int(getattr(self._held, "depth", 0))
+
+    @contextmanager
+    def handed_over(self) -> Iterator[None]:
+        """Let other threads have their turn meanwhile."""
+        depth = self._depth
+        for _ in range(depth):
+            self.__exit__()
+        try:
+            yield
+        finally:
+            for _ in range(depth):
+                self.__enter__()
+
+    def after_fork(self) -> None:
+        """A new process has one thread: what other threads held in the old one is free here."""
+        depth = self._depth
+        self._lock, self._held = threading.RLock(), threading.local()
+        for _ in range(depth):
+            self.__enter__()
+
+
+TURN = _Turn()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=TURN.after_fork)
+
+
+def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which waits for its turn."""
+
+    @wraps(function)
+    def in_turn(*args: P.args, **kwargs: P.kwargs) -> R:
+        with TURN:
+            return function(*args, **kwargs)
+
+    return in_turn
+
+
+def methods_one_at_a_time(cls: C) -> C:
+    """The class with methods and properties that wait for their turn (printing included, other special ones not)."""
+    for name, value in list(vars(cls).items()):
+        if name.startswith("_") and name not in ("__init__", "__getitem__", "__str__", "__repr__"):
+            continue
+        if isinstance(value, FunctionType):
+            setattr(cls, name, one_at_a_time(value))
+        elif isinstance(value, property) and value.fget is not None:
+            setattr(cls, name, property(one_at_a_time(value.fget), doc=value.__doc__))
+    return cls
+
+
+class cached(Generic[R]):  # noqa: N801 - a decorator, named like functools.cached_property
+    """A property that is computed when it is first asked for, by one thread, and kept.
+
+    functools.cached_property would do, but up to Python 3.11 it has a lock of its own: two locks that two threads take
+    in different orders hold both of them for ever.
+    """
+
+    def __init__(self, function: Callable[[Any], R]) -> None:
+        """Keep the function; its name is that of the attribute."""
+        self._function = function
+        self._name = function.__name__
+        self.__doc__ = function.__doc__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, instance: object, owner: type) -> R: ...
+    def __get__(self, instance: object | None, owner: type) -> Self | R:
+        """The value; Python finds it in the instance from the second time on."""
+        if instance is None:
+            return self
+        with TURN:
+            kept = instance.__dict__
+            if self._name not in kept:
+                kept[self._name] = self._function(instance)
+            value: R = kept[self._name]
+        return value

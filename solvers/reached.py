@@ -1,0 +1,184 @@
+"""The residuals of a point of the NLP, in the scale of that point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.convergence import LIMIT, VANISHING, Residuals, complementary
+from covocp.guess import choose_scales, magnitudes
+from covocp.matrices import Array
+from covocp.nlp import NLP, Scales
+from covocp.trajectory import Trajectory
+
+# Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
+SMALLEST_SHARE = 1e-6
+# Powers of ten by which scales may differ from those of the point that was reached.
+SIMILAR = 1.5
+# Relative displacement by which the curvature of the cost is measured.
+DISPLACEMENT = 1e-4
+
+
+# The trajectory of a point, its cost terms and constraint values (`NLP.unpack`).
+Evaluated = tuple[Trajectory, dict[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """Where a run of the NLP solver ended: variables, multipliers for a cost scale of 1, and how it ended."""
+
+    w: Array
+    lam_x: Array
+    lam_g: Array
+    where: Evaluated
+    success: bool
+    status: str
+    iterations: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where a run starts: variables, and multipliers for a cost scale of 1 or None."""
+
+    w: Array
+    lam_x: Array | None = None
+    lam_g: Array | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Round:
+    """A run, with its residuals where it ended at a point that may be stationary."""
+
+    nlp: NLP
+    point: Point
+    where: Evaluated
+    residuals: Residuals | None
+    converged: bool
+
+    @property
+    def worst(self) -> float:
+        """The largest residual; inf where there are none."""
+        return np.inf if self.residuals is None else self.residuals.worst
+
+
+class FirstOrder:
+    """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
+
+    def __init__(self, nlp: NLP, solver: ca.Function, plugin: str) -> None:
+        """Take Ipopt's functions, or make one: every other plugin has its own."""
+        self.nlp = nlp
+        self._gradient: Any = None
+        self._jacobian: Any = None
+        if plugin == "ipopt":
+            self._gradient, self._jacobian = solver.get_function("nlp_grad_f"), solver.get_function("nlp_jac_g")
+
+    def cost(self, w: Array, parameters: Array) -> tuple[float, Array]:
+        """The cost and its gradient by the variables."""
+        if self._gradient is None:
+            outputs = [self.nlp.f, ca.gradient(self.nlp.f, self.nlp.w)]
+            self._gradient = ca.Function("gradient", [self.nlp.w, self.nlp.p], outputs)
+        value, slope = self._gradient(w, np.append(parameters, 1.0))
+        return float(value), np.asarray(slope.full()).ravel()
+
+    def constraints(self, w: Array, parameters: Array, weights: Array) -> tuple[Array, Array]:
+        """The constraints, and the slope by the variables of their sum with these weights."""
+        p = np.append(parameters, 1.0)
+        if self._jacobian is not None:
+            values, jacobian = self._jacobian(w, p)
+            slope = ca.mtimes(jacobian.T, ca.DM(weights)).full()  # not by scipy: importing it takes longer than a solve
+        else:
+            lam = ca.MX.sym("lam", weights.size)
+            outputs = [self.nlp.g, ca.jtimes(self.nlp.g, self.nlp.w, lam, True)]
+            values, slope = ca.Function("weighted", [self.nlp.w, self.nlp.p, lam], outputs)(w, p, weights)
+            slope = slope.full()
+        return np.asarray(values.full()).ravel(), np.asarray(slope).ravel()
+
+
+def reached_scales(nlp: NLP, trajectory: Trajectory, parameters: Array, *, again: bool) -> Scales:
+    """The magnitudes at a point that was reached.
+
+    Args:
+        nlp: in which the point was found.
+        trajectory: the point.
+        parameters: of the statement.
+        again: whether the NLP itself is in the scales of such a point: controls that are then far smaller are zero.
+    """
+    found = choose_scales(nlp.statement, nlp.mesh, trajectory, parameters)
+    least = SMALLEST_SHARE * nlp.scales.u.reshape(-1, found.u.size).max(axis=0, initial=0.0) if again else 0.0
+    return replace(found, u=np.maximum(found.u, least), duration=trajectory.duration)
+
+
+def not_zero(nlp: NLP, scales: Scales) -> Scales:
+    """Magnitudes in which an NLP can work: states and matrices that are zero but for roundoff have none."""
+    x, e = (SMALLEST_SHARE * own for own in (nlp.scales.x, nlp.scales.e))
+    return replace(scales, x=np.maximum(scales.x, x), e=np.maximum(scales.e, e))
+
+
+def similar(nlp: NLP, scales: Scales) -> bool:
+    """Whether other magnitudes are about those that an NLP works in."""
+    own = nlp.scales
+    time = np.array([scales.duration / own.duration])
+    ratios: list[Array] = [scales.x / own.x, scales.e / own.e, np.ravel(scales.u / own.u), time]
+    return bool(np.abs(np.log10(np.concatenate(ratios))).max(initial=0.0) <= SIMILAR)
+
+
+def carried(point: Point, old: NLP, new: NLP, *, dual: bool) -> Start:
+    """A point in the units of another NLP of the same problem, with its multipliers or without."""
+    unit = old.units(new.scales)
+    ones = np.ones(0)
+    rows = np.concatenate([ones, *(b.scale / a.scale for a, b in zip(old.rows, new.rows, strict=True))])
+    if not dual:
+        return Start(w=point.w / unit)
+    return Start(w=point.w / unit, lam_x=point.lam_x * unit, lam_g=point.lam_g * rows)
+
+
+def residuals(first: FirstOrder, point: Point, parameters: Array, where: Evaluated, scales: Scales | None) -> Residuals:
+    """The residuals of a point.
+
+    Args:
+        first: of the NLP.
+        point: variables and multipliers.
+        parameters: of the statement.
+        where: trajectory and values there.
+        scales: magnitudes of the variables there; None: what the trajectory shows, where a control counts with no less
+            than the scale of the NLP (an upper bound, and cheaper).
+    """
+    nlp, (trajectory, values) = first.nlp, where
+    bounds = nlp.bounds(parameters)
+    bound = scales is None
+    if scales is None:
+        scales = magnitudes(nlp.statement, trajectory, parameters)
+        scales = replace(scales, u=np.maximum(scales.u, nlp.scales.u))
+    able = not_zero(nlp, scales)
+    unit, row = nlp.units(able), nlp.row_units(able)
+    lam_x, room_x = complementary(point.lam_x, point.w, bounds["lbx"], bounds["ubx"])
+    lam_g, room_g = complementary(point.lam_g, values["g"], bounds["lbg"], bounds["ubg"])
+    _, by_w = first.cost(point.w, parameters)
+    g, by_g = first.constraints(point.w, parameters, lam_g)
+    free, unequal = bounds["ubx"] > bounds["lbx"], bounds["ubg"] > bounds["lbg"]
+    slope = float(np.sum(np.abs(by_w + by_g + lam_x)[free] * unit[free]))
+    excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
+    apart = np.maximum(np.maximum(bounds["lbx"] - point.w, point.w - bounds["ubx"]), 0.0)
+    rest = float(np.sum(np.abs(lam_x * room_x)[free]) + np.sum(np.abs(lam_g * room_g)[unequal]))
+    missed = float(np.sum(np.abs(lam_g) * excess))
+    for limits in (bounds["lbg"], bounds["ubg"]):  # the size of a limit is one of what it limits
+        row = np.maximum(row, np.where(np.isfinite(limits), np.abs(limits), 0.0))
+    worst = max(float((excess / row).max(initial=0.0)), float((apart / unit).max(initial=0.0)))
+    size = abs(values["running"]) + abs(values["terminal"])
+    if not np.isfinite([slope, rest, missed, worst, size]).all():
+        return Residuals(slope=np.inf, complementarity=np.inf, infeasibility=np.inf, violation=np.inf)
+    if not bound and max(slope, rest, missed) > LIMIT * size:
+        size = max(size, VANISHING * _change(first, point.w, by_w, nlp.units(scales), parameters))
+    size = max(size, float(np.finfo(float).tiny))
+    return Residuals(slope=slope / size, complementarity=rest / size, infeasibility=missed / size, violation=worst)
+
+
+def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: Array) -> float:
+    """Second-order change of the cost where all variables change by their magnitudes, away from zero."""
+    step = np.where(w < 0, -unit, unit)
+    _, moved = first.cost(w + DISPLACEMENT * step, parameters)
+    change = abs(float((moved - slope) @ step)) / DISPLACEMENT
+    return change if np.isfinite(change) else 0.0

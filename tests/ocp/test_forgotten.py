@@ -1,0 +1,146 @@
+"""What is probably forgotten in a statement is named, and what is plainly meant is not."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import covocp as co
+
+
+def run(ocp, **options):
+    return co.solve(ocp, progress=False, intervals=20, **options)
+
+
+def drifting(measure=None, cost="b"):
+    """x' = -b x + u with an unknown b; at the end the variance of something counts."""
+    ocp = co.Problem(2.0)
+    x = ocp.state("x", initial=0.0, final=1.0, variance=0.1)
+    b = ocp.unknown("b", mean=1.0, variance=5.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=0.1)
+    if measure is not None:
+        ocp.measurement("m", measure(x, b), noise=1.0)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[cost, cost])
+    return ocp
+
+
+def test_nothing_is_learnt_without_a_measurement():
+    with pytest.warns(co.CovocpWarning, match="Nothing is learnt about 'b': there is no measurement"):
+        solution = run(drifting())
+    np.testing.assert_allclose(solution.deviation("b"), np.sqrt(5.0), rtol=1e-12)
+
+
+def test_nothing_is_learnt_from_what_does_not_depend_on_it():
+    ocp = co.Problem(2.0)
+    x, z = ocp.state("x", initial=0.0, final=1.0), ocp.state("z", initial=0.0, variance=1.0)
+    b, u = ocp.unknown("b", mean=1.0, variance=5.0), ocp.control("u")
+    ocp.dynamics(x, -b * x + u)
+    ocp.dynamics(z, 0.0)
+    ocp.measurement("m", z, noise=1.0)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[b, b])
+    with pytest.warns(co.CovocpWarning, match="about 'b': no measurement depends on it"):
+        run(ocp)
+
+
+@pytest.mark.parametrize("measure", [lambda x, b: x, lambda x, b: b])
+def test_what_is_measured_at_once_or_by_its_effect_is_learnt(measure):
+    assert run(drifting(measure)).deviation("b")[-1] < np.sqrt(5.0)
+
+
+def test_a_spread_that_the_nominal_shapes_needs_no_measurement():
+    assert run(drifting(cost="x")).converged
+
+
+def test_measurements_that_nothing_uses():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.measurement("gauge", x, noise=1.0)
+    ocp.minimize(running=u**2)
+    with pytest.warns(co.CovocpWarning, match="Nothing uses the measurement 'gauge'"):
+        run(ocp)
+    run(ocp)  # it is said once
+
+
+def corridor(limit):
+    ocp = co.Problem(3.0)
+    x, u = ocp.state("x", initial=0.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, u, noise=1.0)
+    ocp.measurement("m", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(limit(x, E[x, x]), upper=3.0, name="corridor")
+    ocp.minimize_expected(running=u**2 + (x - 2) ** 2)
+    return ocp
+
+
+def test_the_error_of_the_filter_is_not_the_spread_of_the_loop():
+    with pytest.warns(co.CovocpWarning, match=r"'corridor' contains E.*X = E \+ Xhat") as caught:
+        solution = run(corridor(lambda x, E: x + 3 * ca.sqrt(E)))
+    worst = np.argmax(1 - np.sqrt(solution["E"][:, 0, 0]) / solution.deviation("x"))
+    assert f"{solution.deviation('x')[worst]:.4g}" in str(caught[0].message)
+    assert run(corridor(lambda x, E: x)).converged
+
+
+@pytest.mark.parametrize("noise", [[0.0, 1.0], [1.0, 1.0], 0.0])
+def test_noise_that_is_given_for_each_row_is_meant(noise):
+    assert double_integrator(noise).converged
+
+
+def double_integrator(noise):
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=0.0, final=[1.0, None], variance=1.0), ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], u), noise=noise)
+    ocp.measurement("m", x[0], noise=1.0)
+    ocp.minimize_expected(running=u**2, terminal_weight={x[0]: 1.0})
+    return run(ocp)
+
+
+def test_one_noise_for_position_and_velocity():
+    with pytest.warns(co.CovocpWarning, match=r"The noise of 'x' is one number.*x\[0\]"):
+        double_integrator(1.0)
+
+
+def guessed(rows, **options):
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0, guess=np.linspace(0, 1, rows)), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2)
+    return run(ocp, **options)
+
+
+def test_a_guess_of_another_length():
+    with pytest.warns(co.CovocpWarning, match="guess of 'x' has 18 rows, and 20 intervals have 21 nodes"):
+        guessed(18)
+    with pytest.warns(co.CovocpWarning, match="guess of 'u' has 40 rows"):
+        guessed(21, guess={"u": np.ones(40)})
+
+
+@pytest.mark.parametrize("rows", [2, 5, 20, 21])
+def test_guesses_at_the_nodes_and_waypoints_are_meant(rows):
+    assert guessed(rows).converged
+
+
+@pytest.mark.parametrize("value", [np.nan, [1.0, np.nan], np.array([np.nan, 1.0]), ca.DM([1.0, np.nan]), ca.MX(np.nan)])
+@pytest.mark.parametrize("end", ["initial", "final"])
+def test_nan_is_no_free_value(end, value):
+    with pytest.raises(co.ProblemError, match=f"The {end} value of 'x' contains NaN(?s:.)*None"):
+        co.Problem(1.0).state("x", 2, **({"initial": 0.0} | {end: value}))
+
+
+def test_nan_is_no_free_entry_of_a_matrix():
+    with pytest.raises(co.ProblemError, match="initial value of 'S' contains NaN"):
+        co.Problem(1.0).symmetric("S", 2, initial=[[1.0, np.nan], [np.nan, 1.0]])
+
+
+def test_none_in_a_sequence_is_free():
+    """x = (t, anything): the second component stays where it costs nothing, at its start."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=[0.0, 3.0], final=[1.0, None]), ocp.control("u", 2)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=ca.sumsqr(u))
+    solution = run(ocp)
+    np.testing.assert_allclose(solution["x"], np.column_stack([solution.t, np.full(21, 3.0)]), atol=1e-7)

@@ -1,0 +1,150 @@
+"""What is called solved is stationary, whatever the scales of the start were; what is not says so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_problems import draw
+
+import covocp as co
+from covocp.models import unknown_lag
+from covocp.optimality import complementarity
+from covocp.solvers import ipopt
+from covocp.solvers.gradient.memory import damped, learnt
+
+LAG_MINIMA = (7.08523844, 7.71199)  # of the lag with weight 10 on 50 intervals, from starts of the right size
+
+
+def plant(a: float, duration: float) -> co.Problem:
+    """x' = a x + u, x(0) = x(T) = 1, J = int (u^2 + x^2)/2: sqrt(a^2 + 1) for long durations.
+
+    From 1 to 0 the cost is (sqrt(a^2 + 1) + a)/2 and from 0 to 1 (sqrt(a^2 + 1) - a)/2, by the Riccati equation.
+    """
+    ocp = co.Problem(duration=duration)
+    x, u = ocp.state("x", initial=1.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, a * x + u)
+    ocp.minimize(running=0.5 * u**2 + 0.5 * x**2)
+    return ocp
+
+
+def lag(**options: object) -> co.Solution:
+    return co.solve(unknown_lag.problem(final=1.0, weight=10.0), intervals=50, progress=False, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # flown open loop these controls miss the end
+@pytest.mark.parametrize(("a", "duration"), [(1.0, 16.0), (2.0, 12.0), (3.0, 8.0), (3.0, 9.0)])
+def test_unstable_plants_have_the_cost_of_the_closed_form(a: float, duration: float) -> None:
+    # the simulated start reaches e^(a T); the tolerance is that of the mesh, (a h)^4
+    solution = co.solve(plant(a, duration), intervals=100, progress=False)
+    assert solution.cost == pytest.approx(np.hypot(a, 1.0), rel=2e-3)
+    assert solution["x"][-1] == pytest.approx(1.0, abs=1e-6)
+    assert solution.optimality.stationarity is not None
+    assert solution.optimality.stationarity < 1e-4
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse")
+@pytest.mark.parametrize(("a", "duration"), [(1.0, 8.0), (2.0, 16.0), (3.0, 16.0)])
+def test_gradient_method_is_right_or_says_that_it_failed(a: float, duration: float) -> None:
+    options = {"intervals": 50, "progress": False, "max_iterations": 40, "allow_failure": True}
+    solution = co.solve(plant(a, duration), "gradient", **options)
+    assert solution.converged or a * duration > 10
+    if solution.converged:
+        assert solution.cost == pytest.approx(np.hypot(a, 1.0), rel=2e-3)
+        assert solution["x"][-1] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e5, 1e8])
+def test_guess_in_a_wrong_unit_ends_at_a_minimum(size: float) -> None:
+    solution = lag(guess={"u": size})
+    assert min(abs(solution.cost / minimum - 1) for minimum in LAG_MINIMA) < 1e-6
+    assert solution.stats["rounds"] > 1
+
+
+def test_ordinary_solves_take_one_round() -> None:
+    assert "rounds" not in lag().stats
+
+
+def test_without_another_round_the_failure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ipopt, "LARGEST_ROUNDS", 1)
+    with pytest.raises(co.SolveError, match="not in those of the point that was reached: slope") as caught:
+        lag(guess={"u": 1e8})
+    assert caught.value.solution is not None
+    assert not caught.value.solution.converged
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse")
+@pytest.mark.parametrize("seed", [33, 183, 193])
+def test_nothing_is_gained_by_solving_again(seed: int) -> None:
+    first = co.solve(draw(seed).problem, intervals=30, progress=False)
+    again = co.solve(draw(seed).problem, intervals=30, progress=False, guess=first, tolerance=1e-10, allow_failure=True)
+    assert first.cost - again.cost < 1e-6 * abs(first.cost)
+
+
+def test_multipliers_of_inactive_bounds_are_no_stationarity() -> None:
+    # min int u^2/2 - u, u <= 1.5: u = 1. With half of the slope u - 1 called a multiplier u = 1.25 seems stationary.
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u", upper=1.5)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=0.5 * u**2 - u)
+    solution = co.solve(ocp, intervals=10, progress=False)
+    assert solution.cost == pytest.approx(-0.5, abs=1e-6)
+    assert solution.optimality.complementarity is not None
+    assert solution.optimality.complementarity < 1e-6
+    solution.extremal.multipliers.controls.setflags(write=True)
+    solution.extremal.multipliers.controls[:] = 0.25 * 0.1
+    # 11 values, distance 0.5 from the bound, cost 0.5
+    assert complementarity(solution.extremal) == pytest.approx(11 * 0.025 * 0.5 / 0.5, rel=1e-6)
+
+
+def correlated(seed: int) -> co.Problem:
+    """A lag whose final correlation of state and unknown is limited."""
+    r = np.random.default_rng(seed)
+    ocp = co.Problem(duration=float(r.uniform(1, 5)))
+    x = ocp.state("x", initial=0.0, final=float(r.uniform(0.5, 1.5)), variance=float(r.uniform(0.1, 1)))
+    b, u = ocp.unknown("b", float(r.uniform(0.3, 1.5)), float(r.uniform(0.5, 4))), ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=float(r.uniform(0.05, 1)))
+    ocp.measurement("m", x, noise=float(10 ** r.uniform(-1.5, 0.3)))
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * u**2, terminal=float(r.uniform(0.5, 5)) * E[b, b])
+    ocp.subject_to(E[x, b], lower=-0.02, upper=0.02, at="final", name="correlation")
+    return ocp
+
+
+def test_inequality_at_the_end_is_active_or_has_no_multiplier() -> None:
+    gradient = co.solve(correlated(0), "gradient", intervals=20, progress=False)
+    shooting = co.solve(correlated(0), intervals=20, progress=False, guess=gradient, tolerance=1e-9)
+    assert gradient.cost == pytest.approx(shooting.cost, rel=1e-5)
+    assert gradient.optimality.complementarity is not None
+    assert gradient.optimality.complementarity < 1e-4
+
+
+@pytest.mark.parametrize("seed", [1, 9])
+def test_gradient_method_finds_what_shooting_finds(seed: int) -> None:
+    gradient = co.solve(draw(seed).problem, "gradient", intervals=30, progress=False)
+    shooting = co.solve(draw(seed).problem, intervals=30, progress=False)
+    assert gradient.cost == pytest.approx(shooting.cost, rel=1e-5)
+
+
+def test_learnt_metric_is_the_recursion_of_bfgs() -> None:
+    from scipy.sparse import diags_array
+
+    r = np.random.default_rng(3)
+    n, base = 9, diags_array(r.uniform(1, 2, 9)).tocsc()
+    root = r.normal(size=(n, n))
+    pairs = [(s, (root @ root.T) @ s) for s in r.normal(size=(4, n))]
+    dense = base.toarray()
+    for s, y in pairs:
+        image = dense @ s
+        dense = dense - np.outer(image, image) / (s @ image) + np.outer(y, y) / (s @ y)
+    metric = learnt(base, pairs)
+    np.testing.assert_allclose(metric @ np.eye(n), dense, atol=1e-10)
+    free = np.array([0, 2, 3, 7])
+    inverse = (2.0 * metric).inverse(free)(np.eye(4))
+    np.testing.assert_allclose(inverse, np.linalg.inv(2 * dense[np.ix_(free, free)]), atol=1e-10)
+
+
+def test_negative_curvature_is_damped() -> None:
+    d, image = np.array([1.0, 0.0]), np.array([2.0, 0.5])
+    kept = damped(d, np.array([-3.0, 1.0]), image)
+    assert d @ kept == pytest.approx(0.2 * (d @ image))
+    np.testing.assert_array_equal(damped(d, image, image), image)

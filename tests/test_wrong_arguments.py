@@ -1,0 +1,47 @@
+"""Whatever is given to whatever argument: an error of covocp's own, or a result; never one of numpy's or CasADi's."""
+
+import warnings
+
+import pytest
+from wrong_values import CASES, RARE, SLOW, VALUES
+
+import covocp as co
+
+
+def foreign_errors(cases, names):
+    """What is raised that is no error of covocp's own."""
+    found = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)
+        warnings.simplefilter("ignore", RuntimeWarning)  # numpy says that 1e300 overflows, which is true
+        for function, argument, call in cases:
+            for name in names:
+                try:
+                    call(VALUES[name]())
+                except co.CovocpError:
+                    pass
+                except Exception as error:
+                    found.append(f"{function}, {argument}={name}: {type(error).__name__}: {error}"[:200])
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some take a word for the name of a file
+
+
+@pytest.mark.parametrize("group", CASES)
+def test_a_wrong_argument_is_refused_by_covocp(group):
+    assert foreign_errors(CASES[group](), [name for name in VALUES if name not in RARE]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", CASES)
+def test_every_wrong_argument_is_refused_by_covocp(group):
+    assert foreign_errors(CASES[group](), VALUES) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", SLOW)
+def test_a_wrong_statement_that_is_solved_is_refused_by_covocp(group):
+    assert foreign_errors(SLOW[group](), [name for name in VALUES if name not in RARE]) == []
