@@ -40,6 +40,8 @@ MAX_ITERATIONS = 200
 ROUNDING, APART = 1e-6, 1e-2
 # Distance and multiplier of a bound that is not reached at the solution of the export.
 UNREACHED = 1e-5
+# Multipliers below this are rounding: taken for reached, their bounds make the first active set of the QP dependent.
+INACTIVE = 1e-9
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory, as for Ipopt.
 STRETCH = 10.0
 TOLERANCE = 1e-8
@@ -212,6 +214,7 @@ def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any
         settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}
         settings["qpsol_options"] = {
             "print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False,
+            "min_lam": INACTIVE,
         }  # fmt: skip
         settings["hessian_approximation"] = "exact" if exact else "limited-memory"
     elif method == "ipopt":
