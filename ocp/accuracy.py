@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
 from covocp.extremal import Extremal
+from covocp.guess import magnitudes
 from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
-from covocp.refinement import refined_end, refined_run
+from covocp.mesh import Options
+from covocp.refinement import Refined, refined_end, refined_run
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
 COARSE_MESH = 2e-4
@@ -17,6 +23,13 @@ NO_COST = 1e-12
 FAR, MANY_PARTS = 0.05, 16
 # Roundoff of a step, relative: an unstable nominal that makes more of it than the change it suffers tells nothing.
 STEP_ROUNDOFF = 1e-13
+# Change of what is at a node by halving the steps, relative to its range, that is told.
+LONG_STEPS = 1e-2
+# Largest such change that default steps leave; order of the steps, by how much they are divided at a time at most, and
+# how many there may be in an interval.
+NODES, ORDER, MOST_TIMES, MOST_SUBSTEPS = 1e-4, 4, 8, 64
+# Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
+LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
 
 def mesh_error(extremal: Extremal, running: float) -> float:
@@ -39,7 +52,8 @@ def mesh_error(extremal: Extremal, running: float) -> float:
     cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
     change, missed, moved = _change(extremal, running, 2)
     if abs(change) > FAR * abs(cost):
-        further = _change(extremal, running, MANY_PARTS)
+        with np.errstate(over="ignore", invalid="ignore"):
+            further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
     return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
@@ -48,14 +62,67 @@ def mesh_error(extremal: Extremal, running: float) -> float:
 def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, float, float]:
     """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    jumps, refined, last = refined_run(st, mesh, t, extremal.parameters, parts)
+    finer = refined_run(st, mesh, t, extremal.parameters, parts) if parts > 2 else _halved(extremal)
+    jumps = finer.jumps
     weights = extremal.multipliers.gaps
     if weights.shape != jumps.shape:  # a method without segments
         costates, _, _ = discrete_costates(extremal)
         weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
-    change = float(np.sum(weights * jumps)) + refined - running
-    change += _at_the_end(extremal, last) - _at_the_end(extremal, t.e[-1])
+    change = float(np.sum(weights * jumps)) + finer.running - running
+    change += _at_the_end(extremal, finer.matrices[-1]) - _at_the_end(extremal, t.e[-1])
     return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
+
+
+@lru_cache(maxsize=2)
+def _halved(extremal: Extremal) -> Refined:
+    """The run with steps of half the length."""
+    return refined_run(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters)
+
+
+def node_error(extremal: Extremal) -> float:
+    """Largest change of a state or of an entry of a matrix at a node by halving the steps, relative to its range.
+
+    What is a variable where a segment starts changes inside the segments and by the jumps at their ends, summed up.
+
+    Args:
+        extremal: the trajectory.
+
+    Returns:
+        The largest of them; nan where the run is not finite.
+    """
+    t, finer = extremal.trajectory, _halved(extremal)
+    scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
+    magnitude = np.concatenate([scales.x, scales.e])
+    least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
+    size = np.maximum(np.ptp(values, axis=0), least)
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved, inside = np.cumsum(finer.jumps, axis=0), np.hstack([finer.states, finer.matrices]) - values
+        total = np.abs(inside).max(axis=0)
+        total[: moved.shape[1]] += np.abs(moved).max(axis=0)
+        return float((total / size).max(initial=0.0))
+
+
+def finer_steps(extremal: Extremal, options: Options) -> Options | None:
+    """The options with so many integration steps that halving them moves nothing at the nodes by more than NODES.
+
+    Args:
+        extremal: a solution on the mesh of the options.
+        options: those of this mesh.
+
+    Returns:
+        None where the steps are short enough, or cannot be shorter.
+    """
+    mesh = extremal.mesh
+    error = node_error(extremal)
+    if not error > NODES:  # nan: where halving them diverges nothing can be said
+        return None
+    order = 2 if mesh.step == "strang" else ORDER
+    factor = int(np.clip(np.ceil((error / NODES) ** (1 / order)), 2, MOST_TIMES))
+    substeps = min(factor, MOST_SUBSTEPS // mesh.substeps) * mesh.substeps
+    if substeps <= mesh.substeps:
+        return None
+    step: Any = {"step": "rodas" if mesh.step == "rodas" else "rk4"}
+    return replace(options, substeps=substeps, points=mesh.points, **step)
 
 
 def _moved(jumps: Array, x: Array) -> float:

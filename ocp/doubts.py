@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from covocp.accuracy import COARSE_MESH
+from covocp.accuracy import COARSE_MESH, LONG_STEPS, node_error
 from covocp.errors import warn_user
 from covocp.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution import Solution
@@ -24,6 +24,11 @@ def mention_doubts(solution: Solution) -> None:
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
             + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
             + "Use more intervals or substeps."
+        )
+    elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
+        warn_user(
+            f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
+            "its range. Use more intervals or substeps."
         )
     else:
         _mention_loop(solution)

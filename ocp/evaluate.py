@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.accuracy import finer_steps
 from covocp.checks import as_number, check_density, check_kind
 from covocp.closed_loop import Statistics, close_loop, densities
 from covocp.doubts import mention_doubts
@@ -107,6 +108,12 @@ def _along(
         x0 = _started_like(st, nominal, x0, values)
     check_model(st, x0, u[:1].ravel(), e0, duration, values)
     outcome = evaluate_controls(st, mesh, u, duration, values, x0)
+    own_steps = given.substeps == "auto"
+    while own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, given)):
+        shorter = evaluate_controls(st, evaluation_mesh(st, finer, values), u, duration, values, x0)
+        if not shorter.converged:
+            break
+        outcome, given = shorter, finer
     if outcome.converged:
         check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
     solution = Solution.of(replace(outcome, stats=given.grading), METHOD)

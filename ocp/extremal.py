@@ -18,7 +18,7 @@ from covocp.trajectory import Multipliers, Trajectory
 STOPPED, ENDED = "stopped", "ended"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Extremal:
     """Trajectory, multipliers, and what is needed to evaluate anything along them."""
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from covocp.accuracy import finer_steps
 from covocp.arguments import checked, text, truth
 from covocp.attempts import best_of, cost_of, from_starts
 from covocp.checks import check_kind, is_whole
@@ -124,7 +125,7 @@ class Solver:
                 )
             )
         check_problem(problem)
-        prepare = importlib.import_module(METHODS[method]).prepare
+        self._prepare = importlib.import_module(METHODS[method]).prepare
         known, own = {field.name for field in fields(Options)}, method_options(method)
         for name in options:
             if name not in known and name not in own:
@@ -144,13 +145,14 @@ class Solver:
         self._problem, self._classical = problem, cast("Solver | None", None)
         asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
         self._options = graded(self.statement, asked, self.statement.values)
+        self._own_steps = self._options.substeps == "auto"
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else deterministic(problem).statement()
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
-        self._prepared = cast(Prepared, prepare(solved, self._options, **self._own))
+        self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
@@ -195,6 +197,7 @@ class Solver:
                     guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
                     outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start)
+                outcome = self._with_finer_steps(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
             if reporter.stop:
@@ -249,9 +252,8 @@ class Solver:
     def _continued(self, solution: Solution, values: Array) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
-        prepare = importlib.import_module(METHODS[self.method]).prepare
         try:
-            prepared = prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
+            prepared = self._prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
             with Progress("", show=False) as reporter:
                 start = make_guess(self._solved, prepared.mesh, values, solution)
                 outcome = prepared.solve(values, start, reporter)
@@ -259,13 +261,7 @@ class Solver:
             return solution
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
-        continued = Solution.of(outcome, self.method)
-        counted = {
-            name: solution.stats[name] + outcome.stats[name]
-            for name in ("iterations", "build_seconds", "solve_seconds")
-            if name in solution.stats and name in outcome.stats
-        }
-        return _noted(continued, **{**solution.stats, **counted})
+        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **_counted(solution, outcome)})
 
     def _solve_values(self, values: Array) -> float | None:
         """Cost of the classical design for stacked parameters; None where it was not found."""
@@ -327,6 +323,18 @@ class Solver:
         )
         return _with_stats(min(better, key=cost_of), left_saddle=True)
 
+    def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
+        while self._own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, self._options)):
+            prepared = cast(Prepared, self._prepare(self._solved, finer, **self._own))
+            start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
+            again = prepared.solve(values, start, reporter)
+            if not again.converged:  # what the steps are off is told with the solution
+                break
+            outcome, self._prepared = _with_stats(again, **_counted(outcome, again)), prepared
+            self._options = finer
+        return outcome
+
     def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
@@ -372,6 +380,13 @@ def is_roundoff(cost: float, statement: Statement, options: Options, parameters:
     start = make_guess(statement, mesh, parameters, None).trajectory
     outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
     return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
+
+
+def _counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
+    """Iterations and times of two runs together."""
+    names = ("iterations", "build_seconds", "solve_seconds")
+    both = [name for name in names if name in first.stats and name in second.stats]
+    return {name: first.stats[name] + second.stats[name] for name in both}
 
 
 def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,9 +17,24 @@ from covocp.statement import Statement
 from covocp.trajectory import Trajectory
 
 
-def refined_run(
-    statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2
-) -> tuple[Array, float, Array]:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refined:
+    """What shorter integration steps make of a trajectory.
+
+    Attributes:
+        jumps: at the ends of the segments, (segments, nx, or nx + ne where the matrices are variables).
+        running: running cost.
+        states: at the nodes, (N + 1, nx); those at which a segment starts are as given.
+        matrices: half-vectors at the nodes, (N + 1, ne); the same where they are variables.
+    """
+
+    jumps: Array
+    running: float
+    states: Array
+    matrices: Array
+
+
+def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Refined:
     """Run the segments of a trajectory again with shorter integration steps.
 
     The intervals are divided, not the substeps multiplied: so the functions of the transcription serve again.
@@ -30,10 +45,6 @@ def refined_run(
         trajectory: where each segment starts from, and the controls.
         parameters: of the statement.
         parts: parts of each interval.
-
-    Returns:
-        Jumps at the ends of the segments (segments, nx, or nx + ne where the matrices are variables), running cost,
-        half-vectors at the end (ne,).
     """
     starts, (divided, u) = list(mesh.starts), _divided(mesh, trajectory.u, parts)
     start = SimpleNamespace(
@@ -45,8 +56,8 @@ def refined_run(
     )
     values = shoot(statement, divided, start)
     jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
-    running, last = ca.DM(ca.sum2(values["cost"])), ca.DM(values["e"][:, -1])
-    return jumps, float(running), np.asarray(last.full()).ravel()
+    states, matrices = (np.asarray(ca.DM(values[name][:, ::parts]).full()).T for name in ("x", "e"))
+    return Refined(jumps=jumps, running=float(ca.DM(ca.sum2(values["cost"]))), states=states, matrices=matrices)
 
 
 def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Array:

@@ -44,6 +44,8 @@ MAX_ITERATIONS = 1000
 LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
 # Runs from one start, each in the scales of the point that the last one reached.
 LARGEST_ROUNDS = 6
+# A run that ends after so few iterations had met its tolerance where it began: the next one has this share of it.
+AT_ONCE, STRICTER = 1, 0.03
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
@@ -201,6 +203,7 @@ class ShootingSolver:
         """Keep the settings; see `prepare`. `limit`: of the residuals of a converged point."""
         self._statement, self._mesh = statement, mesh
         self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
+        self._strictness = 1.0
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: _Monitor | None = None
         self._nlp: NLP | None = None
@@ -219,6 +222,8 @@ class ShootingSolver:
         there in new ones.
         """
         begin = time.perf_counter()
+        if self._strictness < 1.0:
+            self._strictness, self._warm = 1.0, None
         nlp, solver = self._build(parameters, guess, progress.shown)
         built = time.perf_counter()
         start = Start(w=nlp.pack(guess.trajectory))
@@ -253,6 +258,8 @@ class ShootingSolver:
             best = min(done, key=lambda entry: entry.worst)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
+            if done[-1].point.success and done[-1].point.iterations <= AT_ONCE:  # new scales alone do not move it
+                self._tighten()
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
             solver = self._warm_solver() if start.lam_x is not None else self._cold
             assert solver is not None
@@ -261,6 +268,11 @@ class ShootingSolver:
         if not done[-1].converged:
             done.append(done.pop(done.index(min(done, key=lambda entry: entry.worst))))
         return done
+
+    def _tighten(self) -> None:
+        """Ask more of Ipopt in the runs that follow; other plugins keep the tolerance of their own options."""
+        self._strictness *= STRICTER
+        self._warm = None
 
     def _judged(self, nlp: NLP, point: Point, parameters: Array, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
@@ -421,6 +433,7 @@ class ShootingSolver:
                 "warm_start_slack_bound_push": 1e-8,
                 "mu_init": 1e-6,
             }
+            settings["ipopt"]["tol"] *= self._strictness
         try:
             return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
         except RuntimeError as error:

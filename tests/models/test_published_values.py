@@ -224,7 +224,7 @@ def test_chord():
     np.testing.assert_allclose(np.ravel(solution["u"]), exact.u, atol=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # 50 steps, as in the table
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse", "ignore:The integration steps are long")  # as tabulated
 @pytest.mark.parametrize(
     ("masses", "rk4", "gauss"),
     [

@@ -123,7 +123,7 @@ def test_a_rate_that_jumps_at_a_node_is_integrated_from_its_own_side(comparison,
 
 def test_a_jump_inside_an_interval_is_told_by_the_mesh_error():
     with pytest.warns(co.CovocpWarning, match="node where a rate jumps"):
-        solution = solve(phases(lambda t, at: t < at), intervals=8)
+        solution = solve(phases(lambda t, at: t < at), intervals=8, substeps=1)
     wrong = abs(solution["x"][-1] - 0.9) / 0.9
     assert wrong > 0.01
     assert wrong / 5 < solution.mesh_error < 5 * wrong
@@ -181,7 +181,8 @@ def test_limits_of_a_stiff_state_hold_on_its_true_path():
     """Points follow the substeps: between them the current passes its limit by less than a per cent."""
     guess = {"u": lambda s: 12 * np.sign(np.sin(6 * np.pi * s + 0.1))}
     solution = solve(circuit(), intervals=10, guess=guess)
-    assert solution.mesh.points == solution.mesh.substeps >= 3
+    assert solution.mesh.points >= 3
+    assert solution.mesh.substeps % solution.mesh.points == 0
     true = current(solution, np.linspace(0.0, 0.02, 4001))
     assert np.abs(true).max() <= 6.0 * 1.01
 

@@ -91,7 +91,8 @@ def identification():
 def test_a_stiff_nominal_is_stepped_implicitly_and_costs_the_same():
     stiff = co.solve(identification(), intervals=40, progress=False)
     explicit = co.solve(identification(), intervals=40, step="rk4", progress=False)
-    assert (stiff.mesh.step, stiff.mesh.substeps) == ("rodas", 4)
+    assert stiff.mesh.step == "rodas"
+    assert stiff.mesh.substeps <= 8
     assert (explicit.mesh.step, explicit.mesh.substeps) == ("gauss", 26)
     assert stiff.cost == pytest.approx(explicit.cost, rel=2e-4)  # the accuracy that is warned below
     assert np.isfinite(stiff.optimality.costate_difference)  # explicit steps of the adjoint, as many as it needs
@@ -128,9 +129,14 @@ def test_what_oscillates_keeps_explicit_steps():
     x, u = problem.state("x", 2, initial=[1.0, 0.0]), problem.control("u")
     problem.dynamics(x, ca.vertcat(x[1], -(400.0**2) * x[0] - 4.0 * x[1] + u))
     problem.minimize(running=u**2, terminal=x[0] ** 2)
-    with pytest.warns(co.CovocpWarning, match="too coarse"):  # 64 turns in 440 steps: what they lose is said
+    with pytest.warns(co.CovocpWarning, match="too coarse"):  # 64 turns: what even the most steps lose is said
         solution = co.evaluate(problem, nominal={"u": 0.0}, intervals=40)
-    assert (solution.mesh.step, solution.mesh.substeps) == ("gauss", 11)
+    assert solution.mesh.step == "gauss"
+    damping, frequency = 2.0, np.sqrt(400.0**2 - 4.0)
+    phase = frequency * solution.t
+    exact = np.exp(-damping * solution.t) * (np.cos(phase) + damping / frequency * np.sin(phase))
+    np.testing.assert_allclose(solution["x"][:, 0], exact, atol=2e-3)
+    assert abs(solution.cost - exact[-1] ** 2) / exact[-1] ** 2 < 2 * solution.mesh_error
 
 
 @pytest.mark.parametrize("method", ["ipopt", "gradient"])

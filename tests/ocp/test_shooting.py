@@ -33,11 +33,13 @@ def test_lag(final, weight, formulation, step):
 def test_lag_with_strang(final):
     """Of order 2: extrapolated from two meshes to the cost, both formulations on the coarser one."""
     problem = lag(10.0, final).problem
-    coarse, fine = (solve(problem, covariance_step="strang", intervals=n, segments=10).cost for n in (100, 200))
+    coarse, fine = (
+        solve(problem, covariance_step="strang", intervals=n, substeps=1, segments=10).cost for n in (100, 200)
+    )
     exact = LAG_COSTS[final, 10.0]
     assert (fine - exact) / (coarse - exact) == pytest.approx(0.25, abs=0.02)
     assert (4 * fine - coarse) / 3 == pytest.approx(exact, rel=3e-6)
-    other = solve(problem, covariance_step="strang", intervals=100, covariances="states").cost
+    other = solve(problem, covariance_step="strang", intervals=100, substeps=1, covariances="states").cost
     assert other == pytest.approx(coarse, rel=1e-7)
 
 
@@ -68,7 +70,7 @@ def test_the_better_of_two_minima(formulation, final):
 def test_order_of_the_cost(control, expected, final):
     """Against the published cost; its nine digits bear the errors of up to 80 intervals."""
     problem, counts = lag(10.0, final).problem, [25, 50, 80]
-    costs = [solve(problem, intervals=n, control=control, tolerance=1e-9).cost for n in counts]
+    costs = [solve(problem, intervals=n, substeps=1, control=control, tolerance=1e-9).cost for n in counts]
     assert order(counts, np.array(costs) - LAG_COSTS[final, 10.0]) == pytest.approx(expected, abs=0.35)
 
 
@@ -121,7 +123,7 @@ CHAIN = {
 slow = pytest.mark.slow
 
 
-@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # as published
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse", "ignore:The integration steps are long")  # as published
 @pytest.mark.parametrize(
     ("masses", "options"),
     [
@@ -145,7 +147,7 @@ def test_chain(masses, options):
 
 def test_coarse_mesh_warns():
     with pytest.warns(co.CovocpWarning, match="mesh is too coarse") as caught:
-        solution = co.solve(damped_oscillator.problem(), intervals=20, progress=False)
+        solution = co.solve(damped_oscillator.problem(), intervals=20, substeps=1, progress=False)
     assert solution.mesh_error > 1e-3
     assert abs(solution.cost / 863.839329 - 1) > 1e-3  # and it is
     assert caught[0].filename == __file__  # the line of the user, not one of the toolbox

@@ -234,9 +234,9 @@ def test_weight_grows_where_the_cost_does_not_fall_as_predicted() -> None:
 def test_coarse_meshes_still_end(options: Any) -> None:
     # Slopes and costs disagree by the discretisation error, mesh_error, and the run still ends within it.
     with pytest.warns(co.CovocpWarning, match="too coarse"):
-        solution = solve(unknown_lag.steering(), intervals=10, tolerance=1e-8, **options)
+        solution = solve(unknown_lag.steering(), intervals=10, substeps=2, tolerance=1e-8, **options)
     with pytest.warns(co.CovocpWarning, match="too coarse"):
-        shooting = co.solve(unknown_lag.steering(), progress=False, intervals=10, **options)
+        shooting = co.solve(unknown_lag.steering(), progress=False, intervals=10, substeps=2, **options)
     assert solution.mesh_error > 1e-4
     assert solution.cost == pytest.approx(shooting.cost, rel=solution.mesh_error)
 
