@@ -12,8 +12,10 @@ from covocp.extremal import Extremal
 from covocp.guess import magnitudes
 from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
-from covocp.mesh import Options
+from covocp.mesh import Mesh, Options
 from covocp.refinement import Refined, refined_end, refined_run
+from covocp.statement import Statement
+from covocp.trajectory import Trajectory
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
 COARSE_MESH = 2e-4
@@ -73,10 +75,14 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
     return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
 
 
-@lru_cache(maxsize=2)
 def _halved(extremal: Extremal) -> Refined:
     """The run with steps of half the length."""
-    return refined_run(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters)
+    return _halved_run(extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()))
+
+
+@lru_cache(maxsize=2)
+def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
+    return refined_run(statement, mesh, trajectory, np.array(parameters))
 
 
 def node_error(extremal: Extremal) -> float:

@@ -18,7 +18,7 @@ from covocp.trajectory import Multipliers, Trajectory
 STOPPED, ENDED = "stopped", "ended"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Extremal:
     """Trajectory, multipliers, and what is needed to evaluate anything along them."""
 

@@ -11,7 +11,7 @@ from covocp.mesh import Mesh
 from covocp.statement import Statement
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
     """Nominal and matrices at the nodes: x (N+1, nx), u (N+1 or N, nu), e (N+1, ne), terminal time [s]."""
 
