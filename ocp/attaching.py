@@ -55,10 +55,10 @@ def _of_another(solution: Solution, statement: Statement, found: list[Difference
     more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
     names = ", ".join(entry.what for entry in shown)
     plural = len(found) > 1 or names.startswith(PLURAL)
+    called = f" (stored: '{solution.name}', given: '{statement.name}')" if solution.name != statement.name else ""
     return ProblemError(
         describe(
-            f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'} "
-            f"(stored: '{solution.name}', given: '{statement.name}').",
+            f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
             expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
             received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
             remedy="give the problem that was solved, or load without one; evaluate(problem, nominal=load(path)) tells "
