@@ -48,7 +48,8 @@ def main() -> None:
     """Print the table."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
     print(f"{runs} runs: standard deviations are known to {100 / np.sqrt(2 * runs):.1f} %, periods of T/{PERIODS}.\n")
-    print("| system | nodes added | in Python | C, any times | C, sampled | warnings | s |\n|---|---|---|---|---|---|---|")
+    print("| system | nodes added | in Python | C, any times | C, sampled | warnings | s |")
+    print("|---|---|---|---|---|---|---|")
     seed = done = 0
     while done < LOOPS:
         begin = time.perf_counter()

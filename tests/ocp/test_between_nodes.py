@@ -49,6 +49,60 @@ def test_a_stiff_state_between_nodes_is_that_of_the_differential_equation():
     assert solution.dense.knots.size < 40 * solution.mesh.intervals
 
 
+def lag(noise):
+    ocp = co.Problem(10.0)
+    x, b = ocp.state("x", initial=0.0, variance=1.0), ocp.unknown("b", mean=1.0, variance=5.0)
+    u = ocp.control("u", guess=lambda s: np.sin(12 * s))
+    ocp.dynamics(x, -b * x + u, noise=1.0)
+    ocp.measurement("position", x, noise=noise)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[b, b])
+    return ocp
+
+
+def along_lag(solution, noise, t):
+    """x and E as rows at some times, by scipy an interval at a time."""
+    nodes, u, z = solution.t, solution["u"], np.array([0.0, 1.0, 0.0, 0.0, 5.0])
+    result = np.zeros((t.size, 5))
+
+    def rates(s, z):
+        E = z[1:].reshape(2, 2)
+        F = np.array([[-1.0, -z[0]], [0.0, 0.0]])
+        rate = F @ E + E @ F.T + np.diag([1.0, 0.0]) - np.outer(E[:, 0], E[0]) / noise
+        return np.append(-z[0] + np.interp(s, nodes, u), rate)
+
+    for k in range(nodes.size - 1):
+        inside = (t >= nodes[k]) & (t <= nodes[k + 1])
+        found = solve_ivp(rates, nodes[k : k + 2], z, method="Radau", rtol=1e-10, atol=1e-13, dense_output=True)
+        result[inside], z = found.sol(t[inside]).T, found.y[:, -1]
+    return result[:, 0], result[:, 1:].reshape(-1, 2, 2)
+
+
+@pytest.mark.parametrize("run", [co.evaluate, solve])
+def test_default_steps_are_as_short_as_what_is_at_the_nodes_asks_for(run):
+    """A covariance that falls within a tenth of the first interval, on the way only: the cost does not show it."""
+    with pytest.warns(co.CovocpWarning, match="integration steps are long"):
+        coarse = run(lag(1e-4), intervals=60, substeps=1)
+    solution = run(lag(1e-4), intervals=60)
+    t = np.linspace(0.0, 10.0, 601)
+    for got, limits in ((coarse, (1e-3, 1.0)), (solution, (0.0, 1e-4))):
+        x, E = along_lag(got, 1e-4, t)
+        sample = got.at(t)
+        assert np.abs(sample["x"] - x).max() <= 1e-4 * np.ptp(x)
+        error = (np.abs(sample["E"] - E).max(axis=0) / np.ptp(E, axis=0)).max()
+        assert limits[0] <= error <= limits[1]
+
+
+def test_given_steps_that_are_too_long_for_the_nodes_are_told_with_what_they_lose():
+    problem = lag(1e-4)
+    with pytest.warns(co.CovocpWarning, match="integration steps are long: halving them moves") as told:
+        solution = co.evaluate(problem, intervals=20, substeps=1)
+    _, E = along_lag(solution, 1e-4, solution.t)
+    error = (np.abs(solution["E"] - E).max(axis=0) / np.ptp(E, axis=0)).max()
+    stated = float(str(told[0].message).split("by ")[1].split()[0])
+    assert error / 3 <= stated <= 3 * error
+
+
 def test_a_state_that_is_smooth_needs_no_more_than_its_nodes():
     ocp = co.Problem(1.0)
     x, u = ocp.state("x", initial=0.0), ocp.control("u")
