@@ -17,9 +17,9 @@ def walk():
     """A noisy walk whose positions are correlated from the start."""
     ocp = co.Problem(1.0, "walk")
     variance = [[1.0, 0.4], [0.4, 0.5]]
-    p = ocp.state("p", 2, initial=0.0, final=[1.0, 2.0], variance=variance, unit="m")
+    p = ocp.state("p", 2, initial=0.0, final=[1.0, 2.0], variance=variance, unit="m", lower=-90.0, upper=4.0)
     v = ocp.state("v", initial=0.0, variance=1.0, unit="m/s")
-    u = ocp.control("u", 2, lower=-9.0, upper=9.0)
+    u = ocp.control("u", 2, lower=-1.5, upper=3.0)
     ocp.dynamics(p, u, noise=0.2)
     ocp.dynamics(v, -v)
     ocp.measurement("m", p, noise=1.0)
@@ -91,5 +91,7 @@ def test_a_simulation_shows_the_errors_of_the_filter_and_the_limits(walk, runs):
     np.testing.assert_allclose(np.abs(green[0]), np.sqrt(runs.predicted_error[:, 0, 0]))
     np.testing.assert_allclose(np.abs(green[1]), np.sqrt(runs.error_covariance("p[0]")[:, 0, 0]))
     grey = [line.get_ydata() for line in control.lines if line.get_color() == "#666666"]
-    np.testing.assert_allclose(grey, [-9.0 - runs.nominal_control[:, 0], 9.0 - runs.nominal_control[:, 0]])
-    assert {"predicted error of the estimate", "limit of the control"} <= set(legend_of(figure))
+    np.testing.assert_allclose(grey, [-1.5 - runs.nominal_control[:, 0], 3.0 - runs.nominal_control[:, 0]])
+    bounds = [line.get_ydata() for line in place.lines if line.get_color() == "#666666"]
+    np.testing.assert_allclose(bounds, [4.0 - runs.nominal[:, 0]])  # the lower one is far away
+    assert {"predicted error of the estimate", "limit"} <= set(legend_of(figure))

@@ -60,7 +60,8 @@ def plot_monte_carlo(
 
     A panel of deviations has the predicted standard deviation as a band, mean and standard deviation of the sample as
     dashed lines, and some runs; of states and unknowns also the errors of the filter, predicted and in the runs; of
-    controls their limits. A cloud has the runs at the end, the predicted ellipses and, dashed, those of the sample.
+    states and controls their limits. A cloud has the runs at the end, the predicted ellipses and, dashed, those of the
+    sample.
 
     Args:
         sample: what `simulate` returned.
@@ -93,8 +94,9 @@ def plot_monte_carlo(
     with matplotlib.rc_context(STYLE):
         figure = _figure((PANEL[0] * columns, height * rows + HEAD))
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        for place, component in zip(axes, components, strict=False):
-            _draw_band(place, sample, component, known)
+        limits = [
+            _draw_band(place, sample, component, known) for place, component in zip(axes, components, strict=False)
+        ]
         for place, pair in zip(axes[len(components) :], clouds, strict=False):
             _draw_cloud(place, sample, pair, known, tuple(sizes.tolist()))
         for place in axes[count:]:
@@ -102,9 +104,7 @@ def plot_monte_carlo(
         _title(figure, sample, title)
         rows_shown = [row for _, _, row in components]
         errors = sample.estimated and any(row < sample.size for row in rows_shown)
-        columns_shown = [row - 2 * sample.size for row in rows_shown if row >= 2 * sample.size]
-        limits = any(_limits(sample, column) for column in columns_shown)
-        _legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()), errors=errors, limits=limits)
+        _legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()), errors=errors, limits=any(limits))
         if path is not None:
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
@@ -155,8 +155,8 @@ def _wrong(name: str, expected: str, received: Any) -> ProblemError:
     )
 
 
-def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], units: Mapping[str, str]) -> None:
-    """Deviations of one component over time."""
+def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], units: Mapping[str, str]) -> bool:
+    """Deviations of one component over time; whether a limit is among what is drawn."""
     label, name, row = component
     t, n = sample.t, sample.size
     for run in sample.paths[:, :, row]:
@@ -172,12 +172,24 @@ def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], 
         axes.plot(t, curve, color=SAMPLE, linestyle=(0, (5, 1.6)), linewidth=width)
     if sample.estimated and row < n:
         _draw_error(axes, sample, row)
-    for limit in _limits(sample, row - 2 * n) if row >= 2 * n else ():
-        axes.plot(t, limit, scalex=False, scaley=False, zorder=1, **BOUND)
     axes.axhline(0.0, color="black", linewidth=0.6, zorder=1)
     axes.set_xlabel("time [s]")
     axes.set_ylabel(_folded(_label(label, units.get(name, ""))))
     axes.margins(x=0)
+    return _draw_limits(axes, t, _limits(sample, row))
+
+
+def _draw_limits(axes: Axes, t: Array, limits: list[Array]) -> bool:
+    """Limits that come near what is drawn, if any; the view grows by no more than itself to show them."""
+    low, high = axes.get_ylim()
+    room = (low - (high - low), high + (high - low))
+    near = [limit for limit in limits if limit.min() <= room[1] and limit.max() >= room[0]]
+    for limit in near:
+        axes.plot(t, limit, zorder=1, **BOUND)
+    least, most = (float(f(limit)) for f, limit in ((np.min, near), (np.max, near))) if near else (low, high)
+    margin = 0.05 * (high - low)
+    axes.set_ylim(min(low, max(least - margin, room[0])), max(high, min(most + margin, room[1])))
+    return bool(near)
 
 
 def _draw_error(axes: Axes, sample: MonteCarlo, row: int) -> None:
@@ -189,10 +201,16 @@ def _draw_error(axes: Axes, sample: MonteCarlo, row: int) -> None:
         axes.plot(sample.t, sign * own, color=ERROR, linewidth=1.4, linestyle=DOTTED)
 
 
-def _limits(sample: MonteCarlo, column: int) -> list[Array]:
-    """How far a control may deviate from its nominal, where there are limits."""
-    nominal = sample.nominal_control[:, column]
-    return [limit[column] - nominal for limit in sample.limits if np.isfinite(limit[column])]
+def _limits(sample: MonteCarlo, row: int) -> list[Array]:
+    """How far a control may deviate from its nominal, where there are limits; a state, to its bounds."""
+    n = sample.size
+    if row >= 2 * n:
+        column = row - 2 * n
+        nominal, limits = sample.nominal_control[:, column], [float(limit[column]) for limit in sample.limits]
+    else:
+        bounds = [entry for entry in sample.inequalities.rows if entry.bound and entry.name == sample.augmented[row]]
+        nominal, limits = sample.nominal[:, row], [v for entry in bounds for v in (entry.lower, entry.upper)]
+    return [limit - nominal for limit in limits if np.isfinite(limit)]
 
 
 def _label(name: str, unit: str) -> str:
@@ -254,7 +272,7 @@ def _legend(
         handles.append(Line2D([], [], color=ERROR, linewidth=1.0, label="predicted error of the estimate"))
         handles.append(Line2D([], [], color=ERROR, linestyle=DOTTED, label="error of the estimate in the runs"))
     if limits:
-        handles.append(Line2D([], [], label="limit of the control", **BOUND))
+        handles.append(Line2D([], [], label="limit", **BOUND))
     if clouds:
         widths = ", ".join(f"{k:g}" for k in sigmas)
         handles.append(Line2D([], [], color=PREDICTED, label=f"predicted ellipses ({widths} deviations)"))
