@@ -4,12 +4,14 @@ The control that a step returns is held until the next one. A step from time s t
 deviation from the nominal, computes
 
     y- :  y' = F y + G (u_held - u(time)) over [s, t], one step of the two-stage Gauss method: order 4, stable for any h
-    L  =  h E M' (h M E M' + U)^-1           K h to first order; the spectrum of L M is in [0, 1): stable for any h
+    P- =  Phi E(s) Phi' + h Q                of the error before the measurement; Phi of the same step, E of the design
+    L  =  h P- M' (h M P- M' + U)^-1         K h to first order; the spectrum of L M is in [0, 1): stable for any h, and
+                                             right where a first measurement tells more than all that was known before
     y+ =  y- + L (m - h(x, u, t) - M y- - H (u_held - u(t)))
     u  =  u(t) - C y+,                       within the limits, where there are some
 
-with F, G, M, H, U and the measurement h expected there from the model's own functions along the nominal, E of the
-design and C at t. A measurement stands for the h seconds before it: white noise of density U, averaged over them.
+with F, G, Q, M, H, U and the measurement h expected there from the model's own functions along the nominal, and C at t.
+A measurement stands for the h seconds before it: white noise of density U, averaged over them.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
     "u), one step of the two-stage Gauss method, stable for any h; it is corrected by L (m - what is expected) with "
-    "L = h E M' (h M E M' + U)^-1; the control is u - C y.",
+    "L = h P M' (h M P M' + U)^-1, P = Phi E(s) Phi' + h Q the covariance of its error before; the control is u - C y.",
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
@@ -56,9 +58,10 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     valid = ca.if_else(backwards, 0.0, clock.within)
     h = ca.if_else(valid, clock.time - last, 0.0)
     middle = [last + c * h for c in GAUSS_NODES]
-    predicted = _predict(design, y, held, [tables.at(t) for t in middle], middle, h)
+    before = design.error(tables.at(last).e)
+    predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
     now = tables.at(clock.time)
-    corrected, C, L, missing = _corrected(design, predicted, (held, measured, h), now, clock.time)
+    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h), now, clock.time)
     feedback = C @ corrected
     good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
@@ -178,8 +181,17 @@ def solved(matrix: Any, right: Any) -> Any:
     return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else linear_solve(matrix, right, COMPILED_SOLVER)
 
 
-def _predict(design: Design, y: Any, held: Any, nominal: list[Nominal], at: list[Any], h: Any) -> Any:
-    """The estimate before the measurement, computed in units of typical deviations.
+def _predict(
+    design: Design, given: tuple[Any, Any, Any], nominal: list[Nominal], at: list[Any], h: Any
+) -> tuple[Any, Any]:
+    """Estimate and covariance of its error before the measurement, computed in units of typical deviations.
+
+    Args:
+        design: the model.
+        given: estimate, covariance of its error and control held since the last step.
+        nominal: at both Gauss points of the step.
+        at: their times [s].
+        h: length of the step [s].
 
     The elimination of the stages is that of `covocp.integrators.gauss_matrix`.
     """
@@ -187,7 +199,7 @@ def _predict(design: Design, y: Any, held: Any, nominal: list[Nominal], at: list
     unit, units = ca.DM.eye(n), ca.diag(ca.DM(design.units))
     inverse = ca.diag(1.0 / ca.DM(design.units))
     kind = design.symbolic if n <= SCALAR_SIZE else ca.MX
-    own, du, dt = kind.sym("y", n), kind.sym("held", m), kind.sym("h")
+    own, error, du, dt = kind.sym("y", n), kind.sym("E", n, n), kind.sym("held", m), kind.sym("h")
     symbols = [[kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("t")] for _ in at]
     slopes = [design.linear(*three)[:2] for three in symbols]
     (H1, g1), (H2, g2) = (
@@ -198,21 +210,36 @@ def _predict(design: Design, y: Any, held: Any, nominal: list[Nominal], at: list
     g = np.sqrt(3.0) / 6.0
     a = 0.5 - 2.0 * g
     left, right = unit - g * H2, unit - g * H1
-    stage = solved(left @ right - a / 2 * (H1 + H2), left @ (begin + g * g1) + a / 2 * (g1 + g2))
-    value = own + units @ (right @ stage - begin - g * g1) / a
-    function = ca.Function("predict", [own, du, dt, *symbols[0], *symbols[1]], [ca.densify(value)])
+    asked = ca.horzcat(left @ (begin + g * g1) + a / 2 * (g1 + g2), left)
+    stages = solved(left @ right - a / 2 * (H1 + H2), asked)
+    value = own + units @ (right @ stages[:, 0] - begin - g * g1) / a
+    move = units @ (unit + (right @ stages[:, 1:] - unit) / a) @ inverse
+    spread = move @ error @ move.T + dt * design.noise(*symbols[1])
+    inputs = [own, error, du, dt, *symbols[0], *symbols[1]]
+    function = ca.Function("predict", inputs, [ca.densify(value), ca.densify(spread)])
     points = [(now.x, now.u, t) for now, t in zip(nominal, at, strict=True)]
-    return function(y, held, h, *points[0], *points[1])
+    value, spread = function(*given, h, *points[0], *points[1])
+    return value, spread
 
 
-def _corrected(design: Design, predicted: Any, given: tuple[Any, Any, Any], now: Nominal, time: Any) -> tuple[Any, ...]:
-    """Estimate after the measurement, feedback gain, filter gain, whether a row of the measurement is missing."""
+def _corrected(
+    design: Design, predicted: tuple[Any, Any], given: tuple[Any, Any, Any], now: Nominal, time: Any
+) -> tuple[Any, ...]:
+    """Estimate after the measurement, feedback gain, filter gain, whether a row of the measurement is missing.
+
+    Args:
+        design: the model.
+        predicted: estimate and covariance of its error before.
+        given: control held, measurement, length of the step.
+        now: the nominal.
+        time: of the measurement.
+    """
     st, (n, m, r) = design.statement, design.sizes
     kind = design.symbolic if r <= SCALAR_SIZE else ca.MX
     y, held, measured, h = kind.sym("y", n), kind.sym("held", m), kind.sym("measurement", r), kind.sym("h")
     x, u, e, t = kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("e", st.ne), kind.sym("t")
     _, _, expected, M, slope, U = design.linear(x, u, t)
-    C, E = design.gain(x, u, e, t)
+    E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
     kept = ca.diag(present)
@@ -222,8 +249,8 @@ def _corrected(design: Design, predicted: Any, given: tuple[Any, Any, Any], now:
     L = (units @ solved(units @ spread @ units, h * (units @ rows @ E))).T
     missing = ca.sum1(present) < r
     outputs = [ca.densify(v) for v in (y + L @ residual, C, L, missing)]
-    function = ca.Function("correct", [y, held, measured, h, x, u, e, t], outputs)
-    return tuple(function(predicted, *given, now.x, now.u, now.e, time))
+    function = ca.Function("correct", [y, E, held, measured, h, x, u, e, t], outputs)
+    return tuple(function(*predicted, *given, now.x, now.u, now.e, time))
 
 
 def points(design: Design, tables: History, random: np.random.Generator, count: int) -> Array:

@@ -27,6 +27,7 @@ class Design:
             noise density U (r, r).
         noise: (state, control, time) -> Q (n, n).
         gain: (state, control, half-vectors, time) -> C (m, n), E (n, n).
+        error: half-vectors -> E (n, n).
         weights: (state, control, time) -> A (n, n), N (n, m), B (m, m): second derivatives of the expected running
             cost by deviations of state and control.
         final_weight: S(T) (n, n).
@@ -43,6 +44,7 @@ class Design:
     linear: ca.Function
     noise: ca.Function
     gain: ca.Function
+    error: ca.Function
     weights: ca.Function
     final_weight: Array
     best_gain: bool
@@ -104,6 +106,7 @@ def design_of(solution: Solution, limits: Any) -> Design:
         linear=ca.Function("linear", [x, u, t], [ca.densify(v) for v in (F, G, h, M, slope, U)]),
         noise=ca.Function("noise", [x, u, t], [ca.densify(Q)]),
         gain=ca.Function("gain", [x, u, e, t], [ca.densify(C), ca.densify(E)]),
+        error=ca.Function("error", [e], [ca.densify(E)]),
         weights=ca.Function("weights", [x, u, t], [ca.densify(v) for v in (A, N, B)]),
         final_weight=np.asarray(statement.loop.terminal(solution.trajectory.x[-1], *rest[1:])[1].full()),
         best_gain=statement.loop.by_parts is not None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.errors import ExportError, describe, warn_user
+from covocp.export.moves import WHOLE
 from covocp.export.sampled import Samples
 from covocp.flight import Flight, compared
 from covocp.solution import Solution
@@ -15,6 +16,8 @@ NOTICED = 1.05
 # Share of its largest predicted deviation below which a deviation counts as that: where it passes through a minimum a
 # delay of half a period moves it much and costs nothing.
 SMALL = 0.1
+# The end is what a design is for: there a deviation below this share of the largest counts as that.
+SMALL_AT_END = 1e-3
 
 
 def sampled_flight(solution: Solution, samples: Samples) -> Flight:
@@ -32,7 +35,14 @@ def sampled_flight(solution: Solution, samples: Samples) -> Flight:
     flown = np.diagonal(samples.flown, axis1=1, axis2=2)
     most = np.maximum(variances[after - 1], variances[after])
     expected[:, rows, rows] = np.where(np.isfinite(flown), np.minimum(flown, most), most)
-    return compared(solution, samples.flown, expected, samples.times, SMALL)
+    along = compared(solution, samples.flown, expected, samples.times, SMALL)
+    if samples.times[-1] >= nodes[-1] * (1.0 - WHOLE):
+        expected[-1, rows, rows] = np.minimum(flown[-1], variances[-1])
+    ends = samples.flown[-1:].copy(), expected[-1:].copy()
+    for end in ends:
+        end[0, rows, rows] = np.maximum(end[0, rows, rows], SMALL_AT_END**2 * variances.max(axis=0))
+    at_end = compared(solution, *ends, samples.times[-1:])
+    return max(along, at_end, key=lambda flight: flight.worst)
 
 
 def check_flight(flight: Flight, largest: float, period: float | None) -> None:
