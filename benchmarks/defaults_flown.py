@@ -48,6 +48,8 @@ def answers(controller: Any, when: float) -> np.ndarray:
     places, row = controller._places, np.zeros(controller._size)
     for place, field in controller._kept:
         row[place] = controller._values[field]
+    for name in ("estimate", "held"):  # those of the nominal, zero; alone the law may be unstable
+        row[places[name]] = 0.0
     row[places["time"]] = when
     results, status = controller._backend(row)
     chosen = [*range(*controller._estimate.indices(10**6)), *range(*controller._control.indices(10**6))]
