@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +10,7 @@ from covocp.extremal import Extremal
 from covocp.guess import magnitudes
 from covocp.hamiltonian import discrete_costates
 from covocp.matrices import Array
-from covocp.mesh import Mesh, Options
+from covocp.mesh import Mesh, Options, with_substeps
 from covocp.refinement import Refined, refined_end, refined_run
 from covocp.statement import Statement
 from covocp.trajectory import Trajectory
@@ -127,8 +125,7 @@ def finer_steps(extremal: Extremal, options: Options) -> Options | None:
     substeps = min(factor, MOST_SUBSTEPS // mesh.substeps) * mesh.substeps
     if substeps <= mesh.substeps:
         return None
-    step: Any = {"step": "rodas" if mesh.step == "rodas" else "rk4"}
-    return replace(options, substeps=substeps, points=mesh.points, **step)
+    return with_substeps(options, mesh, substeps)
 
 
 def _moved(jumps: Array, x: Array) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -205,6 +205,12 @@ def choose_mesh(statement: Statement, options: Options, step: Step, stiffness: S
         step=step,
         points=points,
     )
+
+
+def with_substeps(options: Options, mesh: Mesh, substeps: int) -> Options:
+    """Options of a mesh with other integration steps of its kind, and limits imposed where they are."""
+    step: Any = "rodas" if mesh.step == "rodas" else "rk4"
+    return replace(options, substeps=substeps, points=mesh.points, step=step)
 
 
 def _choose_points(statement: Statement, options: Options, substeps: int, group: int) -> tuple[int, int]:

@@ -35,7 +35,7 @@ from covocp.forgotten import mention_forgotten, mention_lengths
 from covocp.grading import graded
 from covocp.lookup import stacked_parameters
 from covocp.matrices import Array
-from covocp.mesh import Options
+from covocp.mesh import Mesh, Options, with_substeps
 from covocp.problem import Problem
 from covocp.progress import Progress
 from covocp.random_starts import random_guesses
@@ -189,6 +189,8 @@ class Solver:
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
+        if isinstance(guess, Solution):
+            self._take_steps(guess.mesh)
         with evaluating(self.statement.name):
             with Progress(self.statement.name or "solving", progress) as reporter:
                 if isinstance(guess, str):
@@ -322,6 +324,15 @@ class Solver:
             "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
         return _with_stats(min(better, key=cost_of), left_saddle=True)
+
+    def _take_steps(self, mesh: Mesh) -> None:
+        """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
+        own = self._prepared.mesh
+        times, rest = divmod(mesh.substeps, own.substeps)
+        alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
+        if self._own_steps and alike and times > 1 and not rest:
+            self._options = with_substeps(self._options, own, mesh.substeps)
+            self._prepared = cast(Prepared, self._prepare(self._solved, self._options, **self._own))
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""

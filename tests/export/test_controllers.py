@@ -165,7 +165,8 @@ def test_rows_that_are_missing_leave_the_filter_of_the_others():
     controller.step([np.nan, np.nan], t - h)
     controller.step([np.nan, 3.0], t)
     assert controller.status == "MEASUREMENT_MISSING"
-    np.testing.assert_allclose(controller.state["filter_gain"][:, 1:], expected, rtol=1e-4, atol=1e-9 * np.abs(expected).max())
+    found, small = controller.state["filter_gain"][:, 1:], 1e-9 * np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=small)  # one Gauss step of order 4
     np.testing.assert_array_equal(controller.state["filter_gain"][:, 0], 0.0)
     assert np.isfinite(controller.state["estimate"]).all()
 

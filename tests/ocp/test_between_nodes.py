@@ -93,6 +93,14 @@ def test_default_steps_are_as_short_as_what_is_at_the_nodes_asks_for(run):
         assert limits[0] <= error <= limits[1]
 
 
+def test_a_warm_start_takes_the_shorter_steps_of_its_solution():
+    solution = solve(lag(1e-4), intervals=60)
+    again = solve(lag(1e-4), intervals=60, guess=solution)
+    assert again.mesh.substeps == solution.mesh.substeps > 1
+    assert again.stats["iterations"] <= 1
+    assert again.cost == pytest.approx(solution.cost, rel=1e-9)
+
+
 def test_given_steps_that_are_too_long_for_the_nodes_are_told_with_what_they_lose():
     problem = lag(1e-4)
     with pytest.warns(co.CovocpWarning, match="integration steps are long: halving them moves") as told:
