@@ -26,7 +26,7 @@ from scipy.linalg import expm
 import covocp as co
 from covocp.flight import interpolated_flight
 
-LOOPS, POLE, MOST = 10, 0.05, 60_000
+LOOPS, POLE, MOST = 10, 0.02, 60_000
 
 
 def over_period(s: System, period: float) -> tuple[np.ndarray, np.ndarray]:
