@@ -118,7 +118,7 @@ def finer_steps(extremal: Extremal, options: Options) -> Options | None:
     """
     mesh = extremal.mesh
     error = node_error(extremal)
-    if not error > NODES:  # nan: where halving them diverges nothing can be said
+    if not NODES < error < np.inf:  # where halving them diverges nothing can be said
         return None
     order = 2 if mesh.step == "strang" else ORDER
     factor = int(np.clip(np.ceil((error / NODES) ** (1 / order)), 2, MOST_TIMES))

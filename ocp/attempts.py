@@ -62,7 +62,7 @@ def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: 
         OutsideDomainError: all of them lie outside it (says what the first one lacks).
     """
     best: Outcome | None = None
-    stopped: Guess | None = None
+    stopped: tuple[int, Guess] | None = None
     refused: list[OutsideDomainError] = []
     costs: list[float] = []
     for guess in guesses:
@@ -77,14 +77,15 @@ def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: 
         if best is None or (outcome.converged, -cost) > (best.converged, -cost_of(best)):
             best = outcome
         if stopped is None and outcome.stats.get("wandered"):
-            stopped = guess
+            stopped = len(costs) - 1, guess
         if reporter.stop:
             break
     if best is None:
         raise refused[0]
     if not best.converged and stopped is not None and not reporter.stop:
-        best = prepared.solve(values, stopped, reporter)
-        costs[-1] = cost_of(best) if best.converged else np.nan
+        place, guess = stopped
+        best = prepared.solve(values, guess, reporter)
+        costs[place] = cost_of(best) if best.converged else np.nan
     return replace(best, stats={**best.stats, "starts": costs, "asked": count})
 
 

@@ -188,8 +188,8 @@ def _passage(first: Array, forms: tuple[Array, Array, Array], times: Array) -> A
     values = np.zeros((count, size, size))
     values[0] = first
     try:
-        steps = np.linalg.solve(unit - h / 2 + square, unit + h / 2 + square)
-        for k, D in enumerate(steps):
+        for k in range(count - 1):
+            D = np.linalg.solve(unit - h[k] / 2 + square[k], unit + h[k] / 2 + square[k])
             moved = D[:, :size] + D[:, size:] @ values[k]
             after = np.linalg.solve(moved[:size].T, moved[size:].T)
             values[k + 1] = 0.5 * (after + after.T)

@@ -59,7 +59,7 @@ def noted(effect: MeanEffect | None) -> dict[str, Any]:
 def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
     """The effect of the rates' and measurements' curvature along a solution.
 
-    None where rates contain a matrix, or where the loop leaves the range of numbers.
+    None where rates contain a matrix, where the loop leaves the range of numbers or a step cannot be solved.
     """
     st = extremal.statement
     if st.nominal is None or st.loop is None:
@@ -73,7 +73,10 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
     for k in range(count):
         (A, a, c), (B, b, e) = ((drift[k], forcing[k], slope[k]) for drift, forcing, slope in sides)
         right = state + h[k] / 2 * (A @ state + a + b)
-        after = np.linalg.solve(np.eye(2 * n) - h[k] / 2 * B, right)
+        try:
+            after = np.linalg.solve(np.eye(2 * n) - h[k] / 2 * B, right)
+        except np.linalg.LinAlgError:  # a step that is as long as one over a rate of growth
+            return None
         cost += h[k] / 2 * float(c @ state + e @ after)
         states[k + 1] = state = after
     at_end = st.loop.terminal.jacobian()(

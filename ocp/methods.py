@@ -212,6 +212,13 @@ class Solver:
         mesh = evaluation_mesh(self.statement, self._options, found.parameters)
         t = found.trajectory
         closed = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+        options = self._options
+        while self._own_steps and closed.converged and (finer := finer_steps(closed.extremal, options)):
+            mesh = evaluation_mesh(self.statement, finer, found.parameters)
+            shorter = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+            if not shorter.converged:
+                break
+            closed, options = shorter, finer
         return replace(
             closed,
             converged=outcome.converged and closed.converged,
@@ -256,11 +263,14 @@ class Solver:
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
         try:
             prepared = self._prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
-            with Progress("", show=False) as reporter:
-                start = make_guess(self._solved, prepared.mesh, values, solution)
-                outcome = prepared.solve(values, start, reporter)
-        except CovocpError:  # a plugin that has no tolerance
+        except ProblemError:  # a plugin that has no tolerance
             return solution
+        with Progress("", show=False) as reporter:
+            start = make_guess(self._solved, prepared.mesh, values, solution)
+            outcome = prepared.solve(values, start, reporter)
+            if reporter.stop:
+                message = "Interrupted while the solution was made more exact. On this error (.solution): a solution."
+                raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
         return _noted(Solution.of(outcome, self.method), **{**solution.stats, **_counted(solution, outcome)})
@@ -331,19 +341,29 @@ class Solver:
         times, rest = divmod(mesh.substeps, own.substeps)
         alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
         if self._own_steps and alike and times > 1 and not rest:
-            self._options = with_substeps(self._options, own, mesh.substeps)
-            self._prepared = cast(Prepared, self._prepare(self._solved, self._options, **self._own))
+            options = with_substeps(self._options, own, mesh.substeps)
+            self._keep(options, cast(Prepared, self._prepare(self._solved, options, **self._own)))
+
+    def _keep(self, options: Options, prepared: Prepared) -> None:
+        """Other steps from now on; what the classical design costs is then another number."""
+        self._options, self._prepared, self._classical = options, prepared, None
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
-        while self._own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, self._options)):
-            prepared = cast(Prepared, self._prepare(self._solved, finer, **self._own))
-            start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
-            again = prepared.solve(values, start, reporter)
-            if not again.converged:  # what the steps are off is told with the solution
+        while self._own_steps and outcome.converged and not reporter.stop:
+            finer = finer_steps(outcome.extremal, self._options)
+            if finer is None:
                 break
-            outcome, self._prepared = _with_stats(again, **_counted(outcome, again)), prepared
-            self._options = finer
+            try:
+                prepared = cast(Prepared, self._prepare(self._solved, finer, **self._own))
+                start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
+                again = prepared.solve(values, start, reporter)
+            except CovocpError:  # what the steps are off is told with the solution that there is
+                break
+            if not again.converged:
+                break
+            outcome = _with_stats(again, **{**outcome.stats, **again.stats, **_counted(outcome, again)})
+            self._keep(finer, prepared)
         return outcome
 
     def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:

@@ -158,7 +158,7 @@ def prepare(
         settings |= JIT
         mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
     settings = merged(settings, plugin_options or {})
-    limit = max(LIMIT, LIMIT_PER_TOLERANCE * (TOLERANCE if tolerance is None else tolerance))
+    limit = max(LIMIT, LIMIT_PER_TOLERANCE * settings.get("ipopt", {}).get("tol", TOLERANCE))
     return ShootingSolver(statement, mesh, plugin, settings, limited, limit)
 
 
@@ -258,7 +258,8 @@ class ShootingSolver:
             best = min(done, key=lambda entry: entry.worst)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
-            if done[-1].point.success and done[-1].point.iterations <= AT_ONCE:  # new scales alone do not move it
+            at_once = 0 <= done[-1].point.iterations <= AT_ONCE
+            if self._plugin == "ipopt" and done[-1] is best and at_once:  # new scales alone do not move it
                 self._tighten()
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
             solver = self._warm_solver() if start.lam_x is not None else self._cold
@@ -270,7 +271,7 @@ class ShootingSolver:
         return done
 
     def _tighten(self) -> None:
-        """Ask more of Ipopt in the runs that follow; other plugins keep the tolerance of their own options."""
+        """Ask more of Ipopt in the warm starts that follow."""
         self._strictness *= STRICTER
         self._warm = None
 

@@ -101,6 +101,12 @@ def test_a_warm_start_takes_the_shorter_steps_of_its_solution():
     assert again.cost == pytest.approx(solution.cost, rel=1e-9)
 
 
+def test_shorter_steps_keep_what_is_told_of_the_starts():
+    solution = solve(lag(1e-4), intervals=60, guess="multistart", starts=2)
+    assert solution.mesh.substeps > 1
+    assert len(solution.stats["starts"]) == solution.stats["asked"] == 3
+
+
 def test_given_steps_that_are_too_long_for_the_nodes_are_told_with_what_they_lose():
     problem = lag(1e-4)
     with pytest.warns(co.CovocpWarning, match="integration steps are long: halving them moves") as told:
