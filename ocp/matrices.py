@@ -7,6 +7,7 @@ the entry stands for two entries of the matrix (Schmidt 1971, section 2.4).
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from typing import Any
 
@@ -33,7 +34,7 @@ def real_numbers(value: Any) -> Array:
         return np.asarray(float(value))
     if value is None or _no_number(value):
         raise TypeError("numpy would read words and truths as numbers, and None as NaN")
-    if np.ma.is_masked(value):
+    if "numpy.ma" in sys.modules and np.ma.is_masked(value):  # importing it takes longer than a solve
         raise TypeError("numpy would read what is masked too")
     numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value)
     if numbers.dtype.kind not in "fiubO":

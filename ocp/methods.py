@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from covocp.accuracy import finer_steps
+from covocp.accuracy import OPTIMISED, finer_steps
 from covocp.arguments import checked, text, truth
 from covocp.attempts import best_of, cost_of, from_starts
 from covocp.checks import check_kind, is_whole
@@ -351,7 +351,7 @@ class Solver:
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
-            finer = finer_steps(outcome.extremal, self._options)
+            finer = finer_steps(outcome.extremal, self._options, OPTIMISED)
             if finer is None:
                 break
             try:

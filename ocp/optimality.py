@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.accuracy import node_error
 from covocp.closed_loop import ClosedLoop
 from covocp.convergence import complementary
 from covocp.curvature import smallest_curvature
@@ -55,6 +56,8 @@ class Optimality:
             depends on time explicitly.
         transversality: k_T + H(T) with all multipliers, relative to the largest terms of H; None for a fixed duration.
         mesh_error: relative change of the cost by halving the integration steps.
+        node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
+            relative to its range.
         control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
@@ -74,6 +77,7 @@ class Optimality:
     hamiltonian_variation: float | None
     transversality: float | None
     mesh_error: float
+    node_error: float
     control_error: float | None
     smallest_eigenvalue: float
     curvature: float | None
@@ -137,6 +141,7 @@ def assess(
         hamiltonian_variation=_variation(values) if st.autonomous else None,
         transversality=_transversality(extremal, costates, values) if st.duration.free else None,
         mesh_error=mesh_error,
+        node_error=node_error(extremal),
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=_curvature(extremal),
@@ -169,7 +174,11 @@ def complementarity(extremal: Extremal) -> float:
 
 
 def identities(
-    mesh_error: float, smallest_eigenvalue: float, loop: ClosedLoop | None, cost_identity: float | None
+    extremal: Extremal,
+    mesh_error: float,
+    smallest_eigenvalue: float,
+    loop: ClosedLoop | None,
+    cost_identity: float | None,
 ) -> Optimality:
     """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
     return Optimality(
@@ -179,6 +188,7 @@ def identities(
         hamiltonian_variation=None,
         transversality=None,
         mesh_error=mesh_error,
+        node_error=node_error(extremal),
         control_error=None,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=None,

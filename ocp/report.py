@@ -42,6 +42,7 @@ RESIDUALS = {
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
     "transversality": "condition of the free duration, k_T + H(T) (relative)",
     "mesh_error": "cost: change by halving the integration steps (relative)",
+    "node_error": "states and covariances at the nodes: change by halving the steps (of their range)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
     "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
     "cost_identity": "expected cost: as optimised against from the covariances (relative)",
@@ -69,6 +70,7 @@ WORRIES: dict[str, tuple[float, str]] = {
         "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
     ),
     "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
+    "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
     "control_error": (1e-3, "large: a freer control would cost that much less: more intervals, or control='linear'"),
     "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
     "cross_covariance": (

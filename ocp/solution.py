@@ -204,9 +204,9 @@ class Solution:
         """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
         if self.stored_optimality is not None:
             return self.stored_optimality
-        if not self.optimised:
-            return identities(self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
+        if not self.optimised:
+            return identities(self.extremal, *known)
         return assess(self.extremal, self.costates, *known)
 
     @property

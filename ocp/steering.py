@@ -24,7 +24,7 @@ TRACKING_STEPS = 20
 CUTS = 5
 # Share of the control's energy in what tracking minimises, beside the squared miss in units of the states.
 TRACKING_ENERGY = 1e-4
-# Operations up to which a run and its slopes are written out in scalars: many calls pay for it.
+# Operations up to which a run and its slopes are written out in scalars where they are called often.
 SHORT = 50_000
 # Smallest singular value, relative to the largest, of directions in which the controls move what is aimed at.
 RANK = 1e-8
@@ -95,7 +95,9 @@ def _along(statement: Statement, mesh: Mesh) -> ca.Function:
 
 
 @lru_cache(maxsize=KEPT)
-def _aims(statement: Statement, mesh: Mesh, columns: tuple[int, ...], rows: tuple[int, ...]) -> ca.Function:
+def _aims(
+    statement: Statement, mesh: Mesh, columns: tuple[int, ...], rows: tuple[int, ...], often: bool
+) -> ca.Function:
     """(start, controls as one column, T, p) -> some states at the ends of some intervals, their Jacobian by u."""
     u = ca.MX.sym("u", statement.nu * mesh.control_nodes)
     x0, duration, p = ca.MX.sym("x0", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)
@@ -103,14 +105,18 @@ def _aims(statement: Statement, mesh: Mesh, columns: tuple[int, ...], rows: tupl
     ends = _along(statement, mesh)(x0, matrix, duration, p)[0]
     value = ca.vec(ends[list(rows), list(columns)])
     function = ca.Function("aims", [x0, u, duration, p], [value, ca.jacobian(value, u)])
+    if not often:
+        return function
     length = nominal_interval(statement, mesh.substeps, mesh.step).n_instructions() * mesh.intervals * value.shape[0]
     scalar = statement.symbolic is ca.SX and mesh.step != "rodas"  # implicit steps solve linear systems
     return function.expand() if scalar and length <= SHORT else function
 
 
-def final_pull(run: Run, fixed: tuple[int, ...], target: Array, u: Array) -> tuple[Array, Array]:
+def final_pull(
+    run: Run, fixed: tuple[int, ...], target: Array, u: Array, often: bool = True
+) -> tuple[Array, Array]:
     """Miss of the final values of some states in their scales, and its Jacobian by the controls."""
-    aims = _aims(run.statement, run.mesh, (run.mesh.intervals - 1,), fixed)
+    aims = _aims(run.statement, run.mesh, (run.mesh.intervals - 1,), fixed, often)
     value, slope = aims(run.start, u.ravel(), run.duration, run.parameters)
     scale = run.divisors[list(fixed)]
     return (np.asarray(value.full()).ravel() - target) / scale, np.asarray(slope.full()) / scale[:, None]
@@ -125,16 +131,16 @@ def steer(run: Run, fixed: tuple[int, ...], target: Array, plain: Array) -> tupl
         The controls, and the share of the miss that the first step leaves where no bound stops it: 0 where the states
         answer in proportion.
     """
-    best, (gap, slope) = plain, final_pull(run, fixed, target, plain)
+    best, (gap, slope) = plain, final_pull(run, fixed, target, plain, often=False)
     norm, left = float(np.linalg.norm(gap)), 0.0
     for k in range(STEERING_STEPS):
         if not np.isfinite(slope).all() or not norm >= STEERING_TOLERANCE:
             break
         wanted = best + _least_change(slope, -gap, run.weights).reshape(best.shape)
         trial = run.clip(wanted)
-        following, its_slope = final_pull(run, fixed, target, trial)
+        following, its_slope = final_pull(run, fixed, target, trial, often=False)
         if k == 0:
-            free = following if np.array_equal(trial, wanted) else final_pull(run, fixed, target, wanted)[0]
+            free = following if np.array_equal(trial, wanted) else final_pull(run, fixed, target, wanted, often=False)[0]
             left = float(np.nan_to_num(np.linalg.norm(free) / norm, nan=np.inf))
         if not np.linalg.norm(following) < norm:
             break
@@ -202,7 +208,7 @@ def track(run: Run, rows: tuple[int, ...], path: Array, plain: Array) -> Array:
     Returns:
         The controls.
     """
-    aims = _aims(run.statement, run.mesh, tuple(range(run.mesh.intervals)), rows)
+    aims = _aims(run.statement, run.mesh, tuple(range(run.mesh.intervals)), rows, True)
     lengths = np.repeat(np.diff(run.mesh.nodes), len(rows))
     scale = np.sqrt(lengths) / np.tile(run.divisors[list(rows)], run.mesh.intervals)
     goal, root = path[1:].ravel(), np.sqrt(TRACKING_ENERGY * run.weights)
