@@ -9,7 +9,7 @@ import numpy as np
 from covocp.extremal import Extremal
 from covocp.guess import magnitudes
 from covocp.hamiltonian import discrete_costates
-from covocp.matrices import Array, half_indices
+from covocp.matrices import Array
 from covocp.mesh import Mesh, Options, with_substeps
 from covocp.refinement import Refined, refined_end, refined_run
 from covocp.statement import Statement
@@ -25,9 +25,9 @@ FAR, MANY_PARTS = 0.05, 16
 STEP_ROUNDOFF = 1e-13
 # Change of what is at a node by halving the steps, relative to its range, that is told.
 LONG_STEPS = 1e-2
-# Largest such change that default steps leave along a nominal, and where the nominal is optimised, which shorter steps
-# would make two to four times slower (chains of masses).
-ALONG, OPTIMISED = 1e-4, 1e-3
+# Largest such change that default steps leave along a nominal, and where the nominal is optimised: shorter steps would
+# make that two to four times slower (chains of masses), and the cost has fewer digits than the nodes.
+ALONG, OPTIMISED = 1e-4, 2e-3
 # Order of the steps, by how much they are divided at a time at most, and how many there may be in an interval.
 ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
@@ -100,22 +100,12 @@ def node_error(extremal: Extremal) -> float:
     scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
     least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
-    size = np.maximum(_ranges(extremal.statement, values), least)
+    size = np.maximum(np.ptp(values, axis=0), least)
     with np.errstate(over="ignore", invalid="ignore"):
         moved, inside = np.cumsum(finer.jumps, axis=0), np.hstack([finer.states, finer.matrices]) - values
         total = np.abs(inside).max(axis=0)
         total[: moved.shape[1]] += np.abs(moved).max(axis=0)
         return float((total / size).max(initial=0.0))
-
-
-def _ranges(statement: Statement, values: Array) -> Array:
-    """Ranges of states and entries; those off the diagonal of a matrix have at least that of a correlation."""
-    result: Array = np.ptp(values, axis=0)
-    for block in statement.matrices:
-        own, (rows, columns) = result[statement.nx :][block.span], half_indices(block.size)
-        diagonal = own[rows == columns]
-        own[:] = np.maximum(own, np.sqrt(diagonal[rows] * diagonal[columns]))
-    return result
 
 
 def finer_steps(extremal: Extremal, options: Options, allowed: float = ALONG) -> Options | None:

@@ -138,7 +138,8 @@ def implicit_interval(statement: Statement, substeps: int, nodes: tuple[float, .
             total += nominal(inside[:, k], u, duration * s, duration, p)[1] / (substeps * len(nodes))
         states.append(x)
     length = common[3] * common[4]
-    return ca.Function("implicit_interval", [start, *common], [x, ca.horzcat(*states), length * total])
+    options = {"is_diff_in": [True] * 3 + [False, False, statement.duration.free, False]}  # as explicit steps
+    return ca.Function("implicit_interval", [start, *common], [x, ca.horzcat(*states), length * total], options)
 
 
 @lru_cache(maxsize=KEPT)

@@ -18,7 +18,7 @@ from covocp.held import Entries
 from covocp.integrators import KEPT, full_interval, nominal_interval
 from covocp.matrices import Array
 from covocp.mesh import Mesh
-from covocp.shooting import common_columns, matrices_along, repeat
+from covocp.shooting import common_columns, matrices_along
 from covocp.statement import Statement
 
 
@@ -83,9 +83,8 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         ("end", st.end, end, [n]),
     ):
         if conditions.size:
-            k = len(at)
-            columns = (v[:, at] for v in (x, at_nodes, e, time))
-            rows[kind] = conditions.function.map(k)(*columns, ca.repmat(duration, 1, k), repeat(p, k))
+            places = (x[:, at], at_nodes[:, at], e[:, at], time[:, at])
+            rows[kind] = conditions.columns(places, duration, p)
             value += ca.dot(weights, rows[kind])
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
     inputs = [w, e0, duration, p, costate, final, final_e, start, end, path, states, matrices]

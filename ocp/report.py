@@ -42,7 +42,7 @@ RESIDUALS = {
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
     "transversality": "condition of the free duration, k_T + H(T) (relative)",
     "mesh_error": "cost: change by halving the integration steps (relative)",
-    "node_error": "states and covariances at the nodes: change by halving the steps (of their range)",
+    "node_error": "nodes: change by halving the integration steps (of the range)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
     "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
     "cost_identity": "expected cost: as optimised against from the covariances (relative)",

@@ -69,6 +69,17 @@ class Conditions:
         """Number of rows."""
         return len(self.names)
 
+    def columns(self, at_columns: tuple[Any, Any, Any, Any], duration: Any, parameters: Any) -> Any:
+        """The values for columns of (x, u, matrices, time); matrices that no row reads are no part of the expression.
+
+        Else every slope of these values would carry the propagation of the covariances along.
+        """
+        x, u, matrices, time = at_columns
+        count = x.shape[1]
+        seen = matrices if self.uses_matrices else ca.DM(*matrices.shape)
+        at = (ca.repmat(duration, 1, count), ca.repmat(parameters, 1, count))
+        return self.function.map(count)(x, u, seen, time, *at)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Loop:

@@ -112,9 +112,7 @@ def _aims(
     return function.expand() if scalar and length <= SHORT else function
 
 
-def final_pull(
-    run: Run, fixed: tuple[int, ...], target: Array, u: Array, often: bool = True
-) -> tuple[Array, Array]:
+def final_pull(run: Run, fixed: tuple[int, ...], target: Array, u: Array, often: bool = True) -> tuple[Array, Array]:
     """Miss of the final values of some states in their scales, and its Jacobian by the controls."""
     aims = _aims(run.statement, run.mesh, (run.mesh.intervals - 1,), fixed, often)
     value, slope = aims(run.start, u.ravel(), run.duration, run.parameters)
@@ -140,7 +138,8 @@ def steer(run: Run, fixed: tuple[int, ...], target: Array, plain: Array) -> tupl
         trial = run.clip(wanted)
         following, its_slope = final_pull(run, fixed, target, trial, often=False)
         if k == 0:
-            free = following if np.array_equal(trial, wanted) else final_pull(run, fixed, target, wanted, often=False)[0]
+            bounded = not np.array_equal(trial, wanted)
+            free = final_pull(run, fixed, target, wanted, often=False)[0] if bounded else following
             left = float(np.nan_to_num(np.linalg.norm(free) / norm, nan=np.inf))
         if not np.linalg.norm(following) < norm:
             break

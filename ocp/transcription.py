@@ -12,7 +12,7 @@ import numpy as np
 from covocp.matrices import Array
 from covocp.mesh import Mesh
 from covocp.nlp import NLP, Rows, Scales
-from covocp.shooting import common_columns, repeat, shoot, substep_columns
+from covocp.shooting import common_columns, shoot, substep_columns
 from covocp.statement import Conditions, Statement
 
 
@@ -92,11 +92,8 @@ def _constraints(
     for kind, (conditions, columns) in places.items():
         if conditions.size:
             k = len(columns)
-            value = conditions.function.map(k)(
-                *(v[:, columns] for v in arguments),
-                ca.repmat(variables.duration, 1, k),
-                repeat(variables.parameters, k),
-            )
+            x, u, e, t = (v[:, columns] for v in arguments)
+            value = conditions.columns((x, u, e, t), variables.duration, variables.parameters)
             rows.append(
                 Rows(
                     kind=kind,
@@ -177,16 +174,16 @@ def _inside_rows(
         rows.append(_bound_rows("bounds_inside", statement, scales, nodes["x_inside"][statement.bounded_states, :]))
     path = statement.path
     if path.size:
-        start, end, s, ds, duration, parameters = substep_columns(
+        start, _, s, *_ = substep_columns(
             common_columns(mesh, variables.u, variables.duration, variables.parameters), mesh.points, n
         )
         at = [k * mesh.points + j for k in range(n) for j in range(1, mesh.points)]
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
-        others = (start[:, at], e, duration[:, at] * s[:, at], duration[:, at], parameters[:, at])
+        places = (nodes["x_inside"], start[:, at], e, variables.duration * s[:, at])
         rows.append(
             Rows(
                 kind="path_inside",
-                expression=ca.vec(path.function.map(n * inner)(nodes["x_inside"], *others)),
+                expression=ca.vec(path.columns(places, variables.duration, variables.parameters)),
                 lower=np.tile(path.lower, n * inner),
                 upper=np.tile(path.upper, n * inner),
                 names=path.names,

@@ -9,7 +9,11 @@ from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, simulate, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.guess import resolve_mesh
+from covocp.mesh import Options
 from covocp.models import damped_oscillator, mass_chain, noisy_integrator
+from covocp.nlp import Scales
+from covocp.transcription import transcribe
 
 FORMULATIONS = ("eliminated", "states")
 
@@ -239,6 +243,25 @@ def test_path_constraint_between_nodes():
     assert list(found) == ["wall"]
     assert found["wall"] == pytest.approx(expected, rel=1e-6)
     assert solution["x"][:, 0].max() < 0.1 + 1e-7
+
+
+def test_constraints_that_no_covariance_enters_do_not_evaluate_its_propagation():
+    """Their slopes would be as dear as those of the covariances: a motor with a limited current took five times."""
+
+    def called(limited):
+        example = lag()
+        ocp = example.problem
+        ocp.subject_to(example.E[example.b, example.b] if limited == "variance" else example.x**2, upper=6.0)
+        st = ocp.statement()
+        mesh = resolve_mesh(st, Options(intervals=20, covariances="eliminated", points=2, substeps=2), st.values)
+        ones = Scales(x=np.ones(st.nx), u=np.ones(st.nu), e=np.ones(st.ne), duration=1.0)
+        nlp = transcribe(st, mesh, ones)
+        function = ca.Function("g", [nlp.w, nlp.p], [nlp.g])
+        instructions = [function.instruction_MX(k) for k in range(function.n_instructions())]
+        return {entry.which_function().name() for entry in instructions if entry.is_call()}
+
+    assert any("propagate" in name for name in called("variance"))
+    assert not any("propagate" in name or "step_matrix" in name for name in called("state"))
 
 
 @pytest.mark.parametrize("control", ["linear", "constant"])
