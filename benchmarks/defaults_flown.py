@@ -24,7 +24,7 @@ from defaults_expected_cost import System, problem, random_system
 from scipy.linalg import expm
 
 import covocp as co
-from covocp.flight import interpolated_flight
+from covocp.solution.flight import interpolated_flight
 
 LOOPS, POLE, MOST = 10, 0.02, 60_000
 

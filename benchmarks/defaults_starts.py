@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import covocp as co
-from covocp.candidates import own_start
+from covocp.transcription.starts import own_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from vehicles import DURATION, SPEED, vehicle

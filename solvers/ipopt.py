@@ -10,18 +10,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
-from covocp.convergence import LIMIT
-from covocp.domain import needs_exact_bounds
-from covocp.errors import ProblemError, describe
-from covocp.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
-from covocp.guess import choose_scales, resolve_mesh, starts
-from covocp.hamiltonian import without_passage
-from covocp.linear_solve import COMPILED_SOLVER
-from covocp.matrices import Array
-from covocp.mesh import Mesh, Options
-from covocp.nlp import NLP, Scales, check_finite
-from covocp.progress import Progress
+from covocp.base.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
+from covocp.base.errors import ProblemError, describe
+from covocp.base.linear_solve import COMPILED_SOLVER
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.base.residuals import LIMIT
+from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
+from covocp.extremal.hamiltonian import without_passage
 from covocp.solvers.plugins import merged, silent
 from covocp.solvers.reached import (
     FirstOrder,
@@ -34,9 +30,13 @@ from covocp.solvers.reached import (
     residuals,
     similar,
 )
-from covocp.statement import Statement
-from covocp.steering import quadrature_weights
-from covocp.transcription import transcribe
+from covocp.statement.statement import Statement
+from covocp.transcription.domain import needs_exact_bounds
+from covocp.transcription.first_guess import choose_scales, resolve_mesh, starts
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.nlp import NLP, Scales, check_finite
+from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.transcribing import transcribe
 
 TOLERANCE = 1e-7
 MAX_ITERATIONS = 1000

@@ -8,11 +8,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.convergence import LIMIT, VANISHING, Residuals, complementary
-from covocp.guess import choose_scales, magnitudes
-from covocp.matrices import Array
-from covocp.nlp import NLP, Scales
-from covocp.trajectory import Trajectory
+from covocp.base.matrices import Array
+from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
+from covocp.transcription.first_guess import choose_scales, magnitudes
+from covocp.transcription.nlp import NLP, Scales
+from covocp.transcription.trajectory import Trajectory
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
 SMALLEST_SHARE = 1e-6

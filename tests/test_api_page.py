@@ -16,25 +16,25 @@ from typing import Any
 import pytest
 
 import covocp as co
-from covocp.mesh import Options
-from covocp.methods import Solver, method_options
-from covocp.plot import plot_solutions
+from covocp.plot.figure import plot_solutions
+from covocp.solving.solver import Solver, method_options
+from covocp.transcription.mesh import Options
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "api.md").read_text(encoding="utf-8")
 SECTIONS = dict(re.findall(r"^## (.*)\n((?:(?!^## ).*\n)*)", PAGE, re.MULTILINE))
 CODE = re.compile(r"`([^`]+)`")
 # Classes that a user meets without making them.
 MET = {
-    "EstimationCovariance": "covocp.estimation",
-    "Sample": "covocp.sample",
-    "Optimality": "covocp.optimality",
-    "ClosedLoop": "covocp.closed_loop",
-    "Row": "covocp.solvers.compare",
-    "MeanEffect": "covocp.mean_effect",
+    "EstimationCovariance": "covocp.problem.estimation_covariance",
+    "Sample": "covocp.solution.sample",
+    "Optimality": "covocp.extremal.optimality",
+    "ClosedLoop": "covocp.extremal.closed_loop",
+    "Row": "covocp.solving.comparison",
+    "MeanEffect": "covocp.extremal.mean_effect",
     "Count": "covocp.simulation.counts",
     "Verdict": "covocp.simulation.verdict",
-    "Check": "covocp.export.package",
-    "Timing": "covocp.export.package",
+    "Check": "covocp.export.compiled.package",
+    "Timing": "covocp.export.compiled.package",
 }
 # By the user: their data are set on construction.
 MADE = ("Free", "Gain", "Problem", "Solver", "SolveError", "Interrupted")

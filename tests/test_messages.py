@@ -4,7 +4,7 @@ import pytest
 from refusals import lag, refused, simple
 
 import covocp as co
-from covocp.errors import kind_and_name, spelling
+from covocp.base.errors import kind_and_name, spelling
 
 
 def damped():

@@ -1,5 +1,6 @@
 """One import name: the folders ocp/, models/ and solvers/ install as covocp and nothing else."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -13,32 +14,67 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-SETUPTOOLS = PROJECT["tool"]["setuptools"]
-ROOTS = {"covocp": "ocp", "covocp.models": "models", "covocp.solvers": "solvers"}
+HOUSE = ROOT / "ocp" / "covocp"
+LINKS = ("models", "solvers")
 NAME_VERSION = f"covocp-{PROJECT['project']['version']}"
 
 
 def modules_on_disk() -> set[str]:
     """Paths inside the installed package of every Python file under the three folders."""
-    return {
-        str(PurePosixPath(*package.split("."), *path.relative_to(ROOT / folder).parts))
-        for package, folder in ROOTS.items()
-        for path in (ROOT / folder).rglob("*.py")
-    }
+    roots = {"covocp": HOUSE, **{f"covocp/{name}": ROOT / name for name in LINKS}}
+    found = {f"{at}/{path.relative_to(folder).as_posix()}" for at, folder in roots.items() for path in walk(folder)}
+    assert len(found) > 100
+    return found
 
 
-def run_python(code: str, directory: Path) -> subprocess.CompletedProcess[str]:
+def walk(folder: Path) -> list[Path]:
+    """Python files under a folder, not through links."""
+    return [Path(at, name) for at, _, names in os.walk(folder) for name in names if name.endswith(".py")]
+
+
+def run_python(code: str, directory: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """A fresh interpreter with the directory first on its path."""
-    return subprocess.run([sys.executable, "-c", code], cwd=directory, capture_output=True, text=True, timeout=120)
+    settings = {"cwd": directory, "capture_output": True, "text": True, "timeout": 120}
+    return subprocess.run([sys.executable, "-c", code], env=os.environ | environment, **settings)
 
 
-def test_every_folder_with_python_files_is_a_listed_package():
-    folders = {str(PurePosixPath(module).parent).replace("/", ".") for module in modules_on_disk()}
-    assert sorted(SETUPTOOLS["packages"]) == sorted(folders)
+def copy_of_the_project(target: Path) -> Path:
+    """The checkout as a clone has it, links included."""
+    hidden = [path.name for path in ROOT.glob(".*") if path.name not in (".ci", ".gitignore")]
+    left_out = shutil.ignore_patterns(*hidden, "__pycache__", "*.egg-info", "build", "dist", "venv", "site")
+    shutil.copytree(ROOT, target, symlinks=True, ignore=left_out)
+    return target
 
 
-def test_package_directories_are_the_three_folders():
-    assert SETUPTOOLS["package-dir"] == ROOTS
+def test_the_links_lead_to_the_folders_of_the_top_level():
+    for name in LINKS:
+        assert os.readlink(HOUSE / name) == f"../../{name}"
+
+
+def test_a_new_file_in_any_folder_is_importable_without_installing_again(tmp_path):
+    """An editable install is one static path to ocp/: what is written there is live."""
+    project = copy_of_the_project(tmp_path / "project")
+    folders = {path.parent for path in walk(project / "ocp") + [p for n in LINKS for p in walk(project / n)]}
+    for folder in folders:
+        (folder / "brand_new.py").write_text("mine = True\n", encoding="utf-8")
+    names = []
+    for folder in folders:
+        inside = folder.relative_to(project / "ocp" if "ocp" in folder.relative_to(project).parts else project)
+        parts = inside.parts if inside.parts[0] == "covocp" else ("covocp", *inside.parts)
+        names.append(".".join((*parts, "brand_new")))
+    assert len(names) > 15
+    code = f"import importlib; print(all(importlib.import_module(n).mine for n in {sorted(names)!r}))"
+    found = run_python(code, tmp_path, PYTHONPATH=str(project / "ocp"))
+    assert found.stdout.strip() == "True", found.stderr
+
+
+def test_the_editable_install_is_a_path_to_the_folder():
+    """Type checkers and editors follow it to the files themselves."""
+    files = metadata.distribution("covocp").files or []
+    paths = [Path(str(file.locate())).read_text(encoding="utf-8").split() for file in files if file.suffix == ".pth"]
+    if not paths:
+        pytest.skip("not an editable install")
+    assert [[str(ROOT / "ocp")]] == paths
 
 
 def test_installed_version_is_that_of_the_project():
@@ -62,63 +98,71 @@ def test_modules_of_the_user_with_the_names_of_the_folders_do_not_collide(tmp_pa
     assert found.stdout.split() == ["True"] * 3
 
 
-def test_importing_the_folder_of_a_checkout_says_what_to_do():
-    found = run_python("import ocp", ROOT)
-    assert found.returncode != 0
-    message = found.stderr.strip().splitlines()[-1]
-    assert message.startswith("ImportError")
-    assert "import covocp" in message
-
-
 def test_command_is_callable():
     (command,) = metadata.entry_points(group="console_scripts", name="covocp")
     assert callable(command.load())
 
 
-@pytest.fixture(scope="module")
-def distributions(tmp_path_factory: pytest.TempPathFactory) -> tuple[set[str], set[str]]:
-    """Names in the sdist of a copy of the project, and in the wheel that is built from that sdist."""
-    copy = tmp_path_factory.mktemp("source") / "project"
-    hidden = [path.name for path in ROOT.glob(".*") if path.name not in (".ci", ".gitignore")]
-    shutil.copytree(
-        ROOT, copy, ignore=shutil.ignore_patterns(*hidden, "__pycache__", "*.egg-info", "build", "dist", "venv")
-    )
-    output = copy.parent / "dist"
-    built = subprocess.run(
-        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(output), str(copy)],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+def build(project: Path, output: Path) -> tuple[Path, Path]:
+    """The sdist of a project, and the wheel that is built from that sdist."""
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(output), str(project)]
+    built = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300)
     assert built.returncode == 0, built.stdout + built.stderr
-    (sdist,) = output.glob("*.tar.gz")
-    (wheel,) = output.glob("*.whl")
+    (sdist,), (wheel,) = output.glob("*.tar.gz"), output.glob("*.whl")
+    return sdist, wheel
+
+
+def names_in_wheel(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if not name.endswith("/")}
+
+
+@pytest.fixture(scope="module", params=["links", "text"])
+def distributions(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[set[str], Path]:
+    """Names in the sdist, and the wheel from it; of a clone with its links, and of one that has text in their place."""
+    project = copy_of_the_project(tmp_path_factory.mktemp("source") / "project")
+    if request.param == "text":
+        for name in LINKS:
+            link = project / "ocp" / "covocp" / name
+            target = os.readlink(link)
+            link.unlink()
+            link.write_text(target, encoding="utf-8")
+    sdist, wheel = build(project, project.parent / "dist")
     with tarfile.open(sdist) as archive:
         in_sdist = {str(PurePosixPath(*PurePosixPath(member.name).parts[1:])) for member in archive if member.isfile()}
-    with zipfile.ZipFile(wheel) as archive:
-        in_wheel = {name for name in archive.namelist() if not name.endswith("/")}
-    return in_sdist, in_wheel
+    return in_sdist, wheel
 
 
 def test_wheel_from_the_sdist_contains_covocp_only(distributions):
-    _, in_wheel = distributions
+    in_wheel = names_in_wheel(distributions[1])
     assert {PurePosixPath(name).parts[0] for name in in_wheel} == {"covocp", f"{NAME_VERSION}.dist-info"}
 
 
 def test_wheel_from_the_sdist_contains_every_module(distributions):
-    _, in_wheel = distributions
+    in_wheel = names_in_wheel(distributions[1])
     assert {name for name in in_wheel if name.endswith(".py")} == modules_on_disk()
 
 
 def test_wheel_says_that_it_is_typed(distributions):
-    _, in_wheel = distributions
+    in_wheel = names_in_wheel(distributions[1])
     assert "covocp/py.typed" in in_wheel
 
 
 def test_sdist_contains_what_a_developer_needs(distributions):
     in_sdist, _ = distributions
-    wanted = {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "pyproject.toml", "setup.cfg", ".ci/run"}
+    wanted = {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "pyproject.toml", "setup.py", ".ci/run"}
     for folder in ("tests", "examples", "benchmarks"):
         wanted |= {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*.py")}
     assert wanted <= in_sdist
+
+
+def test_the_wheel_imports_from_its_own_files(distributions, tmp_path):
+    with zipfile.ZipFile(distributions[1]) as archive:
+        archive.extractall(tmp_path)
+    code = (
+        "import covocp, covocp.models.unknown_lag as lag, covocp.solvers.ipopt as ipopt\n"
+        "print(covocp.__file__); print(lag.__file__); print(ipopt.__file__); print(covocp.simulate, covocp.export_c)"
+    )
+    found = run_python(code, tmp_path, PYTHONPATH=str(tmp_path))
+    assert found.returncode == 0, found.stderr
+    assert all(line.startswith(str(tmp_path)) for line in found.stdout.splitlines()[:3])

@@ -18,9 +18,9 @@ import numpy as np
 
 import covocp as co
 from covocp.blocks import kalman, riccati, theta_d
-from covocp.law_simulation import extended_filter, gain_filter
-from covocp.mesh import Options
-from covocp.methods import method_options
+from covocp.simulation.laws import extended_filter, gain_filter
+from covocp.solving.solver import method_options
+from covocp.transcription.mesh import Options
 
 SMALL: dict[str, Any] = {"intervals": 2, "substeps": 2, "progress": False}
 

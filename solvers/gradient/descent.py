@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from covocp.matrices import Array
-from covocp.mesh import Mesh
+from covocp.base.matrices import Array
 from covocp.solvers.gradient.memory import Metric
+from covocp.transcription.mesh import Mesh
 
 ACTIVE_SET_PASSES = 30
 # Share of the largest eigenvalue of I_kk (rows scaled to ones on the diagonal) below which a combination of the

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from covocp.convergence import VANISHING, Residuals
-from covocp.extremal import Guess
-from covocp.guess import choose_scales
-from covocp.influence import (
+from covocp.base.matrices import Array
+from covocp.base.residuals import VANISHING, Residuals
+from covocp.extremal.extremal import Guess
+from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
+from covocp.solvers.gradient.influence import (
     Run,
     Slopes,
     Sweeps,
@@ -24,13 +25,12 @@ from covocp.influence import (
     sweep_backward,
     sweep_forward,
 )
-from covocp.matrices import Array
-from covocp.nlp import Scales
-from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
-from covocp.steering import quadrature_weights
-from covocp.trajectory import Multipliers, Trajectory
+from covocp.transcription.first_guess import choose_scales
+from covocp.transcription.nlp import Scales
+from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Eigenvalues of H_uu, in units of the control scales, are not taken below this share of the largest.
 SMALLEST_CURVATURE = 1e-3

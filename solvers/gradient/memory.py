@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse.linalg import splu
 
-from covocp.matrices import Array
+from covocp.base.matrices import Array
 
 # Share of d' B d below which the curvature seen along a step d is damped.
 DAMPED = 0.2

@@ -17,7 +17,7 @@ Beyond the source:
 - Terminal conditions on matrices and equalities between final values have influence functions like those on x.
 - Free initial values: p(0) and P(0) are the slopes by them.
 - Expected costs (appendix E, with free T and inequalities as above): S is integrated backward after x and E, and its
-  costate -Xhat/2 forward before p and P; see `covocp.influence`. The weight of the terminal conditions is part of S(T).
+  costate -Xhat/2 forward before p and P; see `influence`. The weight of the terminal conditions is part of S(T).
 
 The stop test does not depend on W; see `prepare`.
 """
@@ -31,23 +31,23 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from covocp.arguments import checked, one_of, positive, share, whole
-from covocp.checks import as_number
-from covocp.errors import OutsideDomainError, ProblemError, describe, shown
-from covocp.extremal import Extremal, Guess, Outcome
-from covocp.guess import controls_guess, resolve_mesh, stiffness
-from covocp.influence import build_sweeps
-from covocp.matrices import Array
-from covocp.mesh import Mesh, Options
-from covocp.nlp import check_costs
-from covocp.progress import Progress
+from covocp.base.arguments import checked, one_of, positive, share, whole
+from covocp.base.checks import as_number
+from covocp.base.errors import OutsideDomainError, ProblemError, describe, shown
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Extremal, Guess, Outcome
 from covocp.solvers.gradient.descent import solve_step
+from covocp.solvers.gradient.influence import build_sweeps
 from covocp.solvers.gradient.iterate import Iterate, Measures, Space, make_space
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings, Variant
-from covocp.statement import Statement
-from covocp.trajectory import Trajectory
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import controls_guess, resolve_mesh, stiffness
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.nlp import check_costs
+from covocp.transcription.trajectory import Trajectory
 
 LARGEST_PAIRS = 64
 # Steps per interval of the backward integration: h times the rate of the costates stays below this. The method ends
@@ -88,7 +88,7 @@ def prepare(
     - |dJ/dT| T and |dJ/dx_i(0)| s_i of a free duration and of free initial values <= tolerance (|k| + |int L dt|);
     - the violation of every inequality / its magnitude <= violation_tolerance, and |dz_j| / (magnitude of z_j) <= a
       hundredth of it;
-    - what is left in the scale of the point that was reached holds, complementarity included (`covocp.convergence`).
+    - what is left in the scale of the point that was reached holds, complementarity included (`covocp.base.residuals`).
 
     Args:
         statement: the problem.

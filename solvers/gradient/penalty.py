@@ -19,11 +19,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.influence import Run, controls_at_nodes
-from covocp.matrices import Array
-from covocp.mesh import Mesh
-from covocp.nlp import Scales
-from covocp.statement import Statement
+from covocp.base.matrices import Array
+from covocp.solvers.gradient.influence import Run, controls_at_nodes
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.nlp import Scales
 
 Indices = NDArray[np.intp]
 

@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from covocp.convergence import LIMIT, Residuals
-from covocp.errors import ProblemError, describe
-from covocp.matrices import Array
-from covocp.progress import Progress
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.base.residuals import LIMIT, Residuals
 from covocp.solvers.gradient.descent import Step, solve_gram, solve_step, solve_tangent, unreachable
 from covocp.solvers.gradient.iterate import Iterate, Linear, Measures, Space
 from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt

@@ -8,8 +8,8 @@ import pytest
 
 import covocp as co
 from covocp.blocks import sdre, theta_d
-from covocp.law_simulation import simulate_law
 from covocp.models import agile_aircraft, theta_d_benchmarks
+from covocp.simulation.laws import simulate_law
 
 X = ca.SX.sym("x", 3)
 A0 = np.array([[0.2, 1.0, 0.0], [-0.5, 0.1, 0.4], [0.3, 0.0, -0.6]])

@@ -9,8 +9,8 @@ from compiled import compile_function
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.base.matrices import pack, unpack
 from covocp.blocks import kalman
-from covocp.matrices import pack, unpack
 
 START = np.diag([1.0, 2.0])
 DURATION = 1.0

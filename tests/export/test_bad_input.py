@@ -11,7 +11,7 @@ from exports import package
 
 import covocp as co
 from covocp.export import export_c
-from covocp.export.laws import span
+from covocp.export.laws.law import span
 
 pytestmark = pytest.mark.needs_cc
 PROGRAM = """\

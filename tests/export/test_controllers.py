@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.export import export_c
-from covocp.export.controller import controller_law
-from covocp.export.design import design_of
-from covocp.export.history import history
-from covocp.export.laws import span
+from covocp.export.laws.controller import controller_law
+from covocp.export.laws.design import design_of
+from covocp.export.laws.history import history
+from covocp.export.laws.law import span
 
 pytestmark = pytest.mark.needs_cc
 B, U, NOISE = 1.0, 1.0, 1.0  # mean of the time constant, densities of measurement and process noise

@@ -122,8 +122,8 @@ def test_a_thousand_steps_of_the_mars_entry_agree(name, missing):
 def test_theta_d_law_and_filter_in_the_loop_over_the_whole_of_scenario_two():
     import casadi as ca
 
-    from covocp.law_simulation import gain_filter
     from covocp.models import agile_aircraft
+    from covocp.simulation.laws import gain_filter
 
     A0, bilinear, B, measured = agile_aircraft.matrices()
     x, u = ca.SX.sym("x", 5), ca.SX.sym("u")

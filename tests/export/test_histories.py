@@ -8,8 +8,8 @@ from exports import FOLDER, lag, open_lag, package
 
 import covocp as co
 from covocp.export import export_c
-from covocp.export.history import history
-from covocp.export.trajectory import sample_law
+from covocp.export.laws.history import history
+from covocp.export.laws.trajectory import sample_law
 from covocp.models import unknown_lag
 
 pytestmark = pytest.mark.needs_cc

@@ -10,7 +10,7 @@ import pytest
 from exports import FOLDER, mars
 
 import covocp as co
-from covocp.cli import main
+from covocp.cli.commands import main
 from covocp.export import export_c
 
 

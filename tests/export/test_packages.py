@@ -14,7 +14,7 @@ from exports import FOLDER, STRICT, open_lag, package
 
 import covocp as co
 from covocp.export import export_c
-from covocp.export.names import KEYWORDS
+from covocp.export.text.names import KEYWORDS
 
 X, T = ca.SX.sym("x", 2), ca.SX.sym("t")
 LAW = ca.Function("law", [X, T], [ca.sin(X[0]) * T + X[1]], ["x", "t"], ["u"])

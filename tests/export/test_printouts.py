@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from exports import package
 
-from covocp.export.building import Build
-from covocp.export.package import Timing, Timings
+from covocp.export.compiled.building import Build
+from covocp.export.compiled.package import Timing, Timings
 
 BUILD = Build(library=Path("a/b.so"), self_test=Path("a/b"), compiler="cc 1.0", object_bytes=1200, stack_bytes=340)
 

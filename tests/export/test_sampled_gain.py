@@ -11,11 +11,11 @@ from exports import FOLDER
 from scipy.linalg import expm
 
 import covocp as co
-from covocp.export.design import design_of
-from covocp.export.history import history
-from covocp.export.sampled import discretised
-from covocp.export.spread import check_flight
-from covocp.flight import Flight
+from covocp.export.laws.design import design_of
+from covocp.export.laws.history import history
+from covocp.export.laws.sampled import discretised
+from covocp.export.laws.spread import check_flight
+from covocp.solution.flight import Flight
 
 F, G = np.array([[0.0, 1.0], [0.5, -0.2]]), np.array([[0.0], [1.0]])
 M, Q, U = np.array([[1.0, 0.0]]), np.diag([0.0, 0.02]), 0.1

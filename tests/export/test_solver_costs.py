@@ -13,8 +13,8 @@ import pytest
 from exports import FOLDER
 
 import covocp as co
+from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.export import export_c
-from covocp.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.models import (
     brachistochrone,
     bryson_denham,

@@ -9,8 +9,8 @@ from scipy.integrate import quad, solve_bvp
 
 import covocp as co
 from covocp.blocks import riccati, sdre, theta_d
-from covocp.law_simulation import extended_filter, gain_filter, simulate_law
 from covocp.models import agile_aircraft
+from covocp.simulation.laws import extended_filter, gain_filter, simulate_law
 
 LINEAR, BILINEAR, COLUMN, MEASURED = agile_aircraft.matrices()
 X, U, T = ca.SX.sym("x", 5), ca.SX.sym("u"), ca.SX.sym("t")

@@ -8,8 +8,8 @@ import pytest
 
 import covocp as co
 from covocp.blocks import sdre, theta_d
-from covocp.law_simulation import simulate_law
 from covocp.models import theta_d_benchmarks
+from covocp.simulation.laws import simulate_law
 
 RNG = np.random.default_rng(11)
 CLOSED = ("cubic", "arctangent", "rational", "rational_split")

@@ -7,8 +7,8 @@ import pytest
 from random_problems import draw
 
 import covocp as co
+from covocp.extremal.optimality import complementarity
 from covocp.models import unknown_lag
-from covocp.optimality import complementarity
 from covocp.solvers import ipopt
 from covocp.solvers.gradient.memory import damped, learnt
 

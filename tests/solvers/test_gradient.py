@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import covocp as co
-from covocp.mesh import Options
 from covocp.models import (
     chord_test,
     damped_oscillator,
@@ -20,7 +19,8 @@ from covocp.models import (
     unknown_lag,
 )
 from covocp.solvers.gradient import one_iteration, prepare
-from covocp.starting import make_guess
+from covocp.solving.warm_start import make_guess
+from covocp.transcription.mesh import Options
 
 
 def noisy(

@@ -19,12 +19,12 @@ from problems import graded
 from scipy.stats import linregress
 
 import covocp as co
-from covocp.matrices import pack, pack_costate, unpack_costate
-from covocp.mesh import Options
+from covocp.base.matrices import pack, pack_costate, unpack_costate
 from covocp.models import mars_entry, unknown_lag
 from covocp.solvers.gradient import one_iteration, prepare
 from covocp.solvers.gradient.iterate import Iterate, Linear, Space
-from covocp.starting import make_guess
+from covocp.solving.warm_start import make_guess
+from covocp.transcription.mesh import Options
 
 # --- a loop in which everything depends on everything -----------------------------------------------------------------
 

@@ -251,7 +251,7 @@ INTERRUPTED = """
     import casadi as ca
     import numpy as np
     import covocp as co
-    from covocp.progress import Progress
+    from covocp.base.progress import Progress
 
     after = int(sys.argv[1])
     update = Progress.update

@@ -1,0 +1,184 @@
+"""How much a combined design can gain over the classical one, before it is computed.
+
+The classical design takes its nominal from the deterministic cost, so along it only the statistics have a slope by the
+control: h_u = 1/2 [tr(P dE) + tr(S dXhat) + ...]_u [Schmidt 6.3-30]. The step d that lowers the expected cost most for
+its size, int du' L_uu du dt, within the terminal conditions and the bounds, is
+
+    d = -W^-1 (h_u + R'l),     W = L_uu (where that is singular: the scale of the controls),
+
+and the first-order change of the expected cost along it, relative to that cost, is a figure of merit: zero where
+nominal and statistics separate. For a cost that is quadratic with the curvature L_uu a full step would gain half of it;
+how much is gained truly along d is seen by evaluating the expected cost at a few steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from covocp.base.checks import check_kind
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array
+from covocp.base.threads import one_at_a_time
+from covocp.extremal.curvature import held_jacobian, mass_matrix
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.given_controls import evaluate_controls
+from covocp.extremal.hamiltonian import discrete_costates
+from covocp.problem.builder import Problem
+from covocp.solution.solution import Solution
+from covocp.solving.evaluation import evaluate
+from covocp.solving.solver import is_roundoff, solve
+from covocp.transcription.first_guess import control_scale
+from covocp.transcription.mesh import Options
+
+# Steps along the statistical gradient at which the expected cost is evaluated.
+STEPS = tuple(2.0 ** np.arange(2, -13, -1))
+# Relative gains below which the classical design is as good, and above which the combined one is worth its while.
+NOTHING, MUCH = 1e-4, 1e-2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Worth:
+    """What a combined design promises.
+
+    Attributes:
+        classical: the classical design.
+        first_order: first-order change of the expected cost for the full step along the statistical gradient, relative
+            to the cost, positive; the cost of the deviations' slope in units of L_uu.
+        gain: relative decrease of the expected cost found along the statistical gradient: a lower estimate of what the
+            combined design gains.
+        direction: of the control, at its values, (N + 1 or N, nu).
+        step: share of the full step at which `gain` was found.
+    """
+
+    classical: Solution = field(repr=False)
+    first_order: float
+    gain: float
+    direction: Array = field(repr=False)
+    step: float
+
+    @property
+    def verdict(self) -> str:
+        """What the numbers mean, a sentence."""
+        if self.gain < NOTHING and self.first_order < NOTHING:
+            return "nothing to gain: nominal and statistics separate here; the classical design will do"
+        if self.gain < MUCH:
+            return "little to gain: the classical design is nearly as good"
+        return f"worth solving: at least {100 * self.gain:.1f} % of the expected cost can be saved"
+
+    def __str__(self) -> str:
+        """The summary that print shows."""
+        return "\n".join(
+            (
+                f"{self.classical.name or 'problem without a name'}: {self.verdict}",
+                f"expected cost of the classical design   {self.classical.cost:.8g}",
+                f"first-order change along the gradient   {100 * self.first_order:.3g} % of it",
+                f"decrease found along the gradient       {100 * self.gain:.3g} % of it"
+                + (f", at {self.step:g} of the full step" if self.gain > 0 else ""),
+            )
+        )
+
+
+@one_at_a_time
+def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **options: Any) -> Worth:
+    """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
+
+    Args:
+        problem: with an expected cost.
+        nominal: the classical nominal, as in `evaluate`; None: from the deterministic cost.
+        intervals: number of control intervals.
+        options: of the mesh, as in `solve`.
+
+    Returns:
+        The estimate; it costs one deterministic solution and a few evaluations.
+
+    Raises:
+        ProblemError: no expected cost, constrained gains, or no deterministic cost and no `nominal`.
+        SolveError: the deterministic problem was not solved.
+    """
+    check_kind(problem, Problem, "worth(problem), with minimize_expected()")
+    if problem.expected is None or problem.expected.gain is not None:
+        raise ProblemError(
+            describe(
+                "worth() compares the classical with the combined design.",
+                expected="a problem with minimize_expected() and the best gain",
+                received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
+                remedy="compare solutions by their costs instead",
+            )
+        )
+    if nominal is None:
+        classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)
+    else:
+        classical = evaluate(problem, nominal=nominal, intervals=intervals, **options)
+    size, extremal = abs(classical.cost), classical.extremal
+    mesh = Options(grid=extremal.mesh.nodes, control=classical.mesh.control)  # type: ignore[arg-type]
+    if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
+        still = np.zeros_like(extremal.trajectory.u)
+        return Worth(classical=classical, first_order=0.0, gain=0.0, direction=still, step=0.0)
+    direction, ell, slope = _statistical_gradient(extremal)
+    first = float(-np.sum(slope * direction)) / size
+    gain, best = 0.0, 0.0
+    for step in STEPS if first > np.finfo(float).eps else ():
+        decrease = _decrease(classical, step * direction, ell) / size
+        if decrease > gain:
+            gain, best = decrease, step
+        elif best:
+            break
+    return Worth(classical=classical, first_order=first, gain=gain, direction=direction, step=best)
+
+
+def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
+    """Step d, multipliers l of what is held, slope of the expected cost by the control values (without l)."""
+    st, mesh, u = extremal.statement, extremal.mesh, extremal.trajectory.u
+    _, slopes, _ = discrete_costates(extremal)
+    rows = held_jacobian(extremal)
+    scale = np.concatenate([control_scale(st, b, u[:, b.span]) for b in st.controls])
+    given = _metric(extremal)
+    plain = np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), np.diag(scale**-2.0)))
+    metric = plain if given is None else given
+    lower, upper = st.control_bounds
+    free = np.ones(u.size, dtype=bool)
+    for _ in range(u.size):
+        solved = np.linalg.solve(metric[np.ix_(free, free)], np.column_stack([slopes.ravel()[free], rows[:, free].T]))
+        gram = rows[:, free] @ solved[:, 1:]
+        ell = -np.linalg.pinv(gram, rcond=1e-10) @ (rows[:, free] @ solved[:, 0])
+        direction = np.zeros(u.size)
+        direction[free] = -(solved[:, 0] + solved[:, 1:] @ ell)
+        d = direction.reshape(u.shape)
+        stuck = (((u <= lower) & (d < 0)) | ((u >= upper) & (d > 0))).ravel() & free
+        if not stuck.any():
+            break
+        free &= ~stuck
+    step = np.asarray(direction.reshape(mesh.control_nodes, st.nu))
+    if given is None:  # no curvature tells how far to go: as far as the control's own scale
+        step /= max(float(np.abs(step / scale).max(initial=0.0)), float(np.finfo(float).tiny))
+    return step, ell, slopes
+
+
+def _metric(extremal: Extremal) -> Array | None:
+    """int du' L_uu du dt over the control values; None where L_uu is singular."""
+    st, mesh = extremal.statement, extremal.mesh
+    assert st.loop is not None
+    x, u, _, t, duration, p = extremal.columns()
+    count = mesh.intervals + 1
+    B = np.asarray(st.loop.expansion.map(count)(x, u, t, duration, p)[3].full())
+    extra = np.asarray(st.loop.extra_control.map(count)(x, u, t, duration, p).full())
+    curvature = (B - extra).reshape(st.nu, count, st.nu).transpose(1, 0, 2).mean(axis=0)
+    if np.linalg.eigvalsh(curvature)[0] <= 0:
+        return None
+    return np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), curvature))
+
+
+def _decrease(classical: Solution, change: Array, ell: Array) -> float:
+    """Decrease of the expected cost, with what the step misses of the conditions held weighted by l."""
+    extremal = classical.extremal
+    st, t = extremal.statement, extremal.trajectory
+    u = np.clip(t.u + change, *st.control_bounds)
+    mesh = replace(extremal.mesh, segments=(extremal.mesh.intervals,), eliminated=True)
+    outcome = evaluate_controls(st, mesh, u, t.duration, extremal.parameters, t.x[0])
+    fixed = ~np.isnan(st.boundary_values(extremal.parameters)[1])
+    missed = (outcome.extremal.trajectory.x[-1] - t.x[-1])[fixed]
+    cost = float(sum(outcome.cost_terms.values())) + float(ell[: missed.size] @ missed)
+    return classical.cost - cost if np.isfinite(cost) else -np.inf

@@ -1,0 +1,212 @@
+"""Trees of plain data as the bytes of a file and back: compressed arrays (.npz) or text (.json), sealed by checksums.
+
+Both formats end with the SHA-256 of everything before it, so that one flipped bit anywhere is noticed. A .npz file is a
+ZIP archive, to which other programs may add entries: those are never read, and a second checksum, over the content of
+the entries that belong to the tree, tells whether the tree is what was written.
+
+What is read is bounded by the size of the file, whatever the file says of itself: an entry is only unpacked where the
+tree refers to it, and all of them together may be `UNPACKED` times as large as the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from covocp.base.encoding import KINDS, LARGEST_ITEM, DamagedFileError, decode, encode
+
+DOCUMENT = "document"
+NPY = ".npy"
+# Bytes of an archive that are unpacked at most: a number for each byte of the file, and as much for any file.
+UNPACKED, ALWAYS = 64, 2**26
+# The same for its text, of which every byte becomes a Python object in the worst case.
+TEXT_UNPACKED, TEXT_ALWAYS = 4, 2**22
+CHUNK = 2**20
+DIGEST = 64  # letters of a SHA-256
+JSON_SEAL, JSON_END = b', "checksum": "sha256:', b'"}'
+NPZ_SEAL = re.compile(rb"covocp content ([0-9a-f]{64}) file ([0-9a-f]{64})")
+
+
+def packed(tree: Mapping[str, Any], suffix: str) -> bytes:
+    """The bytes of a file.
+
+    Args:
+        tree: what `encode` can write, by name.
+        suffix: ".npz" or ".json".
+
+    Raises:
+        ExportError: a value of a type that cannot be written (says which).
+    """
+    arrays: dict[str, Any] | None = None if suffix == ".json" else {}
+    text = json.dumps({name: encode(value, name, arrays) for name, value in tree.items()}, allow_nan=False)
+    if arrays is None:
+        return sealed_text(text)
+    entries = {DOCUMENT: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
+    return sealed_arrays(entries)
+
+
+def sealed_text(text: str) -> bytes:
+    """A JSON object with its checksum as the last entry."""
+    body = text.rstrip()[:-1].encode() + JSON_SEAL
+    return body + hashlib.sha256(body).hexdigest().encode() + JSON_END
+
+
+def sealed_arrays(entries: Mapping[str, Any]) -> bytes:
+    """A .npz file of these entries with the checksums as its comment."""
+    written = {name: _npy(array) for name, array in entries.items()}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in written.items():
+            archive.writestr(_info(name), data)
+    raw = buffer.getvalue()
+    if sum(map(len, written.values())) > UNPACKED * len(raw) + ALWAYS:  # it would not be read again
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+            for name, data in written.items():
+                archive.writestr(_info(name, zipfile.ZIP_STORED), data)
+    content = _Content()
+    for name, data in written.items():
+        content.add(name, data)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.comment = b"covocp content " + content.digest() + b" file " + b"0" * DIGEST
+    body = buffer.getvalue()[:-DIGEST]
+    return body + hashlib.sha256(body).hexdigest().encode()
+
+
+def unpacked(data: bytes) -> tuple[Any, bool]:
+    """What `packed` made the bytes of, and whether the checksums fit.
+
+    Args:
+        data: of a file, whatever it is.
+
+    Raises:
+        DamagedFileError: neither a .npz nor a .json file, one that contradicts itself, or one that unpacks to more than
+            such a file can hold.
+        ValueError, TypeError, ...: of the readers of both formats.
+    """
+    if data[:2] != b"PK":
+        tree = decode(json.loads(data.decode("utf-8")))
+        if isinstance(tree, dict):
+            tree.pop("checksum", None)
+        return tree, _text_is_sealed(data)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = _Entries(archive, len(data))
+        text = entries.text()
+        tree = decode(json.loads(text), entries)
+        return tree, entries.sealed(data)
+
+
+def _text_is_sealed(data: bytes) -> bool:
+    body, digest, end = data[: -DIGEST - len(JSON_END)], data[-DIGEST - len(JSON_END) : -len(JSON_END)], data[-2:]
+    return body.endswith(JSON_SEAL) and end == JSON_END and hashlib.sha256(body).hexdigest().encode() == digest
+
+
+class _Content:
+    """The checksum over entries: their names, lengths and bytes, in the order of the tree."""
+
+    def __init__(self) -> None:
+        self._sum = hashlib.sha256()
+
+    def add(self, name: str, data: bytes) -> None:
+        self._sum.update(f"{len(name.encode())} {name} {len(data)} ".encode())
+        self._sum.update(data)
+
+    def digest(self) -> bytes:
+        return self._sum.hexdigest().encode()
+
+
+class _Entries(Mapping[str, Any]):
+    """The arrays of an archive, unpacked when they are asked for, as often as the size of the file allows."""
+
+    def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
+        self._archive, self._size = archive, size
+        self._left = UNPACKED * size + ALWAYS
+        self._names = {name.removesuffix(NPY): name for name in archive.namelist() if name.endswith(NPY)}
+        self._read: set[str] = set()
+        self._content = _Content()
+
+    def __getitem__(self, name: str) -> Any:
+        return self._array(name, self._left)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def text(self) -> str:
+        """The document."""
+        if DOCUMENT not in self._names:
+            raise DamagedFileError(f"it has no entry '{DOCUMENT}'")
+        array = self._array(DOCUMENT, TEXT_UNPACKED * self._size + TEXT_ALWAYS)
+        return bytes(array.tobytes()).decode("utf-8")
+
+    def sealed(self, data: bytes) -> bool:
+        """Whether the file is as it was written, or has nothing new but entries that do not belong to the tree."""
+        found = NPZ_SEAL.fullmatch(self._archive.comment)
+        if found is None or found.group(1) != self._content.digest():
+            return False
+        added = len(self._archive.infolist()) > len(self._read)
+        return added or (data.endswith(found.group(2)) and _digest(data[:-DIGEST]) == found.group(2))
+
+    def _array(self, name: str, most: int) -> Any:
+        info = self._archive.getinfo(self._names[name])
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise DamagedFileError(f"the entry '{name[:60]}' is compressed in another way than save does it")
+        if info.file_size > min(self._left, most):
+            raise DamagedFileError(
+                f"the entry '{name[:60]}' unpacks to {info.file_size} bytes, more than a file of {self._size} bytes can"
+                " hold"
+            )
+        self._left -= info.file_size
+        chunks = []
+        with self._archive.open(info) as stream:  # in pieces: one read would unpack more than the entry says it holds
+            while chunk := stream.read(CHUNK):
+                chunks.append(chunk)
+        data = b"".join(chunks)
+        self._read.add(name)
+        self._content.add(name, data)
+        return _array(data)
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.sha256(data).hexdigest().encode()
+
+
+def _info(name: str, compression: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
+    """Of an entry, without the time of day: the same solution makes the same file."""
+    info = zipfile.ZipInfo(name + NPY)
+    info.compress_type = compression
+    return info
+
+
+def _npy(array: Any) -> bytes:
+    """An array in numpy's own format."""
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _array(data: bytes) -> Any:
+    """The inverse of `_npy`; what its header promises is compared with what there is before anything is made."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, columns, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, columns, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise DamagedFileError(f"an array in version {version} of its format")
+    rest = data[stream.tell() :]
+    plain = dtype.kind in KINDS and dtype.itemsize <= LARGEST_ITEM and dtype.subdtype is None
+    if not plain or any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(rest):
+        raise DamagedFileError("an array that is not what its header says, or none of numbers")
+    return np.ndarray(shape, dtype, buffer=rest, order="F" if columns else "C")

@@ -1,0 +1,489 @@
+"""Checks of what a user gives, each with the message that says what is wrong and what to do."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.arguments import is_number
+from covocp.base.arguments import is_whole as is_whole
+from covocp.base.errors import ProblemError, describe, kind_and_name, shown, spelling
+from covocp.base.matrices import Array, pack_symbolic, real_numbers
+
+# Components of a symbol that still make a matrix that fits into a memory.
+LARGEST_SIZE = 10**4
+
+
+def caller() -> str:
+    """File and line of the user's code that called into covocp."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).split(".")[0] == "covocp":
+        if str(frame.f_globals["__name__"]).startswith("covocp.models"):
+            break
+        frame = frame.f_back
+    return f"{frame.f_code.co_filename}:{frame.f_lineno}"
+
+
+def is_symbolic(value: Any) -> bool:
+    """Whether the value is a CasADi expression (also one that happens to be constant)."""
+    return isinstance(value, ca.MX)
+
+
+def is_scalar(value: Any) -> bool:
+    """Whether a number, an array or an expression has one entry."""
+    return bool(value.numel() == 1 if isinstance(value, (ca.MX, ca.DM)) else np.size(value) == 1)
+
+
+def check_kind(value: Any, kind: type, remedy: str) -> None:
+    """A value must be of a kind, such as a Problem or a Solution.
+
+    Raises:
+        ProblemError: it is of another.
+    """
+    if not isinstance(value, kind):
+        raise ProblemError(
+            describe(
+                f"This is not a {kind.__name__.lower()}.",
+                expected=f"a {kind.__name__}",
+                received=kind_and_name(value),
+                remedy=remedy,
+            )
+        )
+
+
+def as_number(name: str, what: str, value: Any) -> Array:
+    """The value as an array of floats, or an error that names the symbol."""
+    if isinstance(value, (ca.SX, ca.MX)):
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is a symbol.",
+                expected="numbers",
+                received=str(value),
+                remedy="give numbers here" + ("; a bound that varies is a subject_to()" if "bound" in what else ""),
+            )
+        )
+    try:
+        return real_numbers(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is not a number.",
+                expected="a number or an array of numbers",
+                received=shown(value, 200),
+                remedy=f"check the {what} of '{name}'",
+            )
+        ) from error
+
+
+def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:
+    """The value as a vector of `size` numbers; a scalar is repeated.
+
+    Raises:
+        ProblemError: where the number of entries does not fit, or NaN or inf appears where it means nothing.
+    """
+    numbers = as_number(name, what, value)
+    if numbers.size == 1:
+        numbers = np.full(size, float(numbers.reshape(())))
+    if numbers.size != size or numbers.ndim > 2 or (numbers.ndim == 2 and 1 not in numbers.shape):
+        raise shape_error(name, what, _numbers(size), f"shape {numbers.shape}")
+    numbers = numbers.reshape(size)
+    if (not nan and np.isnan(numbers).any()) or (not inf and np.isinf(numbers).any()):
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' contains NaN or inf.",
+                expected="finite numbers" + (" (None: free)" if nan else ""),
+                received=str(numbers),
+                remedy=f"correct the {what} of '{name}'",
+            )
+        )
+    return numbers
+
+
+def one_number(name: str, what: str, value: Any) -> float:
+    """The value as one number, which may be NaN or infinite."""
+    return float(column(name, what, value, 1, nan=True, inf=True)[0])
+
+
+def bound_columns(name: str, lower: Any, upper: Any, size: int) -> tuple[Array, Array]:
+    """Lower and upper bounds as vectors of `size` numbers; infinite ones do not bind."""
+    return column(name, "lower bound", lower, size, inf=True), column(name, "upper bound", upper, size, inf=True)
+
+
+def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> Any:
+    """Like `column`, but an expression in the parameters of the problem is accepted too."""
+    if is_symbolic(value):
+        if value.shape == (size, 1):
+            return value
+        if value.shape == (1, 1):
+            return ca.repmat(value, size, 1)
+        raise shape_error(name, what, f"shape ({size}, 1)", f"shape {value.shape}")
+    return ca.MX(ca.DM(column(name, what, value, size, nan=nan)))
+
+
+def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
+    """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix.
+
+    Constant data are checked here: finite, symmetric, positive semidefinite.
+    """
+    expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix" if size > 1 else "a number"
+    if is_symbolic(value):
+        if value.shape == (size, size):
+            check_symmetric(name, what, value)
+            return value
+        if value.shape == (1, 1):
+            return value * ca.MX.eye(size)
+        if value.shape == (size, 1):
+            return ca.diag(value)
+        raise shape_error(name, what, expected, f"shape {value.shape}")
+    numbers = as_number(name, what, value)
+    if numbers.size == 1:
+        numbers = np.diag(np.full(size, float(numbers.reshape(()))))
+    elif numbers.size == size and (numbers.ndim == 1 or 1 in numbers.shape):
+        numbers = np.diag(numbers.ravel())
+    if numbers.shape != (size, size):
+        raise shape_error(name, what, expected, f"shape {numbers.shape}")
+    check_density(name, what, numbers, definite=False)
+    return ca.MX(ca.DM(numbers))
+
+
+def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite: bool) -> Any:
+    """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
+    matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
+    if not is_symbolic(value):
+        if matrix.ndim > 2:
+            raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
+        matrix = matrix.reshape(1, 1) if matrix.size == 1 else matrix
+        known = np.nan_to_num(matrix, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        if matrix.shape == (size, size):
+            if not np.isfinite(known).all() or not np.allclose(known, known.T):
+                check_density(name, what, known, definite=False)
+            if semidefinite and not np.isnan(matrix).any():
+                check_density(name, what, known, definite=False)
+        matrix = ca.MX(ca.DM(matrix))
+    if matrix.shape != (size, size):
+        raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
+    return pack_symbolic(matrix)
+
+
+def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
+    """A matrix expression must be symmetric: seen at random values of its symbols."""
+    symbols = ca.symvar(expression)
+    generator = np.random.default_rng(0)
+    values = [generator.uniform(0.5, 1.5, symbol.shape) for symbol in symbols]
+    numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
+    difference = np.abs(numbers - numbers.T)
+    if np.isfinite(numbers).all() and (difference > 1e-9 * np.abs(numbers).max(initial=0.0)).any():
+        i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is not symmetric.",
+                expected="a symmetric matrix",
+                received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
+                remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
+            )
+        )
+
+
+def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:
+    """A numeric density or variance must be finite, symmetric and positive (semi)definite."""
+    problem = None
+    scalar = numbers.size == 1
+    if not np.isfinite(numbers).all():
+        problem = "contains NaN or inf"
+    elif not np.allclose(numbers, numbers.T, rtol=1e-9, atol=1e-12 * float(np.abs(numbers).max(initial=0.0))):
+        problem = "is not symmetric"
+    else:
+        values = np.linalg.eigvalsh(numbers)
+        largest = float(np.abs(values).max(initial=0.0))
+        if values.size and values[0] < -1e-12 * largest:
+            problem = f"is not positive semidefinite (smallest eigenvalue {values[0]:.6g})"
+            problem = "is negative" if scalar else problem
+        elif definite and values.size and values[0] <= 1e-14 * largest:
+            problem = "is zero" if scalar else f"is singular (smallest eigenvalue {values[0]:.6g})"
+    if problem:
+        number = f"a {'positive' if definite else 'nonnegative'} number"
+        matrix = f"a symmetric positive {'definite' if definite else 'semidefinite'} matrix"
+        text = np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12)
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' {problem}.",
+                expected=number if scalar else matrix,
+                received=f"{float(numbers.item()):g}" if scalar else text,
+                remedy=f"check the {what} given for '{name}'"
+                + (": every measurement needs some noise" if definite and "noise" in what else ""),
+            )
+        )
+
+
+def check_bounds(name: str, lower: Array, upper: Array) -> None:
+    """Bounds must not cross, nor leave nothing but infinity."""
+    for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf)):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"The bounds of {entry} cross." if lower[i] > upper[i] else f"The bounds of {entry} leave no number.",
+                expected="lower <= upper, lower < inf, upper > -inf",
+                received=f"lower = {lower[i]:g}, upper = {upper[i]:g}",
+                remedy="exchange or correct them",
+            )
+        )
+
+
+def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array) -> None:
+    """Given (not NaN) values must lie within the bounds."""
+    margin = 1e-12 * np.maximum(1.0, np.abs(np.nan_to_num(values)))
+    for i in np.flatnonzero((values < lower - margin) | (values > upper + margin)):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"The {what} value of {entry} lies outside its bounds.",
+                expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
+                received=f"{values[i]:g}",
+                remedy=f"move the {what} value or widen the bounds",
+            )
+        )
+
+
+def check_size(name: str, size: Any) -> int:
+    """The shape of a symbol must be a positive whole number."""
+    if not is_whole(size, 1, LARGEST_SIZE):
+        raise ProblemError(
+            describe(
+                f"The shape of '{name}' is not a number of components.",
+                expected=f"a positive whole number, at most {LARGEST_SIZE}",
+                received=repr(size),
+                remedy="give 1 for a scalar, n for a column of n",
+            )
+        )
+    return int(size)
+
+
+def check_positive(name: str, value: Any, unit: str = "") -> float:
+    """A positive finite number."""
+    number = np.full(1, np.nan) if value is None else as_number(name, "value", value)
+    if number.size != 1 or not math.isfinite(float(number.reshape(()))) or float(number.reshape(())) <= 0:
+        raise ProblemError(
+            describe(
+                f"'{name}' must be positive.",
+                expected=f"a finite number > 0{' ' + unit if unit else ''}",
+                received=repr(value),
+                remedy=f"give a positive {name}" + (", or Free(guess) to leave it free" if name == "duration" else ""),
+            )
+        )
+    return float(number.reshape(()))
+
+
+def check_times(guess: float, lower: float, upper: float) -> None:
+    """The three numbers of a free terminal time must be in order."""
+    if not 0 < lower <= guess <= upper:
+        raise ProblemError(
+            describe(
+                "The free duration is not ordered.",
+                expected="0 < lower <= guess <= upper [s]",
+                received=f"lower = {lower:g}, guess = {guess:g}, upper = {upper:g}",
+                remedy="correct the three numbers of Free(guess, lower, upper)",
+            )
+        )
+
+
+def _numbers(size: int) -> str:
+    return f"a number or {size} numbers" if size > 1 else "a number"
+
+
+def shape_error(name: str, what: str, expected: str, received: str) -> ProblemError:
+    """The error for a shape that does not fit."""
+    return ProblemError(
+        describe(
+            f"The {what} of '{name}' has the wrong size.",
+            expected=expected,
+            received=received,
+            remedy=f"give the {what} of '{name}' in that shape",
+        )
+    )
+
+
+def scale_column(name: str, scale: Any, size: int) -> Array | None:
+    """Typical magnitudes, positive; None stays None."""
+    if scale is None:
+        return None
+    values = column(name, "scale", scale, size)
+    if (values <= 0).any():
+        raise ProblemError(
+            describe(
+                f"The scale of '{name}' must be positive.",
+                expected="typical magnitudes > 0",
+                received=str(values),
+                remedy="give magnitudes, or None for automatic scaling",
+            )
+        )
+    return values
+
+
+def check_name(name: Any, declared: list[Any]) -> None:
+    """A name must be a text that no declaration has yet."""
+    if not isinstance(name, str) or not name:
+        raise ProblemError(
+            describe(
+                "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
+            )
+        )
+    if name in ("time", "duration"):
+        raise ProblemError(
+            describe(
+                f"The name '{name}' is taken.",
+                expected="any other name",
+                received=name,
+                remedy=f"use Problem.{name} for that symbol",
+            )
+        )
+    for entry in declared:
+        if name in (entry.name, *(f"{entry.name}[{i}]" for i in range(getattr(entry, "size", 0)))):
+            raise ProblemError(
+                describe(
+                    f"The name '{name}' is used twice.",
+                    expected="a unique name for each symbol, measurement and constraint",
+                    received=f"'{name}', declared before at {entry.where}",
+                    remedy="choose another name",
+                )
+            )
+
+
+def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
+    """Everything that moves needs a rate."""
+    for entry in entries:
+        if entry.name not in rates:
+            raise ProblemError(
+                describe(
+                    f"'{entry.name}' has no dynamics (declared at {entry.where}).",
+                    expected=f"dynamics({entry.name}, rate)",
+                    received="none",
+                    remedy="give its rate; 0 for a constant",
+                )
+            )
+
+
+def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, ...]) -> str:
+    """Name of what was declared, from its symbol or name."""
+    for entry in declared:
+        own = getattr(entry, "symbol", None)
+        if own is None:
+            continue
+        if (
+            symbol is own
+            or symbol is getattr(entry, "matrix", None)
+            or (isinstance(symbol, str) and symbol == entry.name)
+        ):
+            return str(entry.name)
+        if is_symbolic(symbol) and symbol.is_symbolic() and ca.is_equal(symbol, own):
+            return str(entry.name)
+    names = [str(entry.name) for entry in allowed]
+    raise ProblemError(
+        describe(
+            f"{what}() was given something that is not a symbol of this problem.",
+            expected="one of " + ", ".join(names),
+            received=str(symbol),
+            remedy=spelling(symbol, names, "check the spelling; or pass the symbol that its declaration returned"),
+        )
+    )
+
+
+def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
+    """The value as an expression of the given shape (a scalar zero fits every shape)."""
+    try:
+        expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(real_numbers(value)))
+    except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is not an expression.",
+                expected="an expression of the symbols of this problem",
+                received=shown(value, 200),
+                remedy="use casadi functions on the symbols (casadi.vertcat, casadi.sin, @, *), not lists, arrays "
+                "of symbols or symbols made by casadi.SX.sym",
+            )
+        ) from error
+    if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():
+        return ca.MX.zeros(*shape)
+    if expression.shape != shape:
+        raise shape_error(name, what, f"shape {shape}", f"shape {expression.shape}")
+    if expression.is_constant() and not np.isfinite(ca.evalf(expression).full()).all():
+        raise ProblemError(
+            describe(
+                f"The {what} of '{name}' is NaN or inf.",
+                expected="a finite expression",
+                received=str(expression),
+                remedy=f"correct the {what}",
+            )
+        )
+    return expression
+
+
+COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
+
+
+def column_expression(name: str, what: str, value: Any) -> ca.MX:
+    """The value as a column of expressions; comparisons, lists and symbols of another kind are refused."""
+    if not isinstance(value, (ca.MX, ca.DM)) and not is_number(value):
+        raise ProblemError(
+            describe(
+                f"The {what} '{name}' is not an expression of this problem's symbols.",
+                expected="one expression; several go into one column by casadi.vertcat",
+                received=kind_and_name(value),
+                remedy="use the symbols that state(), control() and symmetric() return",
+            )
+        )
+    expression = ca.MX(value)
+    if not expression.is_constant() and expression.is_binary() and expression.op() in COMPARISONS:
+        raise ProblemError(
+            describe(
+                f"The {what} '{name}' is a comparison, whose value is true or false.",
+                expected="an expression, and its bounds apart: subject_to(x, upper=1)",
+                received=str(value),
+                remedy="give what is bounded, and its bounds by lower= and upper=",
+            )
+        )
+    if expression.shape[1] != 1:
+        raise shape_error(name, what, "a scalar or a column", f"shape {expression.shape}")
+    return expression
+
+
+def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None:
+    """A constraint must contain something that can be chosen."""
+    fixed = {symbol.__hash__() for symbol in constants}
+    if all(symbol.__hash__() in fixed for symbol in ca.symvar(expression)):
+        raise ProblemError(
+            describe(
+                f"'{name}' contains no variable.",
+                expected="an expression of states, controls, matrix states or the free duration",
+                received=str(expression),
+                remedy="remove it, or use the symbols that state(), control() and symmetric() return",
+            )
+        )
+
+
+def check_limits(name: str, lower: Array, upper: Array) -> None:
+    """Bounds of a constraint must not cross, and one of them must bind."""
+    if (lower > upper).any() and (upper == 0).all():
+        raise ProblemError(
+            describe(
+                f"The bounds of '{name}' cross.",
+                expected="lower <= upper",
+                received=f"lower = {lower.max():g}, upper = 0 (which it is unless given)",
+                remedy="give the upper bound too; upper=numpy.inf where there is none",
+            )
+        )
+    check_bounds(name, lower, upper)
+    for i in np.flatnonzero(np.isneginf(lower) & np.isposinf(upper)):
+        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+        raise ProblemError(
+            describe(
+                f"{entry} has no bound.",
+                expected="a finite lower or upper bound",
+                received="lower = -inf, upper = inf",
+                remedy="give lower= or upper=, or remove the constraint",
+            )
+        )

@@ -1,0 +1,185 @@
+"""The errors that covocp raises, and the warnings that it gives."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from covocp.solution.solution import Solution
+
+PACKAGE = __name__.partition(".")[0]
+# Likeness of two names (difflib's ratio) from which on one may be a slip of the other: "fricton" and "friction" have
+# 0.93, "position" and "friction" 0.63.
+ALIKE = 0.75
+# Whether warnings are held back, in this thread: the filters of the module `warnings` belong to all threads.
+_HELD_BACK = ContextVar("held_back", default=False)
+
+
+class CovocpError(Exception):
+    """Base of every error that covocp raises on purpose."""
+
+
+class ProblemError(CovocpError, ValueError):
+    """The statement of a problem, or an option, is wrong: says which name, what was given and what is needed."""
+
+
+class OutsideDomainError(ProblemError):
+    """A start lies where the model gives no numbers; another one may not."""
+
+
+class SolveError(CovocpError, RuntimeError):
+    """A solver ended without a solution.
+
+    Attributes:
+        solution: the last iterate as a `Solution` (its `status` says that it did not converge), or None where not
+            even one iterate exists. It can be saved, plotted and used as a guess.
+        violations: largest violation of each violated constraint, by the name of the constraint, in its own unit.
+    """
+
+    def __init__(
+        self, message: str, *, solution: Solution | None = None, violations: Mapping[str, float] | None = None
+    ) -> None:
+        """Keep the last iterate and the violated constraints beside the message."""
+        super().__init__(message)
+        self.solution = solution
+        self.violations = dict(violations or {})
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C stopped a solver: a `KeyboardInterrupt`, so that a loop of solves ends too.
+
+    Attributes:
+        solution: the last iterate as a `Solution`, or the best of the starts that were solved before.
+    """
+
+    def __init__(self, message: str, *, solution: Solution | None = None) -> None:
+        """Keep what was found beside the message."""
+        super().__init__(message)
+        self.solution = solution
+
+
+class ExportError(CovocpError, RuntimeError):
+    """Something cannot be exported or written: says what, and why."""
+
+
+class CovocpWarning(UserWarning):
+    """The result is usable, but the user should know something about it (mesh too coarse, saddle point left)."""
+
+
+def warn_user(message: str) -> None:
+    """Give a `CovocpWarning` that names the line of the user's own code from which the toolbox was called.
+
+    Args:
+        message: what the user should know.
+    """
+    if _HELD_BACK.get():
+        return
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, CovocpWarning, stacklevel=level)
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Hold back the warnings of covocp meanwhile, in this thread: they concern something that the user does not see."""
+    token = _HELD_BACK.set(True)
+    try:
+        yield
+    finally:
+        _HELD_BACK.reset(token)
+
+
+@contextmanager
+def evaluating(name: str) -> Iterator[None]:
+    """What CasADi raises where a model has no value (a singular factorisation, a number too large), as an own error.
+
+    Args:
+        name: of the problem.
+
+    Raises:
+        SolveError: without a solution.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if isinstance(error, CovocpError):
+            raise
+        reason = " ".join(str(error).strip().splitlines()[-1:])
+        raise SolveError(
+            f"'{name or 'The problem'}' has no value somewhere between its guess and its end: a solve of linear "
+            f"equations inside it fails, or a number is too large ({reason[:200]}). Give another guess, bounds that "
+            "keep the model in its domain, or other units."
+        ) from error
+
+
+def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
+    """Text of an error in the one form that all of them have.
+
+    Args:
+        problem: what is wrong, with the user's name of the thing.
+        expected: what is needed.
+        received: what was given.
+        remedy: what to do next.
+
+    Returns:
+        The message, four lines.
+    """
+    return f"{problem}\n  expected: {expected}\n  received: {received}\n  remedy:   {remedy}"
+
+
+def shown(value: object, length: int = 100, form: Callable[[object], str] = repr) -> str:
+    """The beginning of what Python shows of a value, on one line; of numbers that are too long for it the type."""
+    try:
+        return " ".join(form(value).split())[:length]
+    except ValueError:
+        return type(value).__name__
+
+
+def kind_and_name(value: object) -> str:
+    """Type and name of something, or its beginning where it has no name: one line."""
+    name = getattr(value, "name", None)
+    text = f"'{name}'" if isinstance(name, str) and name else shown(value, 60, str)
+    return f"{type(value).__name__}: {text}"
+
+
+def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
+    """The remedy for a name that is not known: the known one that is nearly the same, where there is one.
+
+    Args:
+        name: what was given.
+        known: what could be given.
+        otherwise: the remedy where nothing is near.
+    """
+    import difflib  # here: most programs make no mistakes, and importing covocp must not take long
+
+    lower = {word.casefold(): word for word in known}
+    found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
+    return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise
+
+
+def no_option(what: str, name: str, value: object, known: Iterable[str], beside: Iterable[str] = ()) -> ProblemError:
+    """The error for an option that is not there.
+
+    Args:
+        what: that has no such option, the subject of the sentence.
+        name: of the option.
+        value: that was given to it.
+        known: the options that there are.
+        beside: other arguments of the call, which may be meant too.
+    """
+    names = sorted(known)
+    return ProblemError(
+        describe(
+            f"{what} has no option '{name}'.",
+            expected="one of " + ", ".join(names),
+            received=f"{name}={value!r}"[:100],
+            remedy=spelling(name, [*names, *beside], "correct or remove it"),
+        )
+    )

@@ -1,0 +1,81 @@
+"""What is called converged: residuals in the scale of the point that was reached.
+
+A solver works in scales that the start suggests. Where the start is bad (an unstable plant, a guess in a wrong unit)
+its tolerance means nothing there. So every method ends with the same question, asked in the scale of the point it
+reached: by how much would the cost J change, to first order, if
+
+- each free variable changed by its own magnitude along the slope of the Lagrangian (`slope`),
+- each inequality that has a multiplier were met exactly (`complementarity`),
+- each violated constraint were met exactly (`infeasibility`),
+
+all relative to the cost. The gain still to be had is of the order of the square of the first of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from covocp.base.matrices import Array
+
+# Largest residuals of a converged point. To first order it is this share of its cost away from a stationary one, mostly
+# the square of it.
+LIMIT = 1e-5
+# Largest violation of a converged point, in magnitudes of what is constrained.
+VIOLATION = 1e-6
+# A cost below this share of what the controls change of it (a tracking cost that vanishes) has no size of its own.
+VANISHING = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    """First-order changes of the cost that a point leaves, relative to the cost, and its largest violation.
+
+    Attributes:
+        slope: by changes of the variables by their own magnitudes along the slope of the Lagrangian.
+        complementarity: sum of |multiplier| times distance from the bound over all inequalities.
+        infeasibility: sum of |multiplier| times violation over all constraints.
+        violation: largest violation, in magnitudes of what is constrained.
+    """
+
+    slope: float
+    complementarity: float
+    infeasibility: float
+    violation: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of them, the violation in multiples of what it may be."""
+        return max(self.slope, self.complementarity, self.infeasibility, LIMIT * self.violation / VIOLATION)
+
+    def hold(self, limit: float) -> bool:
+        """Whether all are small: those of the cost below `limit`, the violation below VIOLATION."""
+        worst = max(self.slope, self.complementarity, self.infeasibility)
+        return bool(worst <= limit and self.violation <= VIOLATION)
+
+    def __str__(self) -> str:
+        """The residuals in words, for a message."""
+        return (
+            f"slope {self.slope:.1e}, complementarity {self.complementarity:.1e}, infeasibility "
+            f"{self.infeasibility:.1e} (changes of the cost to first order, relative to it), largest violation "
+            f"{self.violation:.1e}"
+        )
+
+
+def complementary(multipliers: Array, values: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Multipliers of bounds that exist, and how far from their bound the values are.
+
+    Args:
+        multipliers: positive at upper bounds, negative at lower ones.
+        values: what is bounded.
+        lower: bounds, -inf where there is none.
+        upper: bounds, inf where there is none.
+
+    Returns:
+        The multipliers, zero where there is no bound of their side; |distance| from that bound, zero without one.
+    """
+    bound = np.where(multipliers > 0, upper, lower)
+    there = np.isfinite(bound) & (multipliers != 0)
+    distance = np.abs(values - np.where(there, bound, values))
+    return np.where(there, multipliers, 0.0), distance

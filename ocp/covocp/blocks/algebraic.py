@@ -1,0 +1,348 @@
+"""Algebraic Riccati and Lyapunov equations with numbers, and the modes that keep them from having a solution.
+
+Everything here is numeric (scipy); a Lyapunov equation, being linear, may also hold expressions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.arguments import checked, truth
+from covocp.base.errors import ProblemError, describe
+from covocp.blocks.arithmetic import apply
+from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
+
+Array = NDArray[np.float64]
+Modes = NDArray[np.complex128]
+
+# A mode is out of reach where the smallest singular value of [A - mode I, B], both blocks of size 1, is below this.
+UNREACHABLE = 1e-10
+# A mode counts as marginal, neither stable nor unstable, this close to the boundary, relative to the size of A.
+MARGINAL = 1e-9
+# Largest relative residual of a Riccati equation that counts as solved.
+RESIDUAL = 1e-7
+
+
+def continuous(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
+    """Stabilising solution S of A'S + S A - (S B + N) R^-1 (B'S + N') + Q = 0.
+
+    Args:
+        A: shape (n, n) [1/s].
+        B: shape (n, m).
+        Q: weight of the state, positive semidefinite, shape (n, n).
+        R: weight of the control, positive definite, shape (m, m).
+        cross: N, weight of state times control, shape (n, m); None: zero.
+
+    Returns:
+        S, shape (n, n), positive semidefinite.
+
+    Raises:
+        ProblemError: expressions, shapes that do not fit, indefinite weights, (A, B) not stabilisable or a mode on the
+            imaginary axis that the weights do not see (names the mode).
+    """
+    return restored(stabilising(*weights(A, B, Q, R, cross), discrete=False), A)
+
+
+def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
+    """Stabilising solution S of S = A'S A - (A'S B + N) (R + B'S B)^-1 (B'S A + N') + Q, of item 5.
+
+    Args:
+        A: transition matrix, shape (n, n).
+        B: shape (n, m).
+        Q: weight of the state, positive semidefinite, shape (n, n).
+        R: weight of the control, positive definite, shape (m, m).
+        cross: N, weight of state times control, shape (n, m); None: zero.
+
+    Returns:
+        S, shape (n, n), positive semidefinite.
+
+    Raises:
+        ProblemError: as for `continuous`, with the unit circle in place of the imaginary axis.
+    """
+    return restored(stabilising(*weights(A, B, Q, R, cross), discrete=True), A)
+
+
+@checked(discrete=truth)
+def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
+    """Solution X of A X + X A' + Q = 0, or of A X A' - X + Q = 0.
+
+    Args:
+        A: shape (n, n), numbers or an expression.
+        Q: shape (n, n), numbers or an expression, usually symmetric.
+        discrete: which of the two equations.
+
+    Returns:
+        X, shape (n, n); symmetric where Q is.
+
+    Raises:
+        ProblemError: shapes that do not fit; no unique solution, because two modes add up to zero (discrete: have the
+            product one).
+    """
+    a = square("A", A)
+    q = square("Q", Q, a.shape[0])
+    if is_symbolic(a, q):
+        return _linear_lyapunov(a, q, discrete)
+    from scipy import linalg
+
+    transition, right = a.full(), q.full()
+    values = np.linalg.eigvals(transition)
+    pairs = values[:, None] * values[None, :] - 1.0 if discrete else values[:, None] + values[None, :]
+    scale = max(1.0, np.abs(values).max(initial=0.0) ** 2) if discrete else np.abs(values).max(initial=0.0)
+    if pairs.size and np.abs(pairs).min() <= 1e-14 * scale:
+        i, j = np.unravel_index(int(np.argmin(np.abs(pairs))), pairs.shape)
+        relation = "have the product one" if discrete else "add up to zero"
+        raise ProblemError(
+            describe(
+                f"The Lyapunov equation has no unique solution: two modes of A {relation}.",
+                expected="modes of A inside the unit circle" if discrete else "modes of A in the left half plane",
+                received=f"{mode_text(values[i])} and {mode_text(values[j])}",
+                remedy="stabilise A first",
+            )
+        )
+    solve = linalg.solve_discrete_lyapunov if discrete else linalg.solve_continuous_lyapunov
+    solution = np.asarray(solve(transition, right if discrete else -right), dtype=float)
+    if np.array_equal(right, right.T):
+        solution = symmetrised(solution)
+    return restored(solution, A)
+
+
+@checked(discrete=truth)
+def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
+    """Modes of A that are not stable and that B does not reach (Hautus: [A - mode I, B] loses rank).
+
+    Args:
+        A: shape (n, n).
+        B: shape (n, m).
+        discrete: stable means inside the unit circle, not in the left half plane.
+
+    Returns:
+        Eigenvalues of A, empty where the pair is stabilisable.
+
+    Raises:
+        ProblemError: expressions, shapes that do not fit.
+    """
+    a = numeric("A", square("A", A))
+    return lost_modes(a, numeric("B", matrix("B", B, (a.shape[0], None))), discrete=discrete)
+
+
+@checked(discrete=truth)
+def undetectable(A: Any, H: Any, *, discrete: bool = False) -> Modes:
+    """Modes of A that are not stable and that H does not see: those of the dual pair (A', H').
+
+    Args:
+        A: shape (n, n).
+        H: shape (m, n).
+        discrete: stable means inside the unit circle, not in the left half plane.
+
+    Returns:
+        Eigenvalues of A, empty where the pair is detectable.
+
+    Raises:
+        ProblemError: expressions, shapes that do not fit.
+    """
+    a = numeric("A", square("A", A))
+    return lost_modes(a.T, numeric("H", matrix("H", H, (None, a.shape[0]))).T, discrete=discrete)
+
+
+def lost_modes(A: Array, B: Array, *, discrete: bool, marginal: bool = False) -> Modes:
+    """Modes of A that are not stable (`marginal`: on the boundary) and that B does not reach."""
+    from scipy import linalg
+
+    size = A.shape[0]
+    if not size:
+        return np.zeros(0, dtype=complex)
+    balanced, (scaling, _) = linalg.matrix_balance(A, permute=False, separate=True)
+    columns = B / np.asarray(scaling)[:, None]
+    norms = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(norms > 0.0, norms, 1.0)
+    values = np.linalg.eigvals(balanced)
+    excess = np.abs(values) - 1.0 if discrete else values.real
+    tolerance = MARGINAL * (1.0 if discrete else max(float(np.abs(values).max()), np.finfo(float).tiny))
+    chosen = np.abs(excess) <= tolerance if marginal else excess >= -tolerance
+    lost = []
+    for value in values[chosen]:
+        shifted = balanced - value * np.eye(size)
+        pencil = np.hstack([shifted / max(float(np.linalg.norm(shifted, 2)), np.finfo(float).tiny), columns])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] <= UNREACHABLE:
+            lost.append(value)
+    return np.asarray(lost, dtype=complex)
+
+
+def mode_text(mode: complex) -> str:
+    """An eigenvalue in words: a real one without its imaginary part."""
+    value = complex(mode)
+    if abs(value.imag) <= 1e-12 * max(1.0, abs(value)):
+        return f"{value.real:.6g}"
+    return f"{value.real:.6g} {'+' if value.imag >= 0 else '-'} {abs(value.imag):.6g}i"
+
+
+def root(weights: Array) -> Array:
+    """Symmetric square root of a positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(weights)
+    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+
+
+def lost_mode(modes: Modes, pair: str, needed: str, remedy: str, why: str = "") -> ProblemError:
+    """The error that names the first of some modes."""
+    return ProblemError(
+        describe(
+            f"The pair {pair} is not {needed}.",
+            expected=f"a {needed} pair",
+            received="the mode " + ", ".join(mode_text(mode) for mode in modes[:3]) + (f", which {why}" if why else ""),
+            remedy=remedy,
+        )
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Words:
+    """What the user calls the matrices of a Riccati equation, and the two ways in which a mode can be lost.
+
+    Args:
+        names: of A, B, Q, R.
+        reach: of (A, B): the pair, what it should be, the remedy, why a mode is lost.
+        see: of (A, Q^1/2): the same.
+    """
+
+    names: tuple[str, str, str, str] = ("A", "B", "Q", "R")
+    reach: tuple[str, str, str, str] = (
+        "(A, B)",
+        "stabilisable",
+        "add an input, or take the mode out of the model",
+        "B does not reach",
+    )
+    see: tuple[str, str, str, str] = (
+        "(A, Q^1/2)",
+        "detectable",
+        "give the mode a weight, or take it out of the model",
+        "Q gives no weight",
+    )
+
+
+CONTROL = Words()
+
+
+def weights(A: Any, B: Any, Q: Any, R: Any, cross: Any, words: Words = CONTROL) -> tuple[Array, ...]:
+    """The five matrices of a linear-quadratic problem as checked numbers.
+
+    Raises:
+        ProblemError: expressions, shapes that do not fit, Q or [Q N; N' R] not positive semidefinite, R not definite.
+    """
+    names = words.names
+    a = numeric(names[0], square(names[0], A))
+    b = numeric(names[1], matrix(names[1], B, (a.shape[0], None)))
+    q = numeric(names[2], weight(names[2], Q, a.shape[0]))
+    r = numeric(names[3], weight(names[3], R, b.shape[1], definite=True))
+    n = np.zeros(b.shape) if cross is None else numeric("cross", matrix("cross", cross, b.shape))
+    if cross is not None:
+        weight(f"[{names[2]}, cross; cross', {names[3]}]", np.block([[q, n], [n.T, r]]))
+    return a, b, symmetrised(q), symmetrised(r), n
+
+
+def stabilising(
+    A: Array,
+    B: Array,
+    Q: Array,
+    R: Array,
+    N: Array,
+    *,
+    discrete: bool,
+    detectable: bool = False,
+    words: Words = CONTROL,
+) -> Array:
+    """The stabilising solution, one Newton step after scipy's; `detectable`: refuse every unstable mode without weight.
+
+    Raises:
+        ProblemError: a mode that is not reached, or has no weight and is marginal or must be detectable; no solution.
+    """
+    from scipy import linalg
+
+    reached = lost_modes(A, B, discrete=discrete)
+    if reached.size:
+        raise lost_mode(reached, *words.reach)
+    back = np.linalg.solve(R, N.T)
+    cost = root(symmetrised(Q - N @ back))
+    unseen = lost_modes((A - B @ back).T, cost, discrete=discrete, marginal=not detectable)
+    if unseen.size:
+        raise lost_mode(unseen, *words.see)
+    solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
+    try:
+        start = np.asarray(solve(A, B, Q, R, s=N), dtype=float)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise _unsolved(str(error)) from error
+    solution, stable = _newton(A, B, Q, R, N, symmetrised(start), discrete)
+    residual = np.abs(_residual(A, B, Q, R, N, solution, discrete)).max(initial=0.0)
+    scale = max(np.abs(Q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(A).max(initial=0.0))
+    if not stable or not residual <= RESIDUAL * scale:
+        raise _unsolved("the closed loop is not stable" if not stable else f"a residual of {residual:.3g}")
+    return solution
+
+
+def _unsolved(received: str) -> ProblemError:
+    return ProblemError(
+        describe(
+            "The Riccati equation could not be solved.",
+            expected="a solution that makes the closed loop stable",
+            received=received,
+            remedy="scale states and inputs to similar sizes; look for modes that are hardly reached or weighted",
+        )
+    )
+
+
+def gain_of(A: Array, B: Array, R: Array, cross: Array, S: Array, *, discrete: bool) -> Array:
+    """K = R^-1 (B'S + N'), or (R + B'S B)^-1 (B'S A + N') of item 5."""
+    if discrete:
+        return np.asarray(np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A + cross.T))
+    return np.asarray(np.linalg.solve(R, B.T @ S + cross.T))
+
+
+def frozen(numbers: Any) -> Any:
+    """A copy of an array that cannot be written to."""
+    result = np.array(numbers)
+    result.setflags(write=False)
+    return result
+
+
+def sorted_modes(A: Array) -> Modes:
+    """Eigenvalues, sorted by real part; read-only."""
+    result: Modes = frozen(np.sort_complex(np.linalg.eigvals(A)))
+    return result
+
+
+def is_stable(A: Array, *, discrete: bool) -> bool:
+    """Whether all the modes are strictly inside."""
+    values = np.linalg.eigvals(A)
+    return bool(np.all(np.abs(values) < 1.0) if discrete else np.all(values.real < 0.0))
+
+
+def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, bool]:
+    """One step of Kleinman's iteration (quadratic convergence: the result is exact to rounding); closed loop stable."""
+    K = gain_of(A, B, R, N, S, discrete=discrete)
+    closed = A - B @ K
+    if not is_stable(closed, discrete=discrete):
+        return S, False
+    right = Q + K.T @ R @ K - N @ K - K.T @ N.T
+    return np.asarray(lyapunov(closed.T, symmetrised(right), discrete=discrete)), True
+
+
+def _residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> Array:
+    K = gain_of(A, B, R, N, S, discrete=discrete)
+    if discrete:
+        return A.T @ S @ A - S + Q - (A.T @ S @ B + N) @ K
+    return A.T @ S + S @ A + Q - (S @ B + N) @ K
+
+
+def _linear_lyapunov(A: Any, Q: Any, discrete: bool) -> Any:
+    """The equation as one linear system of n^2 unknowns, which expands to SX."""
+
+    def lyapunov(a: Any, q: Any) -> tuple[Any]:
+        unit = ca.SX.eye(a.shape[0])
+        operator = ca.kron(a, a) - ca.SX.eye(a.shape[0] ** 2) if discrete else ca.kron(unit, a) + ca.kron(a, unit)
+        return (ca.reshape(ca.solve(operator, -ca.vec(q)), a.shape),)
+
+    return apply(lyapunov, A, Q)[0]

@@ -1,0 +1,188 @@
+"""How one law serves numbers and expressions: what numpy and CasADi spell differently, and how a law is applied.
+
+A law is a function of matrices, written with `@`, `.T`, slices and the functions of this module. Numbers go through
+it as numpy arrays, in their precision; expressions as SX. An MX goes through a function of SX that is called with it:
+so every law expands to SX, and its C code holds no linear solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.errors import ProblemError, describe
+from covocp.blocks.values import is_symbolic
+
+Array = NDArray[Any]
+
+# A reading beyond this, an infinite one or NaN counts as missing: a comparison that holds in C code too.
+LARGEST_READING = 1e300
+
+
+def precision(*arguments: Any) -> Any:
+    """float32 where the arrays among the arguments are all of that type, otherwise float64."""
+    kinds = [argument.dtype for argument in arguments if isinstance(argument, np.ndarray)]
+    return np.float32 if kinds and all(kind == np.float32 for kind in kinds) else np.float64
+
+
+def apply(law: Callable[..., Sequence[Any]], *values: Any, precision: Any = np.float64) -> list[Any]:
+    """The results of a law.
+
+    Args:
+        law: of as many matrices as there are values; returns a sequence of matrices.
+        values: as `values.matrix` returns them: SX, MX or DM.
+        precision: of the arrays where all the values are numbers.
+
+    Returns:
+        Arrays where all the values are numbers; otherwise dense SX or MX.
+
+    Raises:
+        ProblemError: SX and MX together.
+    """
+    if not is_symbolic(*values):
+        return [np.asarray(entry) for entry in law(*(value.full().astype(precision) for value in values))]
+    kinds = {type(value) for value in values if is_symbolic(value) and not value.is_constant()}
+    if len(kinds) > 1:
+        raise ProblemError(
+            describe(
+                "The arguments mix SX and MX.",
+                expected="expressions of one kind",
+                received="both",
+                remedy="make a casadi.Function of the SX part and call it with the MX",
+            )
+        )
+    symbols, given, inputs = [], [], []
+    for k, value in enumerate(values):
+        if isinstance(value, ca.MX) and not value.is_constant():
+            symbols.append(ca.SX.sym(f"argument_{k}", value.sparsity()))
+            given.append(value)
+            inputs.append(symbols[-1])
+        else:
+            constant = ca.evalf(value) if isinstance(value, ca.MX) else value
+            inputs.append(constant if isinstance(constant, ca.SX) else ca.SX(ca.sparsify(constant)))
+    results = [ca.densify(entry) for entry in law(*inputs)]
+    if not symbols:
+        return results if kinds == {ca.SX} else [ca.evalf(entry) for entry in results]
+    return list(ca.Function(getattr(law, "__name__", "law").strip("_<>"), symbols, results).call(given, False, False))
+
+
+def unit(like: Any, size: int) -> Any:
+    """The unit matrix of the kind of another matrix."""
+    return np.eye(size, dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX.eye(size)
+
+
+def zeros(like: Any, rows: int, columns: int) -> Any:
+    """Zeros of the kind of another matrix."""
+    return np.zeros((rows, columns), dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX(rows, columns)
+
+
+def symmetric(value: Any) -> Any:
+    """The symmetric part, in the precision of the value."""
+    return (value + value.T) / 2
+
+
+def diagonal(value: Any) -> Any:
+    """A column as a diagonal matrix."""
+    return np.diag(value.ravel()) if isinstance(value, np.ndarray) else ca.diag(value)
+
+
+def below(upper: Any, lower: Any) -> Any:
+    """One matrix below another."""
+    return np.vstack([upper, lower]) if isinstance(upper, np.ndarray) else ca.vertcat(upper, lower)
+
+
+def beside(left: Any, right: Any) -> Any:
+    """One matrix beside another."""
+    return np.hstack([left, right]) if isinstance(left, np.ndarray) else ca.horzcat(left, right)
+
+
+def definite_solve(matrix: Any, right: Any, what: str) -> Any:
+    """matrix^-1 right for a positive definite matrix, by L D L' without pivots.
+
+    Args:
+        matrix: shape (n, n).
+        right: shape (n, k).
+        what: the matrix is, for the message.
+
+    Raises:
+        ProblemError: numbers that are not positive definite.
+    """
+    if isinstance(matrix, np.ndarray):
+        try:
+            np.linalg.cholesky(matrix)
+            return np.linalg.solve(matrix, right)
+        except np.linalg.LinAlgError as error:
+            raise _indefinite(what, matrix) from error
+    entries, upper, order = ca.ldl(matrix)
+    return ca.ldl_solve(ca.densify(right), entries, upper, order)
+
+
+def unit_triangular(matrix: Any, what: str) -> tuple[Any, Any]:
+    """L and the column D of matrix = L diag(D) L', L unit lower triangular.
+
+    Raises:
+        ProblemError: numbers, not diagonal, that are not positive definite.
+    """
+    if isinstance(matrix, np.ndarray):
+        entries = np.diag(matrix)
+        if not np.any(matrix - np.diag(entries)):
+            return unit(matrix, matrix.shape[0]), entries[:, None]
+        try:
+            factor = np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError as error:
+            raise _indefinite(what, matrix) from error
+        return factor / np.diag(factor), (np.diag(factor) ** 2)[:, None]
+    entries, upper, _ = ca.ldl(matrix, False)
+    return ca.SX.eye(matrix.shape[0]) + upper.T, entries
+
+
+def triangular_solve(lower: Any, right: Any) -> Any:
+    """lower^-1 right for a unit lower triangular matrix, by substitution."""
+    if isinstance(lower, np.ndarray):
+        return np.linalg.solve(lower, right)
+    rows = [right[i, :] for i in range(lower.shape[0])]
+    for i in range(lower.shape[0]):
+        for j in range(i):
+            if lower.sparsity().has_nz(i, j):
+                rows[i] = rows[i] - lower[i, j] * rows[j]
+    return ca.vertcat(*rows)
+
+
+def is_there(reading: Any) -> Any:
+    """1 where a reading is a number, 0 where it is missing (NaN or infinite)."""
+    if isinstance(reading, np.ndarray):
+        return np.isfinite(reading).astype(reading.dtype)
+    return ca.fabs(reading) <= LARGEST_READING
+
+
+def where(condition: Any, value: Any) -> Any:
+    """The value where the condition is 1, zero elsewhere, also where the value is NaN."""
+    if isinstance(value, np.ndarray):
+        return np.where(condition > 0, value, 0).astype(value.dtype)
+    return ca.if_else(condition, value, 0)
+
+
+def semidefinite(value: Any) -> Any:
+    """A covariance without the negative eigenvalues that rounding can leave; expressions as they are."""
+    if not isinstance(value, np.ndarray) or not value.size:
+        return value
+    values, vectors = np.linalg.eigh(value)
+    if values[0] >= 0.0:
+        return value
+    return symmetric((vectors * np.clip(values, 0.0, None)) @ vectors.T)
+
+
+def _indefinite(what: str, matrix: Array) -> ProblemError:
+    smallest = float(np.linalg.eigvalsh(matrix)[0]) if np.isfinite(matrix).all() else np.nan
+    return ProblemError(
+        describe(
+            f"The {what} is singular.",
+            expected="a positive definite matrix",
+            received=f"a smallest eigenvalue of {smallest:.3g}",
+            remedy="give every measurement some noise; where rounding hides it, take the square-root form",
+        )
+    )

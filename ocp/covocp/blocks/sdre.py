@@ -1,0 +1,155 @@
+"""State-dependent Riccati equation: at every x the linear-quadratic law of A0 + A(x), solved when it is called.
+
+Section 5; what θ-D approximates. These laws are Python functions of numbers, for comparison, without a symbolic form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from covocp.base.errors import ProblemError, describe
+from covocp.blocks import values
+from covocp.blocks.algebraic import continuous
+from covocp.blocks.factorisation import as_rows, dependence
+
+Array = NDArray[np.float64]
+Law = Callable[[ArrayLike, float], Array]
+
+
+def solution(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Callable[[ArrayLike], Array]:
+    """Stabilising solution P(x) of the Riccati equation of A0 + A(x).
+
+    Args:
+        x: CasADi symbol of the state, shape (n,), that A is written in.
+        A0: numbers, (n, n) [1/s].
+        A: an expression in x, (n, n) [1/s].
+        B: input matrix, numbers, (n, m).
+        Q: weight of the state, positive semidefinite, (n, n).
+        R: weight of the input, positive definite, (m, m).
+
+    Returns:
+        Function of a state, shape (n,), that returns P, (n, n); it raises ProblemError where there is no solution.
+
+    Raises:
+        ProblemError: an argument does not fit.
+    """
+    return _regulator(x, A0, A, B, Q, R)[0]
+
+
+def regulator(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Law:
+    """Feedback u = -R^-1 B' P(x) x.
+
+    Args:
+        x: CasADi symbol of the state, shape (n,), that A is written in.
+        A0: numbers, (n, n) [1/s].
+        A: an expression in x, (n, n) [1/s].
+        B: input matrix, numbers, (n, m).
+        Q: weight of the state, positive semidefinite, (n, n).
+        R: weight of the input, positive definite, (m, m).
+
+    Returns:
+        Function of a state, shape (n,), and a time, which does not matter, that returns u, shape (m,).
+
+    Raises:
+        ProblemError: an argument does not fit.
+    """
+    riccati, feedback = _regulator(x, A0, A, B, Q, R)
+
+    def law(state: ArrayLike, time: float = 0.0) -> Array:
+        given = np.asarray(state, dtype=float).ravel()
+        return np.asarray(-feedback @ riccati(given) @ given)
+
+    return law
+
+
+def filter_gain(x: Any, A0: Any, A: Any, H: Any, W: Any, V: Any) -> Law:
+    """Gain P(x) H' V^-1 of the filter, P(x) from the dual Riccati equation.
+
+    Args:
+        x: CasADi symbol of the estimate, shape (n,), that A is written in.
+        A0: numbers, (n, n) [1/s].
+        A: an expression in x, (n, n) [1/s].
+        H: measurement matrix, numbers, (p, n) or, of one measurement, (n,).
+        W: power spectral density of the process noise, or a weight, positive semidefinite, (n, n).
+        V: power spectral density of the measurement noise, or a weight, positive definite, (p, p).
+
+    Returns:
+        Function of an estimate, shape (n,), and a time, which does not matter, that returns the gain, (n, p).
+
+    Raises:
+        ProblemError: an argument does not fit.
+    """
+    constant = values.numeric("A0", values.square("A0", A0))
+    size = constant.shape[0]
+    rows = values.numeric("H", values.matrix("H", as_rows(H), (None, size)))
+    w = values.numeric("W", values.weight("W", W, size))
+    v = values.numeric("V", values.weight("V", V, rows.shape[0], definite=True))
+    state, rest = dependence(x, A, size)
+    riccati = _solution((state, rest.T), constant.T, rows.T, w, v)
+    weighted = np.linalg.solve(v, rows).T
+
+    def gain(estimate: ArrayLike, time: float = 0.0) -> Array:
+        return np.asarray(riccati(estimate) @ weighted)
+
+    return gain
+
+
+def _regulator(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Callable[[ArrayLike], Array], Array]:
+    """P(x) and R^-1 B' of checked arguments."""
+    constant = values.numeric("A0", values.square("A0", A0))
+    size = constant.shape[0]
+    column = values.numeric("B", values.matrix("B", B, (size, None)))
+    q = values.numeric("Q", values.weight("Q", Q, size))
+    r = values.numeric("R", values.weight("R", R, column.shape[1], definite=True))
+    return _solution(dependence(x, A, size), constant, column, q, r), np.asarray(np.linalg.solve(r, column.T))
+
+
+def _solution(rest: tuple[Any, Any], A0: Array, B: Array, Q: Array, R: Array) -> Callable[[ArrayLike], Array]:
+    """P(x) of the matrices of a regulator, or of the dual of a filter."""
+    inputs: Any = ([rest[0]], [rest[1]])
+    evaluate = ca.Function("A", *inputs)
+    weight = B @ np.linalg.solve(R, B.T)
+
+    def riccati(state: ArrayLike) -> Array:
+        from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
+
+        given = np.asarray(state, dtype=float).ravel()
+        factor = A0 + evaluate(given).full()
+        try:
+            first = np.asarray(solve_continuous_are(factor, B, Q, R))
+            closed = factor - weight @ first
+            if np.linalg.eigvals(closed).real.max() >= 0.0:
+                return np.asarray(continuous(factor, B, Q, R))
+            # One step of Newton's method, to rounding.
+            found = solve_continuous_lyapunov(closed.T, -(Q + first @ weight @ first))
+            return np.asarray(values.symmetrised(found))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise _unsolved(given, _reason(factor, B, Q, R) or str(error)) from error
+
+    return riccati
+
+
+def _reason(A: Array, B: Array, Q: Array, R: Array) -> str:
+    """What the checked solver says of these matrices."""
+    try:
+        continuous(A, B, Q, R)
+    except ValueError as error:
+        return str(error).splitlines()[0]
+    return ""
+
+
+def _unsolved(state: Array, received: str) -> ProblemError:
+    at = "(" + ", ".join(f"{value:.6g}" for value in state) + ")"
+    return ProblemError(
+        describe(
+            f"The state-dependent Riccati equation has no solution at x = {at}.",
+            expected="A0 + A(x) that the input can stabilise and the weights see",
+            received=received,
+            remedy="keep away from this state, change the factorisation, or use covocp.blocks.theta_d",
+        )
+    )

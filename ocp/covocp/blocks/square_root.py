@@ -1,0 +1,173 @@
+"""The discrete filter on triangular factors of the covariance, for ill-conditioned cases.
+
+P = L L' with L lower triangular is positive semidefinite whatever the rounding, and L has half the digits of P to
+carry: a condition number of 1e24 of P is one of 1e12 of L. Both steps are one triangularisation by Householder
+reflections: numbers by LAPACK's QR, expressions unrolled, so that they expand to SX and need no linear solver in C.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.blocks.arithmetic import apply, below, beside, diagonal, is_there, precision, unit_triangular, where, zeros
+from covocp.blocks.updates import Missing, reading, row_matrix, shift
+from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
+
+
+def factor(covariance: Any) -> Any:
+    """Lower triangular L with L L' = covariance.
+
+    Args:
+        covariance: positive semidefinite, shape (n, n); an expression must be definite.
+
+    Returns:
+        L, shape (n, n), its diagonal not negative.
+
+    Raises:
+        ProblemError: not symmetric, or not positive semidefinite.
+    """
+    P = weight("covariance", covariance)
+    if is_symbolic(P):
+        return apply(_definite_factor, P)[0]
+    values, vectors = np.linalg.eigh(P.full())
+    (lower,) = apply(lambda roots: (triangular(roots),), ca.DM(vectors * np.sqrt(np.clip(values, 0.0, None))))
+    return restored(lower.astype(precision(covariance)), covariance)
+
+
+def predict_factor(
+    estimate: Any, factor: Any, transition: Any, noise_factor: Any, *, drift: Any = 0
+) -> tuple[Any, Any]:
+    """Time update of item 3 on factors: L+ L+' = Phi L L' Phi' + G G'.
+
+    Args:
+        estimate: after the last measurement, shape (n,) or (n, 1).
+        factor: L of its covariance, any square root, shape (n, n).
+        transition: Phi, shape (n, n).
+        noise_factor: G, any square root of the noise covariance, such as Gamma1 R_w^1/2, shape (n, k).
+        drift: what is known to be added, shape (n,); 0: nothing.
+
+    Returns:
+        Estimate and lower triangular factor before the next measurement.
+
+    Raises:
+        ProblemError: shapes that do not fit, NaN.
+    """
+    phi = square("transition", transition)
+    size = phi.shape[0]
+    x, L = matrix("estimate", estimate, (size, 1)), square("factor", factor, size)
+    G = matrix("noise_factor", noise_factor, (size, None))
+    kind = precision(estimate, factor, transition, noise_factor, drift)
+    moved, lower = apply(_time_update, x, L, phi, G, shift(drift, size), precision=kind)
+    return restored(moved, estimate), restored(lower, factor)
+
+
+def update_factor(
+    estimate: Any, factor: Any, measurement: Any, H: Any, R_factor: Any, *, missing: Missing = "raise"
+) -> tuple[Any, Any]:
+    """Measurement update of item 3 on factors.
+
+    Args:
+        estimate: before the measurement, shape (n,) or (n, 1).
+        factor: L of its covariance, any square root, shape (n, n).
+        measurement: y, shape (m,) or (m, 1), or a number.
+        H: shape (m, n), or (n,) for one measurement.
+        R_factor: any square root of the covariance of the measurement noise, shape (m, m).
+        missing: what a row of y that is NaN or infinite means: "raise": an error, "skip": no measurement of that row.
+
+    Returns:
+        Estimate and lower triangular factor after the measurement.
+
+    Raises:
+        ProblemError: shapes that do not fit, NaN, a row without noise of something that is known exactly.
+    """
+    x, L = matrix("estimate", estimate, (None, 1)), square("factor", factor)
+    size = x.shape[0]
+    L, rows = square("factor", factor, size), row_matrix("H", H, size)
+    y, V = reading("measurement", measurement, rows.shape[0], missing), square("R_factor", R_factor, rows.shape[0])
+    kind = precision(estimate, factor, measurement, H, R_factor)
+    law = _skipping_update if missing == "skip" else _measurement_update
+    corrected, lower = apply(law, x, L, y, rows, V, precision=kind)
+    return restored(corrected, estimate), restored(lower, factor)
+
+
+def triangular(roots: Any) -> Any:
+    """Lower triangular L, its diagonal not negative, with L L' = roots roots' for roots of at least as many columns."""
+    count = roots.shape[0]
+    if isinstance(roots, np.ndarray):
+        if roots.shape[1] < count:
+            roots = beside(roots, np.zeros((count, count - roots.shape[1]), dtype=roots.dtype))
+        lower = np.tril(np.asarray(np.linalg.qr(roots.T, mode="r")).T)
+        return lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0).astype(lower.dtype)
+    if roots.shape[1] < count:
+        roots = beside(roots, ca.SX(count, count - roots.shape[1]))
+    columns: list[Any] = []
+    for i in range(count):
+        roots = _reflected(roots if i == 0 else roots[1:, 1:])
+        columns.append(ca.vertcat(ca.SX(i, 1), roots[:, 0]))
+    return ca.horzcat(*columns)
+
+
+def _reflected(block: Any) -> Any:
+    """The block times a Householder reflection that leaves of its first row the first entry, the norm of the row."""
+    row = block[0, :]
+    squares = ca.sumsqr(row)
+    empty = squares <= 0
+    norm = ca.if_else(empty, 0, ca.sqrt(ca.if_else(empty, 1, squares)))
+    sign = ca.if_else(row[0] < 0, -1, 1)
+    normal = row + beside(sign * norm, ca.SX(1, row.shape[1] - 1))
+    scale = ca.if_else(empty, 0, 1 / ca.if_else(empty, 1, squares + ca.fabs(row[0]) * norm))
+    result = block - (block @ normal.T) @ (scale * normal)
+    result[0, :] = beside(-sign * norm, ca.SX(1, row.shape[1] - 1))
+    return beside(-sign * result[:, 0], result[:, 1:])
+
+
+def _definite_factor(P: Any) -> tuple[Any]:
+    lower, entries = unit_triangular(P, "covariance")
+    return (lower @ diagonal(ca.sqrt(entries)),)
+
+
+def _time_update(x: Any, L: Any, phi: Any, G: Any, drift: Any) -> tuple[Any, Any]:
+    return phi @ x + drift, triangular(beside(phi @ L, G))
+
+
+def _measurement_update(x: Any, L: Any, y: Any, H: Any, V: Any) -> tuple[Any, Any]:
+    return _correct(x, L, y - H @ x, H, V)
+
+
+def _skipping_update(x: Any, L: Any, y: Any, H: Any, V: Any) -> tuple[Any, Any]:
+    """Rows that are missing become 0 = 0 x + noise of variance 1."""
+    there = is_there(y)
+    kept = diagonal(there)
+    return _correct(x, L, where(there, y - H @ x), kept @ H, beside(kept @ V, diagonal(1 - there)))
+
+
+def _correct(x: Any, L: Any, residual: Any, H: Any, V: Any) -> tuple[Any, Any]:
+    """[V, H L; 0, L] becomes [S, 0; K S, L+] with S S' the covariance of the innovation."""
+    count = H.shape[0]
+    lower = triangular(below(beside(V, H @ L), beside(zeros(L, L.shape[0], V.shape[1]), L)))
+    innovation, spread = lower[:count, :count], lower[count:, :count]
+    return x + spread @ _substituted(innovation, residual), lower[count:, count:]
+
+
+def _substituted(lower: Any, right: Any) -> Any:
+    """lower^-1 right by substitution."""
+    if isinstance(lower, np.ndarray):
+        if np.diag(lower).min(initial=np.inf) <= 0.0:
+            raise ProblemError(
+                describe(
+                    "The covariance of the innovation is singular.",
+                    expected="measurements with noise, or of what is not known exactly",
+                    received=f"a smallest entry of its factor of {np.diag(lower).min():.3g}",
+                    remedy="give every measurement some noise, and no measurement twice without noise",
+                )
+            )
+        return np.linalg.solve(lower, right)
+    rows: list[Any] = []
+    for i in range(lower.shape[0]):
+        known = sum((lower[i, j] * rows[j] for j in range(i)), ca.SX(1, 1))
+        rows.append((right[i, 0] - known) / lower[i, i])
+    return ca.vertcat(*rows)

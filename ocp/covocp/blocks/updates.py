@@ -1,0 +1,271 @@
+"""The discrete Kalman filter: prediction, and the measurement update in four forms that agree to rounding.
+
+x+ = Phi x + Gamma u + Gamma1 w, y = H x + v; M is the covariance before, P that after the measurement (item 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.blocks.arithmetic import (
+    apply,
+    definite_solve,
+    diagonal,
+    is_there,
+    precision,
+    semidefinite,
+    symmetric,
+    triangular_solve,
+    unit,
+    unit_triangular,
+    where,
+)
+from covocp.blocks.values import SYMBOLIC, array, is_symbolic, matrix, restored, square, weight
+
+Form = Literal["joseph", "standard", "sequential", "information"]
+Missing = Literal["raise", "skip"]
+
+
+def predict(estimate: Any, covariance: Any, transition: Any, noise: Any, *, drift: Any = 0) -> tuple[Any, Any]:
+    """Time update of item 3: x = Phi x + drift, M = Phi P Phi' + Gamma1 R_w Gamma1'.
+
+    Args:
+        estimate: after the last measurement, shape (n,) or (n, 1).
+        covariance: of its error, shape (n, n).
+        transition: Phi, shape (n, n).
+        noise: Gamma1 R_w Gamma1', positive semidefinite, shape (n, n).
+        drift: Gamma u or whatever else is known to be added, shape (n,); 0: nothing.
+
+    Returns:
+        Estimate and covariance before the next measurement, in the shapes of the arguments.
+
+    Raises:
+        ProblemError: shapes that do not fit, NaN, a covariance or noise that is not positive semidefinite.
+    """
+    phi = square("transition", transition)
+    size = phi.shape[0]
+    x, P = matrix("estimate", estimate, (size, 1)), weight("covariance", covariance, size)
+    Q, known = weight("noise", noise, size), shift(drift, size)
+    kind = precision(estimate, covariance, transition, noise, drift)
+    moved, spread = apply(time_update, x, P, phi, Q, known, precision=kind)
+    return restored(moved, estimate), restored(spread, covariance)
+
+
+def shift(drift: Any, size: int) -> Any:
+    """What is added to a prediction as a column; the number 0 stands for nothing."""
+    nothing = not is_symbolic(drift) and not array("drift", drift).ndim and float(drift) == 0.0
+    return ca.DM.zeros(size, 1) if nothing else matrix("drift", drift, (size, 1))
+
+
+def time_update(x: Any, P: Any, phi: Any, noise: Any, drift: Any) -> tuple[Any, Any]:
+    """Item 3; all are matrices of one kind."""
+    return phi @ x + drift, symmetric(phi @ P @ phi.T + noise)
+
+
+def update(
+    estimate: Any,
+    covariance: Any,
+    measurement: Any,
+    H: Any,
+    R: Any,
+    *,
+    form: Form = "joseph",
+    missing: Missing = "raise",
+) -> tuple[Any, Any]:
+    """Measurement update of item 3: x + L (y - H x), P = (I - L H) M (I - L H)' + L R L', L = M H'(H M H' + R)^-1.
+
+    Forms: "joseph" as above, positive semidefinite whatever the rounding of the gain; "standard" P = M - L H M;
+    "sequential" one row of the measurement after the other, by scalar divisions only, rows that are correlated made
+    independent first; "information" P = (M^-1 + H' R^-1 H)^-1, for definite M and R.
+
+    Args:
+        estimate: before the measurement, shape (n,) or (n, 1).
+        covariance: M, shape (n, n).
+        measurement: y, shape (m,) or (m, 1), or a number.
+        H: shape (m, n), or (n,) for one measurement.
+        R: covariance of v, positive semidefinite, shape (m, m).
+        form: of the equations.
+        missing: what a row of y that is NaN or infinite means: "raise": an error (an expression is trusted), "skip":
+            no measurement of that row.
+
+    Returns:
+        Estimate and covariance after the measurement, in the shapes of the arguments; numeric covariances are positive
+        semidefinite.
+
+    Raises:
+        ProblemError: shapes that do not fit, NaN, a covariance that is not positive semidefinite, a singular
+            H M H' + R ("sequential": correlated R; "information": M or R), an unknown form.
+    """
+    x, P = matrix("estimate", estimate, (None, 1)), square("covariance", covariance)
+    size = x.shape[0]
+    P = weight("covariance", covariance, size)
+    rows = row_matrix("H", H, size)
+    y = reading("measurement", measurement, rows.shape[0], missing)
+    U = weight("R", R, rows.shape[0])
+    kind = precision(estimate, covariance, measurement, H, R)
+    corrected, spread = apply(updating(form, missing), x, P, y, rows, U, precision=kind)
+    return restored(corrected, estimate), restored(spread, covariance)
+
+
+def joseph(covariance: Any, gain: Any, H: Any, R: Any) -> Any:
+    """Covariance after an update with any gain L: (I - L H) M (I - L H)' + L R L', of item 3.
+
+    Args:
+        covariance: M, shape (n, n).
+        gain: L, shape (n, m), the best one or another.
+        H: shape (m, n).
+        R: covariance of the measurement noise, shape (m, m).
+
+    Returns:
+        P, shape (n, n), positive semidefinite to rounding.
+
+    Raises:
+        ProblemError: shapes that do not fit, a covariance that is not positive semidefinite.
+    """
+    P = weight("covariance", covariance)
+    rows = row_matrix("H", H, P.shape[0])
+    L = matrix("gain", gain, (P.shape[0], rows.shape[0]))
+    kind = precision(covariance, gain, H, R)
+    (spread,) = apply(lambda *v: (joseph_form(*v),), P, L, rows, weight("R", R, rows.shape[0]), precision=kind)
+    return restored(spread, covariance)
+
+
+def row_matrix(name: str, value: Any, size: int) -> Any:
+    """A measurement matrix of `size` columns; a flat array of that many numbers is one row."""
+    if not isinstance(value, (*SYMBOLIC, ca.DM)):
+        numbers = array(name, value)
+        value = numbers[None, :] if numbers.shape == (size,) else value
+    return matrix(name, value, (None, size))
+
+
+def reading(name: str, value: Any, size: int, missing: Missing) -> Any:
+    """A measurement as a column, NaN where numbers are missing and that is allowed.
+
+    Raises:
+        ProblemError: another size, NaN or inf where they are not allowed.
+    """
+    check_choice("missing", missing, get_args(Missing))
+    if is_symbolic(value):
+        return matrix(name, value, (size, 1))
+    numbers = array(name, value)
+    gaps = ~np.isfinite(numbers)
+    if gaps.any() and missing == "raise":
+        raise ProblemError(
+            describe(
+                f"The argument '{name}' has a missing reading.",
+                expected="finite numbers",
+                received=f"{numbers.ravel()}",
+                remedy="missing='skip' leaves such rows out",
+            )
+        )
+    column = matrix(name, np.where(gaps, 0.0, numbers), (size, 1))
+    if gaps.any():
+        column[np.flatnonzero(gaps.ravel()).tolist()] = np.nan
+    return column
+
+
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """One of some words.
+
+    Raises:
+        ProblemError: another.
+    """
+    if not isinstance(value, str) or value not in choices:
+        raise ProblemError(
+            describe(
+                f"The argument '{name}' is unknown.",
+                expected=", ".join(repr(choice) for choice in choices),
+                received=repr(value),
+                remedy="choose one of them",
+            )
+        )
+
+
+def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
+    """The law (x, M, y, H, R) -> (x, P) of one form.
+
+    Raises:
+        ProblemError: an unknown form.
+    """
+    check_choice("form", form, tuple(FORMS))
+    check_choice("missing", missing, get_args(Missing))
+    correct = FORMS[form]
+
+    def measurement_update(x: Any, P: Any, y: Any, H: Any, R: Any) -> tuple[Any, Any]:
+        residual, rows, noise = present(y - H @ x, y, H, R) if missing == "skip" else (y - H @ x, H, R)
+        step, spread = correct(P, residual, rows, noise)
+        return x + step, semidefinite(spread)
+
+    return measurement_update
+
+
+def present(residual: Any, y: Any, H: Any, R: Any) -> tuple[Any, Any, Any]:
+    """Residual, H and R without the rows that are missing: these become 0 = 0 x + noise of variance 1, uncorrelated."""
+    there = is_there(y)
+    kept = diagonal(there)
+    return where(there, residual), kept @ H, kept @ R @ kept + diagonal(1 - there)
+
+
+def joseph_form(P: Any, L: Any, H: Any, R: Any) -> Any:
+    """Covariance of item 3 for any gain."""
+    remaining = unit(P, P.shape[0]) - L @ H
+    return symmetric(remaining @ P @ remaining.T + L @ R @ L.T)
+
+
+def _gain(P: Any, H: Any, R: Any) -> Any:
+    """L = M H'(H M H' + R)^-1."""
+    seen = H @ P
+    return definite_solve(symmetric(seen @ H.T + R), seen, "covariance of the innovation, H P H' + R,").T
+
+
+def _joseph(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+    L = _gain(P, H, R)
+    return L @ residual, joseph_form(P, L, H, R)
+
+
+def _standard(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+    L = _gain(P, H, R)
+    return L @ residual, symmetric(P - L @ (H @ P))
+
+
+def _information(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+    size = unit(P, P.shape[0])
+    weighted = definite_solve(R, H, "measurement noise R").T
+    spread = symmetric(definite_solve(symmetric(definite_solve(P, size, "covariance") + weighted @ H), size, "sum"))
+    return spread @ (weighted @ residual), spread
+
+
+def _sequential(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+    """Row by row; the covariance in Joseph form, its products with I - k h written as corrections of rank one."""
+    lower, variances = unit_triangular(R, "measurement noise R, whose rows are correlated,")
+    rows, residual = triangular_solve(lower, H), triangular_solve(lower, residual)
+    step = 0 * P[:, :1]
+    for i in range(rows.shape[0]):
+        h, r = rows[i : i + 1, :], variances[i, 0]
+        seen = P @ h.T
+        spread = (h @ seen)[0, 0] + r
+        _check_divisor(spread)
+        k = seen / spread
+        step = step + k * (residual[i, 0] - (h @ step)[0, 0])
+        left = P - k @ seen.T
+        P = symmetric(left - (left @ h.T) @ k.T + r * (k @ k.T))
+    return step, P
+
+
+def _check_divisor(spread: Any) -> None:
+    """A row without noise of something that is known exactly has no update."""
+    if not isinstance(spread, ca.SX) and not spread > 0.0:
+        definite_solve(np.atleast_2d(spread), np.atleast_2d(spread), "covariance of the innovation, H P H' + R,")
+
+
+FORMS: dict[str, Callable[[Any, Any, Any, Any], tuple[Any, Any]]] = {
+    "joseph": _joseph,
+    "standard": _standard,
+    "sequential": _sequential,
+    "information": _information,
+}

@@ -1,0 +1,3 @@
+"""The command line."""
+
+from covocp.cli.commands import main as main

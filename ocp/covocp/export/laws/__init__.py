@@ -1,0 +1,1 @@
+"""What flies: laws, controllers, trajectories and solvers as functions with their data."""

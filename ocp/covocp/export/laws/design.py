@@ -1,0 +1,126 @@
+"""What a controller is made from: the linear model, the gains and the limits along the nominal of a closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ExportError, describe
+from covocp.base.matrices import Array, unpack, unpack_symbolic
+from covocp.solution.solution import Solution
+from covocp.statement.names import control_limits
+from covocp.statement.statement import Block, Statement
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Design:
+    """A closed loop along its nominal; n: rows of the estimate, m: controls fed back, r: measured values.
+
+    Attributes:
+        statement: of the problem.
+        duration: T [s].
+        parameters: of the statement.
+        linear: (state, control, time) -> F (n, n), G (n, m), h (r,), M (r, n), slope of h by the control (r, m),
+            noise density U (r, r).
+        noise: (state, control, time) -> Q (n, n).
+        gain: (state, control, half-vectors, time) -> C (m, n), E (n, n).
+        error: half-vectors -> E (n, n).
+        weights: (state, control, time) -> A (n, n), N (n, m), B (m, m): second derivatives of the expected running
+            cost by deviations of state and control.
+        final_weight: S(T) (n, n).
+        best_gain: whether C is the best gain, not one that was constrained.
+        limits: lower and upper limits of the control, (m,) each.
+        units: largest standard deviation of each row of the estimate on the way, (n,); 1 where it is zero.
+        labels: names of the rows of the estimate.
+        sizes: n, m, r.
+    """
+
+    statement: Statement
+    duration: float
+    parameters: Array
+    linear: ca.Function
+    noise: ca.Function
+    gain: ca.Function
+    error: ca.Function
+    weights: ca.Function
+    final_weight: Array
+    best_gain: bool
+    limits: tuple[Array, Array]
+    units: Array
+    labels: tuple[str, ...]
+    sizes: tuple[int, int, int]
+
+    @property
+    def symbolic(self) -> Any:
+        """SX, or MX where the model has no SX form."""
+        return self.statement.symbolic
+
+
+def design_of(solution: Solution, limits: Any) -> Design:
+    """The closed loop of a solution.
+
+    Args:
+        solution: with a loop and its problem.
+        limits: of the control that is given out: None, "bounds" (those of the problem), or a dict of control to
+            (lower, upper).
+
+    Raises:
+        ExportError: no problem, nothing measured, limits that mean nothing.
+    """
+    statement = solution.statement
+    if statement is None or statement.loop is None:
+        raise ExportError(
+            describe(
+                "The controller of this solution cannot be exported: it knows no problem.",
+                expected="a solution with its problem",
+                received=f"'{solution.name}', read from a file",
+                remedy="load(path, problem=...) with the problem that was solved",
+            )
+        )
+    if statement.measurement is None:
+        raise ExportError(
+            describe(
+                "There is no controller: the problem measures nothing, so the feedback never acts.",
+                expected="a problem with measurement()",
+                received=f"'{solution.name}' without one",
+                remedy="add what is measured, or export the histories by feedback=False",
+            )
+        )
+    n, m = int(statement.loop.gain.size2_out(0)), int(statement.loop.gain.size1_out(0))
+    symbolic: Any = statement.symbolic
+    sizes = (statement.nx, statement.nu, statement.ne, 1)
+    x, u, e, t = (symbolic.sym(k, size) for k, size in zip("xuet", sizes, strict=True))
+    rest = (t, solution.duration, ca.DM(solution.parameters))
+    F, G, A, B, N, Q = statement.loop.expansion(x, u, *rest)
+    h, M, U = statement.measurement(x, u, *rest)
+    slope = ca.jacobian(h, u)[:, :m]
+    block = next(b for b in statement.matrices if b.estimation)
+    C, E = statement.loop.gain(x, u, e, *rest), unpack_symbolic(e[block.span], n)
+    return Design(
+        statement=statement,
+        duration=solution.duration,
+        parameters=solution.parameters,
+        linear=ca.Function("linear", [x, u, t], [ca.densify(v) for v in (F, G, h, M, slope, U)]),
+        noise=ca.Function("noise", [x, u, t], [ca.densify(Q)]),
+        gain=ca.Function("gain", [x, u, e, t], [ca.densify(C), ca.densify(E)]),
+        error=ca.Function("error", [e], [ca.densify(E)]),
+        weights=ca.Function("weights", [x, u, t], [ca.densify(v) for v in (A, N, B)]),
+        final_weight=np.asarray(statement.loop.terminal(solution.trajectory.x[-1], *rest[1:])[1].full()),
+        best_gain=statement.loop.by_parts is not None,
+        limits=control_limits(statement, m, limits),
+        units=_units(solution, block),
+        labels=statement.augmented,
+        sizes=(n, m, int(h.shape[0])),
+    )
+
+
+def _units(solution: Solution, block: Block) -> Array:
+    """Largest standard deviation of the deviation from the nominal at any node, 1 where it is zero."""
+    matrices = [unpack(solution.trajectory.e[:, block.span], block.size)]
+    matrices += [solution.loop.X] if solution.loop is not None else []
+    variances = np.max([np.diagonal(matrix, axis1=1, axis2=2).max(axis=0) for matrix in matrices], axis=0)
+    units = np.sqrt(np.maximum(variances, 0.0))
+    return np.where(np.isfinite(units) & (units > 0.0), units, 1.0)

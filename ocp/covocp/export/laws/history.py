@@ -1,0 +1,203 @@
+"""The nominal of a solution as a CasADi expression of the time: tables at the knots of `Solution.at`, with its cubics.
+
+The tables are constants and are read by index, which CasADi writes as a pointer into a constant array: the C code has
+each number once and copies one column of a table a call.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ExportError, describe
+from covocp.base.matrices import Array
+from covocp.export.laws.law import LARGEST, status_of
+from covocp.solution.solution import Solution
+from covocp.transcription.steps import hermite
+
+# Times this far outside, relative to the duration, count as inside: sums of steps end there.
+MARGINS = {"double": 1e-9, "single": 1e-6}
+# Distance of two knots, relative to the duration, that the clock of a machine of this precision resolves.
+RESOLVED = {"double": 1e-12, "single": 1e-5}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nominal:
+    """Values at some time, symbolic: x (nx,), u (nu,), half-vectors e (ne,)."""
+
+    x: Any
+    u: Any
+    e: Any
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Clock:
+    """A time made safe: `time` is within [0, T]; `within` tells whether it was there before.
+
+    conditions: what was wrong with it, with names of statuses.
+    """
+
+    time: Any
+    within: Any
+    conditions: list[tuple[Any, str]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class History:
+    """Tables of a solution.
+
+    Attributes:
+        nodes: times of the nodes [s], (K,).
+        knots: times between which the states are cubic [s], (P + 1,); the nodes, and what lies between them where the
+            solution is steep.
+        z: states and half-vectors at the knots, (P + 1, nx + ne).
+        first: slopes of z at the starts of the pieces, (P, nx + ne).
+        last: slopes at their ends.
+        u: controls, (K, nu) where they are linear, (K - 1, nu) where they are constant.
+        states: nx.
+        margin: relative, within which a time counts as inside.
+    """
+
+    nodes: Array
+    knots: Array
+    z: Array
+    first: Array
+    last: Array
+    u: Array
+    states: int
+    margin: float
+
+    @property
+    def duration(self) -> float:
+        """The last time [s]."""
+        return float(self.nodes[-1])
+
+    def clock(self, time: Any, fallback: Any = 0.0) -> Clock:
+        """A time made safe; one that is not finite becomes `fallback`."""
+        finite = ca.fabs(time) <= LARGEST
+        known = ca.if_else(finite, time, fallback)
+        inside = ca.fmin(ca.fmax(known, 0.0), self.duration)
+        slack = self.margin * self.duration
+        before, after = known < -slack, known > self.duration + slack
+        within = ca.if_else(ca.logic_or(before, after), 0.0, finite)
+        conditions = [(ca.logic_not(finite), "TIME_NOT_FINITE"), (before, "TIME_BEFORE"), (after, "TIME_AFTER")]
+        return Clock(time=inside, within=within, conditions=conditions)
+
+    def at(self, time: Any) -> Nominal:
+        """The nominal at a time within [0, T], an MX expression."""
+        k = _piece(self.knots, time)
+        knots = ca.MX(ca.DM(self.knots))
+        start, end = knots[k], knots[k + 1]
+        smooth = _hermite(self.z.shape[1])
+        za, zb = _column(self.z, k), _column(self.z, k + 1)
+        shared = np.array_equal(self.first[1:], self.last[:-1])
+        slopes = np.vstack([self.first, self.last[-1:]]) if shared else self.first
+        fa, fb = _column(slopes, k), _column(slopes, k + 1) if shared else _column(self.last, k)
+        z = smooth(za, zb, fa, fb, start, end, time)
+        if not np.array_equal(self.knots, self.nodes):
+            k, nodes = _piece(self.nodes, time), ca.MX(ca.DM(self.nodes))
+            start, end = nodes[k], nodes[k + 1]
+        u = _column(self.u, k)
+        if self.u.shape[0] == self.nodes.size:
+            u = _linear(self.u.shape[1])(u, _column(self.u, k + 1), start, end, time)
+        x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
+        return Nominal(x=x, u=u, e=e)
+
+
+def history(solution: Solution, precision: str) -> History:
+    """The tables of a solution.
+
+    Raises:
+        ExportError: where a value is NaN or infinite.
+    """
+    trajectory, dense = solution.trajectory, solution.dense
+    slopes = dense.first / solution.duration, dense.last / solution.duration
+    checked = (("a state or a matrix", dense.values), ("a control", trajectory.u), *(("a rate", v) for v in slopes))
+    for what, values in checked:
+        if not np.isfinite(values).all():
+            raise ExportError(
+                describe(
+                    f"{what.capitalize()} of the solution is NaN or infinite.",
+                    expected="finite values at all nodes",
+                    received=f"'{solution.name}', {solution.status}",
+                    remedy="export a solution that converged",
+                )
+            )
+    times, least = dense.knots * solution.duration, RESOLVED[precision] * solution.duration
+    knots, z, first, last = _resolved(times, dense.values, slopes, least)
+    return History(
+        nodes=np.asarray(solution.t),
+        knots=knots,
+        z=z,
+        first=first,
+        last=last,
+        u=trajectory.u,
+        states=trajectory.x.shape[1],
+        margin=MARGINS[precision],
+    )
+
+
+def _piece(table: Array, time: Any) -> Any:
+    """Index of the piece between two entries of a table of times that contains a time, from 0."""
+    pieces, duration = table.size - 1, float(table[-1])
+    guess = np.floor(table * (pieces / duration) + 0.5)
+    times = ca.MX(ca.DM(table))
+    if not np.array_equal(guess, np.arange(pieces + 1)):
+        return ca.low(times, time, {"lookup_mode": "binary"})
+    # equal pieces: computed, and corrected by one where rounding or a graded grid moves an end
+    k = ca.fmin(ca.fmax(ca.floor(time * (pieces / duration)), 0.0), pieces - 1.0)
+    k = k + (time >= times[k + 1]) - (time < times[k])
+    return ca.fmin(ca.fmax(k, 0.0), pieces - 1.0)
+
+
+def time_status(clock: Clock) -> Any:
+    """The status of a time."""
+    return status_of(clock.conditions)
+
+
+def _resolved(knots: Array, values: Array, slopes: tuple[Array, Array], least: float) -> tuple[Array, ...]:
+    """The polynomials without the knots that a clock of this precision cannot tell apart.
+
+    Where some fall away the piece becomes a chord: the slope of a fall that is over at once would carry it far below.
+
+    Args:
+        knots: times, (P + 1,).
+        values: there.
+        slopes: at the starts and the ends of the pieces.
+        least: distance of two knots [s].
+    """
+    kept = [0]
+    for i in range(1, knots.size - 1):
+        if knots[i] - knots[kept[-1]] >= least and knots[-1] - knots[i] >= least:
+            kept.append(i)
+    chosen = np.array([*kept, knots.size - 1])
+    first, last = slopes[0][chosen[:-1]].copy(), slopes[1][chosen[1:] - 1].copy()
+    merged = np.diff(chosen) > 1
+    chords = np.diff(values[chosen], axis=0) / np.diff(knots[chosen])[:, None]
+    first[merged] = last[merged] = chords[merged]
+    return knots[chosen], values[chosen], first, last
+
+
+def _column(table: Array, k: Any) -> Any:
+    """A row of a table as a column; without entries where it has none."""
+    return ca.MX(ca.DM(table.T))[:, k] if table.shape[1] else ca.MX(0, 1)
+
+
+def _hermite(size: int) -> ca.Function:
+    """(za, zb, slopes there, times of both ends, time) -> z."""
+    za, zb, fa, fb = (ca.SX.sym(name, size) for name in ("za", "zb", "fa", "fb"))
+    start, end, time = ca.SX.sym("start"), ca.SX.sym("end"), ca.SX.sym("time")
+    h = end - start
+    z = hermite(za, zb, h * fa, h * fb, (time - start) / h)
+    return ca.Function("smooth", [za, zb, fa, fb, start, end, time], [ca.densify(z)])
+
+
+def _linear(size: int) -> ca.Function:
+    """(ua, ub, times of both ends, time) -> u."""
+    ua, ub = ca.SX.sym("ua", size), ca.SX.sym("ub", size)
+    start, end, time = ca.SX.sym("start"), ca.SX.sym("end"), ca.SX.sym("time")
+    c = (time - start) / (end - start)
+    return ca.Function("straight", [ua, ub, start, end, time], [ca.densify(ua + c * (ub - ua))])

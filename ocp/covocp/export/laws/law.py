@@ -1,0 +1,204 @@
+"""What is exported: laws, each one CasADi function of flat columns, with the names and units of what goes in and out.
+
+Python and C call the same function, so they compute the same. Its inputs and outputs are dense columns; a matrix is
+flat *row by row*, as C has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+
+Kind = Literal["function", "sample", "controller", "solver"]
+Points = Callable[[np.random.Generator, int], Array]
+
+# What the C functions return, in the order of their numbers.
+STATUSES = {
+    "OK": "as asked for",
+    "MEASUREMENT_MISSING": "a row of the measurement was not finite (or beyond 1e30) and was left out",
+    "TIME_BEFORE": "the time is before the start: values of the start",
+    "TIME_AFTER": "the time is after the end: values of the end; of a controller the nominal control of the end "
+    "without feedback: the caller must stop",
+    "TIME_BACKWARDS": "the time is before that of the last step: nominal control, the estimate stays",
+    "TIME_NOT_FINITE": "the time is NaN, infinite or beyond 1e30: values of the last valid time",
+    "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
+    "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
+    "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
+    "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",
+    "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
+}
+CODES = {name: number for number, name in enumerate(STATUSES)}
+# Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the
+# controllers say; it is finite in single precision.
+LARGEST = 1e30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """One value that goes into or comes out of a law.
+
+    Attributes:
+        name: identifier in C.
+        rows: of the matrix; 1 by 1 is a number, one column a vector.
+        columns: of the matrix.
+        unit: in words, for the comments.
+        about: what it is, a line.
+        entries: names of the rows of a vector.
+    """
+
+    name: str
+    rows: int = 1
+    columns: int = 1
+    unit: str = ""
+    about: str = ""
+    entries: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return self.rows * self.columns
+
+    @property
+    def scalar(self) -> bool:
+        """Whether it is one number."""
+        return self.rows == self.columns == 1
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array that Python sees."""
+        return () if self.scalar else (self.rows,) if self.columns == 1 else (self.rows, self.columns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Law:
+    """A law that becomes a C function.
+
+    Attributes:
+        name: the C function is <package>_<name>.
+        kind: "function": arguments in, results out; "sample": a time in, a struct out; "controller": a struct that is
+            kept from step to step; "solver": with a workspace that the caller provides.
+        about: what it computes, paragraphs.
+        core: flat columns of the inputs -> flat columns of the outputs; the last output of a law that has statuses is
+            the status, a number.
+        inputs: ports of the core.
+        outputs: ports of the core; of a controller the fields of its struct, the control among them.
+        statuses: names of what it may return.
+        held: of a controller: input -> field of the struct where it is kept.
+        start: of a controller: first values of the fields, stacked.
+        safe: of a solver: outputs where it fails, stacked.
+        defaults: of a solver: inputs of the export, stacked.
+        points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
+        constants: numbers for the header, by name and unit: "DURATION [s]".
+        notes: what the package says of the law where it is printed.
+        most: largest number of points.
+        tolerance: largest deviation of C from Python, relative.
+    """
+
+    name: str
+    kind: Kind
+    about: tuple[str, ...]
+    core: ca.Function
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    points: Points = field(repr=False)
+    statuses: tuple[str, ...] = ("OK", "RESULT_NOT_FINITE", "FAILED")
+    held: Mapping[str, str] = field(default_factory=dict)
+    start: Array = field(default_factory=lambda: np.zeros(0))
+    safe: Array = field(default_factory=lambda: np.zeros(0))
+    defaults: Array = field(default_factory=lambda: np.zeros(0))
+    constants: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    most: int = 100_000
+    tolerance: float = 1e-12
+
+    @property
+    def arguments(self) -> tuple[Port, ...]:
+        """Inputs that the caller gives."""
+        return tuple(port for port in self.inputs if port.name not in self.held)
+
+    @property
+    def results(self) -> tuple[Port, ...]:
+        """Outputs without the status."""
+        return self.outputs if self.kind == "function" else self.outputs[:-1]
+
+    def values(self, rows: Array) -> Array:
+        """Outputs of the core, a row for each row of inputs; steps that ask to be continued are continued."""
+        result = self._once(rows)
+        while self.kind == "controller":
+            again = np.flatnonzero(result[:, -1] < 0)
+            if not again.size:
+                break
+            following = rows[again].copy()
+            for name, kept in self.held.items():
+                following[:, span(self.inputs, name)] = result[again][:, span(self.outputs, kept)]
+            rows = rows.copy()
+            rows[again] = following
+            result[again] = self._once(following)
+        return result
+
+    def _once(self, rows: Array) -> Array:
+        """Outputs of one call of the core."""
+        if self.kind == "solver":
+            return np.array([self._solved(row) for row in rows])
+        columns: Any = self.core.map(rows.shape[0])(*split_columns(rows, self.inputs))
+        columns = columns if isinstance(columns, tuple) else (columns,)
+        return np.vstack([np.asarray(column.full()) for column in columns]).T
+
+    def _solved(self, row: Array) -> Array:
+        """Outputs of a solver; those of the export where it has none."""
+        reason = "ARGUMENT_NOT_FINITE"
+        if np.isfinite(row).all():
+            reason = "FAILED"
+            try:
+                columns = self.core(*(column[:, 0] for column in split_columns(row[None, :], self.inputs)))
+                values = np.concatenate([np.asarray(column.full()).ravel() for column in columns])
+            except RuntimeError:
+                values = np.full(stacked_size(self.outputs), np.nan)
+            if np.isfinite(values).all():
+                return values
+        return np.append(self.safe[:-1], float(CODES[reason]))
+
+
+def span(ports: tuple[Port, ...], name: str) -> slice:
+    """Where a port lies in the stacked ports."""
+    offset = 0
+    for port in ports:
+        if port.name == name:
+            return slice(offset, offset + port.size)
+        offset += port.size
+    raise KeyError(name)
+
+
+def split_columns(rows: Array, ports: tuple[Port, ...]) -> list[Array]:
+    """Rows of stacked values as one array for each port, a column for each row."""
+    return [np.ascontiguousarray(rows[:, span(ports, port.name)].T) for port in ports]
+
+
+def stacked_size(ports: tuple[Port, ...]) -> int:
+    """Number of entries of all ports."""
+    return sum(port.size for port in ports)
+
+
+def flat(value: Any) -> Any:
+    """A matrix as a dense column, row by row."""
+    dense = ca.densify(value)
+    return dense if dense.shape[1] == 1 else ca.vec(dense.T)
+
+
+def shaped(column: Any, rows: int, columns: int) -> Any:
+    """The matrix of a flat column."""
+    return column if columns == 1 else ca.reshape(column, columns, rows).T
+
+
+def status_of(conditions: list[tuple[Any, str]]) -> Any:
+    """The code of the first condition that holds, as an expression."""
+    code: Any = CODES["OK"]
+    for condition, name in reversed(conditions):
+        code = ca.if_else(condition, CODES[name], code)
+    return code

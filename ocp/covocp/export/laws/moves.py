@@ -1,0 +1,181 @@
+"""What happens between the samples of a period: transitions, covariances and costs, by the two-stage Gauss method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.export.laws.design import Design
+from covocp.export.laws.history import History
+from covocp.transcription.steps import GAUSS_NODES
+
+# Times that differ by less than this share of a period are the same.
+WHOLE = 1e-9
+
+
+def nominal_values(tables: History, t: Array) -> tuple[Array, Array, Array]:
+    """x, u, e at some times, rows."""
+    time = ca.MX.sym("time")
+    now = tables.at(time)
+    values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
+    x, u, e = (np.asarray(v.full()).T for v in values)
+    return x, u, e
+
+
+def stacked(value: Any, count: int) -> Array:
+    """Matrices beside each other as (count, rows, columns)."""
+    array = np.asarray(value.full())
+    return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moves:
+    """Gauss steps between nodes and samples; n deviations, m controls, r measured values.
+
+    state: transitions of (deviation, control held, 1), (steps, n + m + 1, n + m + 1).
+    measured: of (deviation, integral of what is measured of it, control held), (steps, n + r + m, n + r + m).
+    noise, measured_noise, weight: step matrices of the Lyapunov equations of the covariance of the deviation, of that
+        of (deviation, integral), and, run backward, of the cost of (deviation, control held).
+    sizes: n, m, r. first: the step that begins at each of the times.
+    """
+
+    state: Array
+    measured: Array
+    noise: Array
+    measured_noise: Array
+    weight: Array
+    sizes: tuple[int, int, int]
+    first: Any
+
+    @staticmethod
+    def of(design: Design, tables: History, t: Array) -> Moves:
+        """All steps between the first and the last of some times: the samples, and the end."""
+        inside = tables.nodes[(tables.nodes > t[0]) & (tables.nodes < t[-1])]
+        grid = np.unique(np.concatenate([t, inside]))
+        near = np.diff(grid, prepend=-np.inf) <= WHOLE * np.median(np.diff(t))
+        grid = np.array([*grid[~near]])
+        h = np.diff(grid)
+        points = [_Point.at(design, tables, grid[:-1] + c * h, h[:, None, None]) for c in GAUSS_NODES]
+        n, m, r = design.sizes
+        state = [_blocks([[p.F, p.G, -p.G @ p.u]], n + m + 1) for p in points]
+        measured = [_blocks([[p.F, p.zero(n, r), p.G], [p.M, p.zero(r, r), p.H]], n + r + m) for p in points]
+        joint = [matrix[:, : n + r, : n + r] for matrix in measured]
+        spread = [_blocks([[p.Q, p.zero(n, r)], [p.zero(r, n), p.U]], n + r) for p in points]
+        held = [_blocks([[p.F, p.G]], n + m).transpose(0, 2, 1) for p in points[::-1]]
+        cost = [_blocks([[p.A, p.N], [p.N.transpose(0, 2, 1), p.B]], n + m) for p in points[::-1]]
+        return Moves(
+            state=_transitions(state),
+            measured=_transitions(measured),
+            noise=_lyapunov([p.F for p in points], [p.Q for p in points]),
+            measured_noise=_lyapunov(joint, spread),
+            weight=_lyapunov(held, cost),
+            sizes=design.sizes,
+            first=np.searchsorted(grid, t - 0.5 * h.min()),
+        )
+
+    def steps(self, k: int) -> range:
+        """The steps of period k."""
+        return range(int(self.first[k]), int(self.first[k + 1]))
+
+    def over(self, k: int, P: Array) -> tuple[Array, Array, Array, Array]:
+        """Phi, Gamma, g over period k, and the covariance P after it without a measurement."""
+        n, m, _ = self.sizes
+        z = np.eye(n + m + 1)
+        for i in self.steps(k):
+            z, P = self.state[i] @ z, _moved(self.noise[i], P)
+        return z[:n, :n], z[:n, n : n + m], z[:n, n + m :], P
+
+    def measuring(self, k: int) -> tuple[Array, Array, Array]:
+        """Over period k, of the deviation d and the integral a of what is measured of it, noise included.
+
+        Returns:
+            Slopes of (d, a) at its end by d at its start (n + r, n), by the deviation of the control that is held
+            (n + r, m), their covariance from noise alone (n + r, n + r).
+        """
+        n, m, r = self.sizes
+        z, P = np.eye(n + r + m), np.zeros((n + r, n + r))
+        for i in self.steps(k):
+            z, P = self.measured[i] @ z, _moved(self.measured_noise[i], P)
+        return z[: n + r, :n], z[: n + r, n + r :], P
+
+    def weighed(self, k: int, S: Array) -> Array:
+        """Weight of (d at the start of period k, deviation of the control held) in twice the cost, from S at its end.
+
+        With v' = 0 beside d this is a Lyapunov equation, run backward.
+        """
+        n, m, _ = self.sizes
+        P = np.zeros((n + m, n + m))
+        P[:n, :n] = S
+        for i in reversed(self.steps(k)):
+            P = _moved(self.weight[i], P)
+        return P
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Point:
+    """The linear model at one Gauss point of all steps, each value times the length of the step but the control u."""
+
+    F: Array
+    G: Array
+    M: Array
+    H: Array
+    U: Array
+    Q: Array
+    A: Array
+    N: Array
+    B: Array
+    u: Array
+
+    @staticmethod
+    def at(design: Design, tables: History, t: Array, h: Array) -> _Point:
+        """At some times, for steps of some lengths."""
+        x, u, _ = nominal_values(tables, t)
+        columns = x.T, u.T, t[None, :]
+        F, G, _, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
+        Q = h * stacked(design.noise.map(t.size)(*columns), t.size)
+        A, N, B = (h * stacked(v, t.size) for v in design.weights.map(t.size)(*columns))
+        return _Point(F=F, G=G, M=M, H=H, U=U, Q=Q, A=A, N=N, B=B, u=u[:, : design.sizes[1], None])
+
+    def zero(self, rows: int, columns: int) -> Array:
+        """A block of zeros."""
+        return np.zeros((self.F.shape[0], rows, columns))
+
+
+def _blocks(rows: list[list[Array]], size: int) -> Array:
+    """Square matrices of a size from the blocks of their first rows."""
+    top = np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
+    result = np.zeros((top.shape[0], size, size))
+    result[:, : top.shape[1], :] = top
+    return result
+
+
+def _lyapunov(drifts: list[Array], noises: list[Array]) -> Array:
+    """Step matrices of P' = F P + P F' + Q, positive semidefinite at any length."""
+    n = drifts[0].shape[1]
+    zero = np.zeros_like(drifts[0])
+    pairs = zip(drifts, noises, strict=True)
+    return _transitions([_blocks([[-F.transpose(0, 2, 1), zero], [Q, F]], 2 * n) for F, Q in pairs])
+
+
+def _moved(D: Array, P: Array) -> Array:
+    """P after a step of a Lyapunov equation: its D12 vanishes."""
+    n = P.shape[0]
+    moved = np.linalg.solve(D[:n, :n].T, (D[n:, :n] + D[n:, n:] @ P).T)
+    return np.asarray(0.5 * (moved + moved.T))
+
+
+def _transitions(H: list[Array]) -> Array:
+    """One step of the two-stage Gauss method for z' = H z for each step, H at both points times the step's length.
+
+    The elimination is that of `covocp.transcription.steps.gauss_matrix`.
+    """
+    g = np.sqrt(3.0) / 6.0
+    a = 0.5 - 2.0 * g
+    unit = np.eye(H[0].shape[1])
+    left, right = unit - g * H[1], unit - g * H[0]
+    stage = np.linalg.solve(left @ right - a / 2 * (H[0] + H[1]), left)
+    return np.asarray(unit + (right @ stage - unit) / a)

@@ -1,0 +1,385 @@
+"""The solver of a problem as a law: initial state, parameters and a guess in, a plan out.
+
+The transcription is that of every shooting method, its NLP solver one of CasADi's that has C code. The status is not
+the solver's own opinion: it follows from the conditions of a minimum at what it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ExportError, describe, spelling
+from covocp.base.linear_solve import COMPILED_SOLVER
+from covocp.base.matrices import Array
+from covocp.export.compiled.linking import PLUGINS, Linking
+from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
+from covocp.export.laws.replanning import Replannable, replannable, stacked
+from covocp.export.text.names import identifier
+from covocp.problem.builder import Problem
+from covocp.solution.solution import Solution
+from covocp.solving.solver import Solver
+from covocp.transcription.first_guess import choose_scales
+from covocp.transcription.mesh import Options
+from covocp.transcription.nlp import NLP
+from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.transcribing import transcribe
+
+# In the NLP's own units: what counts as solved, and what the solvers are asked for. Interior-point methods end with a
+# barrier of a tenth of what they are asked for, which the cost has in it for each bound that is reached.
+INFEASIBLE, STATIONARY = 1e-6, 1e-5
+ASKED, ASKED_INTERIOR = 1e-8, 1e-10
+# Fatrop widens bounds by this, relative to their size or to 1 where they are smaller, and offers no option for it.
+WIDENED = 1e-8
+MAX_ITERATIONS = 200
+# Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
+ROUNDING, APART = 1e-6, 1e-2
+# Distance and multiplier of a bound that is not reached at the solution of the export.
+UNREACHED = 1e-5
+# Multipliers below this are rounding: taken for reached, their bounds make the first active set of the QP dependent.
+INACTIVE = 1e-9
+# Shooting states are scaled by more than their magnitude where the Hessian is of limited memory, as for Ipopt.
+STRETCH = 10.0
+TOLERANCE = 1e-8
+# Problems near that of the export by which a solver is tried, and how many of them it may fail to solve.
+TRIALS, FAILURES = 6, 3
+MOST_POINTS = 12
+SEED = 1971
+STATUS_NAMES = tuple(CODES)
+RESIDUALS = ("infeasibility", "stationarity")
+STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
+ABOUT = (
+    "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
+    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an "
+    "argument is not finite, the plan made at the export is returned, and the status says so.",
+)
+# What is said of a problem with an expected cost: its plan is no controller.
+NOMINAL = (
+    "The plan is the nominal only, without gains: the feedback that the expected cost assumes is not in it, so it "
+    "cannot be flown in closed loop by itself."
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    """What the core is made of.
+
+    Attributes:
+        made: the problem and the arguments of its solver.
+        nlp: its transcription.
+        solution: of the export.
+        scale: of the cost.
+        multipliers: of the solution in units of the NLP, of the variables and of the constraints.
+    """
+
+    made: Replannable
+    nlp: NLP
+    solution: Solution
+    scale: float
+    multipliers: tuple[Array, Array]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in their order."""
+        st = self.nlp.statement
+        return tuple(b.name for b in (*st.of_kind("parameter"), *st.of_kind("unknown")))
+
+
+def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tuple[Law, Linking | None]:
+    """The solver of a problem, and what has to be linked with it.
+
+    Args:
+        problem: to be solved again and again.
+        method: a plugin of CasADi's nlpsol that has C code.
+        options: of the mesh; plugin_options.
+
+    Raises:
+        ExportError: unknown method or option, or a method that does not solve the problem from its own solution.
+        ProblemError: options of the mesh that mean nothing.
+        SolveError: the problem itself has no solution.
+    """
+    if not isinstance(method, str) or method not in PLUGINS:
+        raise ExportError(
+            describe(
+                f"The method {method!r} has no C code.",
+                expected="one of " + ", ".join(map(repr, PLUGINS)),
+                received=f"method={method!r}",
+                remedy="'sqpmethod' needs nothing else; the others are linked",
+            )
+        )
+    known = {entry.name for entry in fields(Options)} | {"plugin_options"}
+    allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
+    for name in options:
+        if name not in known:
+            raise ExportError(
+                describe(
+                    f"export_c has no option '{name}' for a problem.",
+                    expected="one of " + ", ".join(allowed),
+                    received=f"{name}={options[name]!r}"[:100],
+                    remedy=spelling(name, allowed, "leave it out"),
+                )
+            )
+    task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
+    own = dict(options.get("plugin_options") or {})
+    failure = ""
+    for exact in _hessians(task.nlp, method, own):
+        law = _law(task, method, _settings(method, exact, own))
+        failure = _failure(law)
+        if not failure:
+            return law, PLUGINS[method]
+    raise ExportError(
+        describe(
+            f"The method '{method}' does not solve '{problem.name}' again from its own solution.",
+            expected="a plan near that of the export, for initial values near those of the problem",
+            received=f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints; {failure}",
+            remedy=("another method" if method == "ipopt" else "method='ipopt' (linked)")
+            + ", fewer intervals, or plugin_options such as {'max_iter': 1000}",
+        )
+    )
+
+
+def _failure(law: Law) -> str:
+    """Why it does not solve the problem of the export again, or most of those near it; "" where it does."""
+    failures = 0
+    for number, row in enumerate(law.points(np.random.default_rng(SEED), TRIALS)):
+        values = law.values(row[None, :])[0]
+        failures += int(values[-1]) != CODES["OK"]
+        if failures > (FAILURES if number else 0):
+            left = ", ".join(f"{name} {values[span(law.outputs, name)][0]:.1e}" for name in RESIDUALS)
+            status = STATUS_NAMES[int(values[-1])]
+            return f"{status} {'at the problems near it' if number else 'at its own solution'}, {left}"
+    return ""
+
+
+def _task(problem: Problem, options: dict[str, Any]) -> _Task:
+    """Reference solution and transcription."""
+    made = replannable(problem)
+    solution = Solver(made.fixed, **options).solve(progress=False)
+    statement = made.problem.statement()
+    mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
+    scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
+    if mesh.eliminated and statement.matrices:
+        weights = quadrature_weights(mesh)
+        scales = replace(scales, x=STRETCH * scales.x, u=scales.u * np.sqrt(weights.mean() / weights)[:, None])
+    nlp = transcribe(statement, mesh, scales)
+    scale = _cost_scale(nlp, solution)
+    multipliers = _multipliers(nlp, solution, scale)
+    return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers)
+
+
+def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Array]:
+    """Multipliers of the solution: those of constraints, then those of bounds that are reached, by stationarity.
+
+    Small ones, as an interior-point method leaves them at all bounds, would each cost the QP solver an iteration.
+    """
+    costates, p = solution.costates, np.append(nlp.statement.values, scale)
+    _, constraints = nlp.pack_multipliers(solution.multipliers, (costates.state, costates.matrices))
+    weights, bounds, w = constraints / scale, nlp.bounds(nlp.statement.values), nlp.pack(solution.trajectory)
+    weights[np.abs(weights) < UNREACHED] = 0.0
+    given = ca.MX.sym("given", nlp.g.shape[0])
+    slope = ca.Function("slope", [nlp.w, nlp.p, given], [ca.gradient(nlp.f + ca.dot(given, nlp.g), nlp.w)])
+    left = -np.asarray(ca.densify(slope(w, p, weights)).full()).ravel()
+    reached = ((w > bounds["ubx"] - UNREACHED) & (left > 0.0)) | ((w < bounds["lbx"] + UNREACHED) & (left < 0.0))
+    return np.where(reached & (np.abs(left) > UNREACHED), left, 0.0), weights
+
+
+def _cost_scale(nlp: NLP, solution: Solution) -> float:
+    """Size of the cost; where that is zero, or nothing but rounding, of its slope near the solution."""
+    size = float(np.abs(list(solution.cost_terms.values())).sum())
+    near = (1.0 + APART) * nlp.pack(solution.trajectory) + APART
+    gradient = ca.Function("gradient", [nlp.w, nlp.p], [ca.densify(ca.gradient(nlp.f, nlp.w))])
+    slope = float(np.abs(np.asarray(gradient(near, np.append(nlp.statement.values, 1.0)).full())).max(initial=0.0))
+    if not np.isfinite(slope) or size > ROUNDING * slope:
+        return size or 1.0
+    return slope or 1.0
+
+
+def _hessians(nlp: NLP, method: str, own: Mapping[str, Any]) -> list[bool]:
+    """Whether the Hessian is exact, in the order in which that is tried."""
+    if "hessian_approximation" in own or method == "fatrop":
+        return [True]
+    return [False] if nlp.mesh.eliminated and nlp.statement.matrices else [True, False]
+
+
+def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of the plugin."""
+    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+    settings["calc_lam_p"] = False
+    if method == "sqpmethod":
+        settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": ASKED, "tol_pr": ASKED}
+        settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}
+        settings["qpsol_options"] = {
+            "print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False,
+            "min_lam": INACTIVE,
+        }  # fmt: skip
+        settings["hessian_approximation"] = "exact" if exact else "limited-memory"
+    elif method == "ipopt":
+        # Bounds are those of the problem: widened by Ipopt's 1e-8 they lower the cost of Bryson-Denham by 9e-8.
+        settings["ipopt"] = {"print_level": 0, "sb": "yes", "max_iter": MAX_ITERATIONS}
+        settings["ipopt"] |= {"tol": ASKED_INTERIOR, "bound_relax_factor": 0.0}
+        if not exact:
+            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": 20}
+    elif method == "fatrop":
+        settings["fatrop"] = {"print_level": 0, "tolerance": ASKED_INTERIOR, "max_iter": MAX_ITERATIONS}
+    for key, value in own.items():
+        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
+    return settings
+
+
+def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
+    """The law for these settings."""
+    nlp, entries = task.nlp, task.made.entries
+    try:
+        solver = ca.nlpsol("nlp", method, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+    except RuntimeError as error:
+        raise ExportError(
+            describe(
+                f"The plugin '{method}' refuses the problem or its settings.",
+                expected="a plugin of this CasADi, and options that it has",
+                received=str(error).strip().splitlines()[-1],
+                remedy="correct plugin_options, or take another method",
+            )
+        ) from error
+    symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
+    guess = ca.MX.sym("guess", nlp.w.shape[0])
+    p = ca.vertcat(ca.MX(0, 1), *stacked(entries, symbols, task.names))
+    bounds = _bounds(task, p, symbols.get("duration"))
+    start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
+    given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
+    given |= {"p": ca.vertcat(p, task.scale), **(_narrowed(bounds) if method == "fatrop" else bounds)}
+    result = solver(**given)
+    evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
+    residuals = _residuals(task, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
+    outputs = _results(task, result["x"], evaluated, residuals)
+    bad = ca.logic_not(ca.logic_and(residuals[0] <= INFEASIBLE, residuals[1] <= STATIONARY))
+    values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"])]
+    inputs = [*symbols.values(), guess]
+    core = ca.Function("solve", inputs, [flat(v) for v in values])
+    ports = (*(entry.port for entry in entries), Port(name="guess", rows=int(nlp.w.shape[0]), about="where to start"))
+    default = np.concatenate([*(entry.value for entry in entries), nlp.pack(task.solution.trajectory)])
+    columns = core(*np.split(default, np.cumsum([port.size for port in ports])[:-1]))
+    safe = np.concatenate([np.asarray(c.full()).ravel() for c in columns])
+    return Law(
+        name="solve",
+        kind="solver",
+        about=ABOUT if task.made.fixed.expected is None else (*ABOUT, NOMINAL),
+        core=core,
+        inputs=ports,
+        outputs=(*(port for port, _ in outputs), Port(name="status")),
+        statuses=STATUSES,
+        safe=safe,
+        defaults=default,
+        points=lambda random, count: _points(task, default, random, count),
+        most=MOST_POINTS,
+        tolerance=TOLERANCE,
+    )
+
+
+def _results(
+    task: _Task, variables: Any, evaluated: Sequence[Any], residuals: tuple[Any, Any]
+) -> list[tuple[Port, Any]]:
+    """Results of the solver with their values: times, controls, states, cost, residuals, variables."""
+    nlp = task.nlp
+    x, _, u, duration, running, terminal, _ = evaluated
+    last = {
+        "cost": (running + terminal, "of the plan"),
+        "infeasibility": (residuals[0], "largest violation of a constraint, in the solver's units"),
+        "stationarity": (residuals[1], "largest slope of the Lagrangian that is left, in the solver's units"),
+        "variables": (variables, "of the solver, the guess of a next call"),
+    }
+    taken = {entry.port.name for entry in task.made.entries} | {"guess", "time", "status", *last}
+    times = Port(name="time", rows=nlp.mesh.nodes.size, unit="s", about="of the nodes")
+    results = [(times, duration * ca.DM(nlp.mesh.nodes))]
+    for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):
+        for block in blocks:
+            about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
+            name = identifier(block.name if block.name not in taken else f"{what}_{block.name}", taken)
+            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
+            results.append((port, source[block.span, :].T))
+    results += [(Port(name=n, rows=int(v.shape[0]), about=about), v) for n, (v, about) in last.items()]
+    return results
+
+
+def _where(what: str, nlp: NLP) -> str:
+    """Of which times the rows of a result are."""
+    return "interval" if what == "control" and nlp.mesh.control == "constant" else "node"
+
+
+def _bounds(task: _Task, p: Any, duration: Any) -> dict[str, Any]:
+    """Bounds of the NLP as expressions of the parameters: `NLP.bounds` with symbols where values are prescribed."""
+    nlp, st, mesh = task.nlp, task.nlp.statement, task.nlp.mesh
+    numbers = nlp.bounds(st.values)
+    known = [np.flatnonzero(~np.isnan(v)) for v in st.boundary_values(st.values)]
+    values = st.boundary(p)
+    count = len(mesh.starts)
+    last_e = st.nx * count + st.ne * (count - 1)
+    places = [(0, known[0], values[0], nlp.scales.x), (st.nx * (count - 1), known[1], values[1], nlp.scales.x)]
+    if not mesh.eliminated:
+        places += [(st.nx * count, known[2], values[2], nlp.scales.e), (last_e, known[3], values[3], nlp.scales.e)]
+    lower, upper = ca.MX(ca.DM(numbers["lbx"])), ca.MX(ca.DM(numbers["ubx"]))
+    for offset, rows, value, scale in places:
+        if rows.size:
+            fixed = value[rows.tolist()] / ca.DM(scale[rows])
+            lower[(offset + rows).tolist()] = fixed
+            upper[(offset + rows).tolist()] = fixed
+    if duration is not None:
+        lower[-1] = upper[-1] = duration / nlp.scales.duration
+    lbg, ubg = ca.MX(ca.DM(numbers["lbg"])), ca.MX(ca.DM(numbers["ubg"]))
+    offset = 0
+    for entry in nlp.rows:
+        size = entry.lower.size
+        if entry.kind == "final_matrices":
+            target = values[3][known[3].tolist()] / ca.DM(entry.scale)
+            lbg[offset : offset + size] = target
+            ubg[offset : offset + size] = target
+        offset += size
+    return {"lbx": lower, "ubx": upper, "lbg": lbg, "ubg": ubg}
+
+
+def _narrowed(bounds: dict[str, Any]) -> dict[str, Any]:
+    """Bounds that fatrop widens to these; those that are equal stay, as fatrop leaves them, and so do infinite ones."""
+    result = {}
+    for lower, upper in (("lbx", "ubx"), ("lbg", "ubg")):
+        room = (bounds[upper] - bounds[lower]) / 2
+        for name, sign in ((lower, 1.0), (upper, -1.0)):
+            widened = WIDENED * ca.fmin(ca.fmax(1.0, ca.fabs(bounds[name])), LARGEST)
+            result[name] = bounds[name] + sign * ca.fmin(widened, room)
+    return result
+
+
+def _residuals(
+    task: _Task, result: Mapping[str, Any], g: Any, p: Any, bounds: Mapping[str, Any], duration: Any
+) -> tuple[Any, Any]:
+    """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
+    nlp = task.nlp
+    multipliers = ca.MX.sym("multipliers", nlp.g.shape[0])
+    slope = ca.gradient(nlp.f + ca.dot(multipliers, nlp.g), nlp.w)
+    function = ca.Function("lagrangian_slope", [nlp.w, nlp.p, multipliers], [ca.densify(slope)])
+    left = function(result["x"], ca.vertcat(p, task.scale), result["lam_g"]) + result["lam_x"]
+    both = ca.vertcat(result["x"], g)
+    lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
+    weights = ca.vertcat(result["lam_x"], result["lam_g"])
+    violation = ca.mmax(ca.fmax(0.0, ca.fmax(lower - both, both - upper)))
+    violation = ca.fmax(violation, ca.if_else(duration > 0.0, 0.0, 1.0))  # a plan backwards in time is none
+    slack = ca.if_else(weights > 0.0, upper - both, both - lower)
+    loose = ca.mmax(ca.if_else(weights == 0.0, 0.0, ca.fmin(ca.fabs(weights), ca.fabs(slack))))
+    return violation, ca.fmax(ca.norm_inf(left), loose)
+
+
+def _points(task: _Task, default: Array, random: np.random.Generator, count: int) -> Array:
+    """The arguments of the export, then others near them; one that is not finite."""
+    rows = np.tile(default, (count, 1))
+    offset = 0
+    for entry in task.made.entries:
+        size = entry.port.size
+        rows[1:, offset : offset + size] += entry.deviation * random.uniform(-1.0, 1.0, (count - 1, size))
+        if entry.port.columns > 1:
+            rows[1:, offset : offset + size] *= random.uniform(0.9, 1.1, (count - 1, 1))
+        offset += size
+    if count > TRIALS and offset:
+        rows[TRIALS, 0] = np.nan
+    return rows

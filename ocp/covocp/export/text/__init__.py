@@ -1,0 +1,1 @@
+"""What is written: C sources, headers, self-test and README as text."""

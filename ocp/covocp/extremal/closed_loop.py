@@ -1,0 +1,369 @@
+"""The closed loop along a nominal: covariances for any gains and statistics, gains, both forms of the expected cost.
+
+With e the error of the estimate and y the estimate of the deviation (Schmidt's x'), both driven by the gains of the
+design, K = E M' U^-1 and C, and by the true statistics E0(0), Q0, U0 (appendix A, 6.11):
+
+    de = (F - K M) e dt + K dv - dn,      dy = (F - G C) y dt - K M e dt + K dv.
+
+Their joint covariance [E Z; Z' Xhat] obeys a Lyapunov equation, stepped by the two-stage Gauss method: it is positive
+semidefinite at any step size. Where the statistics are the design's, Z = 0 and E is the design's. The cost is had from
+it by (E-1), extended by Z (6.11), and from E and S of the design by (E-20).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import Array, unpack, unpack_symbolic
+from covocp.base.riccati_rates import inverse
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import fine_trajectory
+from covocp.statement.statement import Loop, Statement
+from covocp.transcription.rosenbrock import one_sided
+from covocp.transcription.shooting import common_columns, substep_columns
+from covocp.transcription.steps import GAUSS_NODES, KEPT, gauss_matrix, hermite, interval_symbols
+
+# Share of the largest slope below which a direction of the state counts as moved by nothing.
+UNMOVED = 1e-10
+# Pairs of substeps for one time constant of filter or loop in an interval, and the most of them.
+STEPS_PER_RATE = 1.0
+LARGEST_PAIRS = 32
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """What is truly uncertain: covariance of the initial deviation, densities of process and measurement noise.
+
+    initial: (n, n); density: (state, control, time, duration, parameters) -> Q (n, n), U (m, m); parameters: its own.
+    """
+
+    initial: Array
+    density: ca.Function
+    parameters: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedLoop:
+    """The closed loop at the nodes of a nominal.
+
+    E: covariance of the error of the estimate, (K, n, n); Xhat: of the estimate; Z: between both, <e y'>; gain: C,
+        (K, m, n).
+    cost: expected cost by (E-1) with Z, by term: "terminal" k, "running" int L dt, "deviations at the end"
+        1/2 tr S(T) X(T), "deviations on the way" the integral of A, B, N.
+    conservation: largest relative error of w'(E + Xhat)w, which grows by int w'Qw dt only, over the directions w that
+        neither the control nor the state moves (w'F = 0, w'G = 0: constants, or the logarithm of a density plus a
+        multiple of the altitude); None where there are none.
+    other_cost: the same expected cost by (E-20), from S(0) E(0); None where the gain is not the best one or the
+        statistics are not the design's.
+    """
+
+    E: Array
+    Xhat: Array
+    Z: Array
+    gain: Array
+    cost: Mapping[str, float]
+    other_cost: float | None
+    conservation: float | None
+
+    @property
+    def X(self) -> Array:
+        """Covariance of the deviations of the actual system, E + Xhat - Z - Z'."""
+        return np.asarray(self.E + self.Xhat - self.Z - self.Z.transpose(0, 2, 1))
+
+    @property
+    def expected_cost(self) -> float:
+        """Sum of the terms."""
+        return float(sum(self.cost.values()))
+
+
+def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoop | None:
+    """Propagate the covariances of the loop along a solution.
+
+    Args:
+        extremal: of a statement with a loop.
+        truth: the true statistics; None: the design's.
+
+    Returns:
+        Covariances, gains and costs at the nodes; None where they leave the range of numbers, as along the last iterate
+        of a run whose gains ran away.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            loop = _propagated(extremal, truth)
+    except (RuntimeError, np.linalg.LinAlgError):  # a step that cannot be solved: CasADi's error, or numpy's
+        return None
+    return loop if np.isfinite(loop.expected_cost) else None
+
+
+def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
+    """What `close_loop` returns."""
+    st, mesh = extremal.statement, extremal.mesh
+    size = len(st.augmented)
+    statistics = truth if truth is not None else design_statistics(extremal)
+    n, m = mesh.intervals, loop_substeps(extremal)
+    fine = fine_trajectory(extremal, m)
+    values = _joint_covariances(extremal, fine, statistics)
+    cost, other = _costs(extremal, fine, values, truth is None)
+    at = values[::m]
+    columns = extremal.columns()
+    loop = _loop(st)
+    gain = np.asarray(loop.gain.map(n + 1)(*columns).full())
+    return ClosedLoop(
+        E=at[:, :size, :size],
+        Xhat=at[:, size:, size:],
+        Z=at[:, :size, size:],
+        gain=gain.reshape(-1, n + 1, size).transpose(1, 0, 2),
+        cost=cost,
+        other_cost=other,
+        conservation=_conservation(extremal, fine, values, statistics),
+    )
+
+
+def covariances_along(extremal: Extremal, fine: Array) -> Array:
+    """Covariances of the deviations at the nodes where the gains are taken from a given course of x, E and S.
+
+    Args:
+        extremal: of a statement with a loop.
+        fine: x and the half-vectors at the starts of equal parts of all intervals and at the ends, (N, m + 1, size).
+
+    Returns:
+        (N + 1, n, n); not finite where such a loop diverges.
+    """
+    size = len(extremal.statement.augmented)
+    with np.errstate(over="ignore", invalid="ignore"):
+        joint = _joint_covariances(extremal, fine, design_statistics(extremal))[:: fine.shape[1] - 1]
+    E, Z, Xhat = joint[:, :size, :size], joint[:, :size, size:], joint[:, size:, size:]
+    return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
+
+
+def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) -> Array:
+    """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
+    st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
+    size = len(st.augmented)
+    common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
+    before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
+    q = np.tile(statistics.parameters[:, None], (1, n * m))
+    step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
+    joint = np.zeros((2 * size, 2 * size))
+    joint[:size, :size] = statistics.initial
+    values = np.zeros((n * m + 1, 2 * size, 2 * size))
+    values[0] = joint
+    matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
+    half = 2 * size
+    for k, D in enumerate(matrices):
+        moved = D[half:, :half] + D[half:, half:] @ joint
+        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
+        joint = 0.5 * (joint + joint.T)
+        values[k + 1] = joint
+    return values
+
+
+def loop_substeps(extremal: Extremal) -> int:
+    """Even number of steps an interval that resolves filter and feedback: S falls fast before a weighted end."""
+    st, count = extremal.statement, extremal.mesh.intervals + 1
+    x, u, e, t, duration, p = extremal.columns()
+    size = len(st.augmented)
+
+    def each(value: Any) -> Array:
+        numbers = np.asarray(value.full())
+        return numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
+
+    F, G = (each(v) for v in _loop(st).expansion.map(count)(x, u, t, duration, p)[:2])
+    C = each(_loop(st).gain.map(count)(x, u, e, t, duration, p))
+    block = next(b for b in st.matrices if b.estimation)
+    loops = [F - G @ C]
+    if st.measurement is not None:
+        _, M, U = (each(v) for v in st.measurement.map(count)(x, u, t, duration, p))
+        E = unpack(extremal.trajectory.e[:, block.span], size)
+        loops.append(F - E @ M.transpose(0, 2, 1) @ np.linalg.solve(U, M))
+    rates = [np.abs(np.linalg.eigvals(matrix)).max(axis=1, initial=0.0) for matrix in loops]
+    h = np.diff(extremal.time)
+    stiff = max(float((np.maximum(rate[1:], rate[:-1]) * h).max(initial=0.0)) for rate in rates)
+    pairs = int(np.clip(np.ceil(STEPS_PER_RATE * stiff), max(1, extremal.mesh.substeps // 2), LARGEST_PAIRS))
+    return 2 * pairs
+
+
+def design_statistics(extremal: Extremal) -> Statistics:
+    """The statistics that the design assumes."""
+    st = extremal.statement
+    block = next(b for b in st.matrices if b.estimation)
+    return Statistics(
+        initial=unpack(st.boundary_values(extremal.parameters)[2][block.span], block.size),
+        density=densities(st),
+        parameters=extremal.parameters,
+    )
+
+
+@lru_cache(maxsize=KEPT)
+def densities(statement: Statement) -> ca.Function:
+    """(state, control, time, duration, parameters) -> densities Q of the process and U of the measurement noise."""
+    symbolic: Any = statement.symbolic
+    arguments = [symbolic.sym(f"a{i}", k) for i, k in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
+    noise = _loop(statement).expansion(*arguments)[5]
+    measured = statement.measurement
+    density = symbolic(0, 0) if measured is None else measured(*arguments)[2]
+    return ca.Function("densities", arguments, [noise, ca.densify(density)])
+
+
+def _loop(statement: Statement) -> Loop:
+    if statement.loop is None:
+        raise ValueError("a problem without an expected cost has no loop")
+    return statement.loop
+
+
+def _fine_columns(extremal: Extremal, substeps: int) -> tuple[Any, ...]:
+    """Common arguments of the interval functions, a column for each substep."""
+    t = extremal.trajectory
+    common = common_columns(extremal.mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
+    return substep_columns(common, substeps, extremal.mesh.intervals)
+
+
+@lru_cache(maxsize=KEPT)
+def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
+    """(z at both ends of a substep, *common, parameters of the truth) -> step matrix of [E Z; Z' Xhat], 4n x 4n.
+
+    x, E, S of the design between the ends by cubic Hermite polynomials.
+    """
+    symbolic: Any = statement.symbolic
+    nx, size = statement.nx, len(statement.augmented)
+    za, zb = (symbolic.sym(name, nx + statement.ne) for name in ("za", "zb"))
+    common = interval_symbols(statement, symbolic)
+    q = symbolic.sym("q", density.size1_in(4))
+    ua, ub, s, ds, duration, p = common
+    h = duration * ds
+
+    def slope(z: Any, u: Any, at: Any) -> Any:
+        return ca.vertcat(*statement.rates(z[:nx], u, z[nx:], duration * at, duration, p)[:2])
+
+    fa, fb = slope(za, ua, s + one_sided(0.0) * ds), slope(zb, ub, s + one_sided(1.0) * ds)
+    block = next(b for b in statement.matrices if b.estimation)
+    loop = _loop(statement)
+    points = []
+    for c in GAUSS_NODES:
+        z, u, t = hermite(za, zb, h * fa, h * fb, c), ua + c * (ub - ua), duration * (s + c * ds)
+        F, G = loop.expansion(z[:nx], u, t, duration, p)[:2]
+        C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
+        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][block.span], size), (t, duration, p))
+        noise, measured = density(z[:nx], u, t, duration, q)
+        drift = ca.blockcat([[F - K @ M, symbolic.zeros(size, size)], [-K @ M, F - G @ C]])
+        spread = K @ measured @ K.T
+        driven = ca.blockcat([[spread + noise, spread], [spread, spread]])
+        points.append(h * ca.blockcat([[-drift.T, symbolic.zeros(2 * size, 2 * size)], [driven, drift]]))
+    inner = ca.Function("points", [za, zb, *common, q], points)
+    outer = inner.mx_in()
+    value = gauss_matrix(inner(*outer), 2 * size, LINEAR_SOLVER)
+    return ca.Function("joint_step", outer, [value])
+
+
+def _filter(statement: Statement, x: Any, u: Any, E: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
+    if statement.measurement is None:
+        return E[:, :0], E[:0, :]
+    _, M, U = statement.measurement(x, u, *rest)
+    return E @ M.T @ inverse(U), ca.densify(M)
+
+
+def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Statistics) -> float | None:
+    """Largest relative error of the variances that only noise changes [2.1 of chapter 6, 3 and 4]."""
+    st, mesh = extremal.statement, extremal.mesh
+    n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
+    X = joint[:, :size, :size] + joint[:, size:, size:] - joint[:, :size, size:] - joint[:, size:, :size]
+    units = np.sqrt(np.diagonal(X, axis1=1, axis2=2).max(axis=0).clip(0.0))
+    uncertain = np.flatnonzero(units)  # what is known exactly never deviates
+    if not uncertain.size:
+        return None
+    units, X = units[uncertain], X[:, uncertain[:, None], uncertain]
+    count = n * (m + 1)
+    arguments = [column.reshape(count, -1).T for column in _points(extremal, fine)]
+    own, true = (np.tile(p[:, None], (1, count)) for p in (extremal.parameters, statistics.parameters))
+    F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
+    F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
+    slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
+    triangle = np.asarray(np.linalg.qr(slopes.T, mode="r"))  # of a few rows with thousands of columns
+    vectors, values, _ = np.linalg.svd(triangle.T)
+    values = np.append(values, np.zeros(units.size - values.size))
+    kept = vectors[:, values <= UNMOVED * max(float(values.max(initial=0.0)), np.finfo(float).tiny)] / units[:, None]
+    if not kept.shape[1]:
+        return None
+    noise = np.asarray(statistics.density.map(count)(*arguments, true)[0].full()).reshape(size, count, size)
+    growth = np.einsum("iw,ikj,jw->kw", kept, noise[uncertain][:, :, uncertain], kept).reshape(n, m + 1, -1)
+    weights = np.array([1.0 if j in (0, m) else 4.0 if j % 2 else 2.0 for j in range(m + 1)]) / (3 * m)
+    grown = np.cumsum(np.einsum("k,j,kjw->kw", np.diff(extremal.time), weights, growth), axis=0)
+    variance = np.einsum("iw,kij,jw->kw", kept, X[::m], kept)
+    error = np.abs(variance[1:] - variance[0] - grown)
+    return float((error / np.maximum(variance[1:], np.finfo(float).tiny)).max())
+
+
+def _points(extremal: Extremal, fine: Array) -> tuple[Array, Array, Array, Array]:
+    """x, u, t, T at the ends of all substeps, with the control of their interval; (N, substeps + 1, entries)."""
+    n, points, _ = fine.shape
+    u, nodes = extremal.controls, extremal.time
+    after = u[:-1] if extremal.mesh.control == "constant" else u[1:]
+    c = np.linspace(0.0, 1.0, points)[:, None]
+    time = nodes[:-1, None, None] + np.clip(c, one_sided(0.0), one_sided(1.0)) * np.diff(nodes)[:, None, None]
+    controls = u[:-1, None, :] + c * (after - u[:-1])[:, None, :]
+    return fine[:, :, : extremal.statement.nx], controls, time, np.full(time.shape, extremal.trajectory.duration)
+
+
+def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple[dict[str, float], float | None]:
+    """Terms of the cost by (E-1) with Z [6.11], and by (E-20) where it holds; integrals by Simpson's rule."""
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    n, m, size = mesh.intervals, fine.shape[1] - 1, len(st.augmented)
+    best = bool(st.behind) and design
+    function = _running(st)
+    h, x, u, time, duration = np.diff(extremal.time), *_points(extremal, fine)
+    p = np.tile(extremal.parameters[:, None], (1, n))
+    running = deviations = other = 0.0
+    for j in range(m + 1):
+        weight = (1 if j in (0, m) else 4 if j % 2 else 2) / (3 * m) * h
+        covariance = joint[j::m][:n].transpose(1, 0, 2).reshape(2 * size, -1)
+        at = (x[:, j].T, u[:, j].T, fine[:, j, st.nx :].T, time[:, j].T, duration[:, j].T, p)
+        L, fed, alternative = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))
+        running += float(weight @ L)
+        deviations += float(weight @ fed)
+        other += float(weight @ alternative)
+    loop = _loop(st)
+    k, S = (np.asarray(v.full()) for v in loop.terminal(t.x[-1], t.duration, extremal.parameters))
+    error, cross, estimate = joint[-1][:size, :size], joint[-1][:size, size:], joint[-1][size:, size:]
+    spread = error + estimate - cross - cross.T
+    terms = {
+        "terminal": float(k.item()),
+        "running": running,
+        "deviations at the end": 0.5 * float(np.sum(S * spread)),
+        "deviations on the way": deviations,
+    }
+    if not best:
+        return terms, None
+    block = next(b for b in st.matrices if b.backward)
+    at_start = unpack(t.e[0, block.span], size)
+    return terms, float(k.item()) + running + 0.5 * float(np.sum(at_start * joint[0][:size, :size])) + other
+
+
+@lru_cache(maxsize=KEPT)
+def _running(statement: Statement) -> ca.Function:
+    """(all six, joint covariance) -> L, its second-order part by (E-1) with Z, 1/2 tr(S Q + C'B C E) of (E-20)."""
+    symbolic: Any = statement.symbolic
+    size = len(statement.augmented)
+    sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
+    six = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    joint = symbolic.sym("joint", 2 * size, 2 * size)
+    loop = _loop(statement)
+    plain = (*six[:2], *six[3:])
+    _, _, A, B, N, Q = loop.expansion(*plain)
+    C = loop.gain(*six)
+    E, Z, Xhat = joint[:size, :size], joint[:size, size:], joint[size:, size:]
+    X = E + Xhat - Z - Z.T
+    fed = ca.trace(A @ X) + ca.trace(B @ C @ Xhat @ C.T) - 2 * ca.trace(N @ C @ (Xhat - Z.T))
+    other = symbolic(0)
+    if statement.behind:
+        block = next(b for b in statement.matrices if b.backward)
+        S = unpack_symbolic(six[2][block.span], size)
+        other = ca.trace(S @ Q) + ca.trace(C.T @ B @ C @ E)
+    return ca.Function("running", [*six, joint], [loop.running(*plain), fed / 2, other / 2])

@@ -1,0 +1,345 @@
+"""Second-order condition: the smallest curvature of the Lagrangian in the directions that what holds a solution leaves.
+
+The reduced Hessian is that of the controls, and of initial states that are free, on the null space of *all* constraints
+that hold: terminal conditions, bounds and inequalities with a multiplier. It is applied to a direction by way of the
+nodes (`tangents` there, the second derivatives of each interval, and back), so that nothing is amplified by the
+horizon where the plant is unstable. Limits inside the intervals count like those at the nodes: rows and second
+derivatives are those of the mesh that has all these points as nodes. Where inequalities only just hold, without a
+multiplier, a direction counts only if they allow it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.krylov import krylov
+from covocp.base.matrices import Array
+from covocp.extremal.active_constraints import held_by
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import refined
+from covocp.extremal.hamiltonian import Costates, discrete_costates
+from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, second_order
+from covocp.extremal.tangents import Between, Tangents
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Trajectory
+
+LANCZOS_STEPS = 120
+# Residual of the smallest Ritz value, relative to the largest eigenvalue, at which it is known well enough; its sign
+# is where the residual is below half of it.
+LANCZOS_TOLERANCE = 1e-3
+DISPLACEMENT = 0.3
+# Rows held, of unit length, whose part across the others is below this say nothing new.
+DEPENDENT = 1e-9
+# An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
+# share of the largest eigenvalue, to which solvers meet the conditions that the multipliers come from.
+SAFETY = 10.0
+SOLVED = 1e-9
+# Steps of the search for a direction that constraints without multipliers allow; what they may be missed by.
+CONE_STEPS = 60
+CONE_MISS = 1e-9
+
+Verdict = Literal["minimum", "saddle", "flat"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curvature:
+    """The smallest curvature and its direction, in the metric int du' du dt.
+
+    Attributes:
+        value: smallest curvature in the directions that are left.
+        largest: largest absolute eigenvalue of the reduced Hessian.
+        error: of both, by roundoff and by the tolerance of the solution.
+        direction: of the controls, (N + 1 or N, nu); of the initial states in `start` (nx,).
+    """
+
+    value: float
+    largest: float
+    error: float
+    direction: Array
+    start: Array
+
+    @property
+    def verdict(self) -> Verdict:
+        """ "minimum", "saddle", or "flat" where the sign is below the error."""
+        if abs(self.value) <= self.error:
+            return "flat"
+        return "minimum" if self.value > 0 else "saddle"
+
+    def displaced(self, extremal: Extremal, sign: float) -> Trajectory:
+        """The trajectory moved along the direction, its controls by their size or one unit, to both sides."""
+        t = extremal.trajectory
+        size = max(float(np.sqrt(np.mean(t.u**2))), DISPLACEMENT)
+        largest = max(float(np.abs(self.direction).max(initial=0.0)), float(np.abs(self.start).max(initial=0.0)))
+        step = sign * size / largest
+        x = t.x.copy()
+        x[0] = np.clip(x[0] + step * self.start, *extremal.statement.state_bounds)
+        u = np.clip(t.u + step * self.direction, *extremal.statement.control_bounds)
+        return Trajectory(x=x, u=u, e=t.e, duration=t.duration)
+
+
+def smallest_curvature(extremal: Extremal) -> Curvature | None:
+    """The smallest curvature with the terminal time held; None where nothing can move or it cannot be computed."""
+    if not extremal.statement.nu:
+        return None
+    try:
+        reduced = _Reduced.of(extremal)
+    except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):  # a step that cannot be differentiated or solved
+        return None
+    if reduced is None:
+        return None
+    strict = reduced.null_space(reduced.strict)
+    if not strict.shape[1] or not np.isfinite(reduced.apply(strict @ np.ones(strict.shape[1]))).all():
+        return None
+    values, vectors, error = _extremes(reduced, strict)
+    value, v = float(values[0]), vectors[:, 0]
+    largest = float(np.abs(values).max())
+    error = max(error, SOLVED * largest)
+    if value < -error and reduced.loose.shape[0]:
+        value, v = _in_the_cone(reduced, v, value, largest, error)
+    z, u = reduced.tangents.forward(reduced.unscaled(v)[:, None])
+    start = np.zeros(extremal.statement.nx)
+    moving = list(reduced.tangents.start)
+    start[moving] = z[0, moving, 0]
+    return Curvature(value=value, largest=largest, error=error, direction=u[:, :, 0], start=start)
+
+
+def _extremes(reduced: _Reduced, basis: Array) -> tuple[Array, Array, float]:
+    """Ritz values (rising) and vectors on a subspace, and how far the operator was from symmetric."""
+
+    def known(value: float, residual: float, largest: float) -> bool:
+        return residual <= min(LANCZOS_TOLERANCE * largest, max(0.5 * abs(value), SOLVED * largest))
+
+    start = np.random.default_rng(0).standard_normal((1, basis.shape[1]))[0]
+    found = krylov(lambda v: np.asarray(basis.T @ reduced.apply(basis @ v)), start, LANCZOS_STEPS, known)
+    return found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry
+
+
+def _in_the_cone(reduced: _Reduced, v: Array, value: float, largest: float, error: float) -> tuple[float, Array]:
+    """The smallest curvature found among the directions that constraints without a multiplier allow.
+
+    Negative only with a direction that shows it: the direction itself or its opposite, one that keeps those constraints
+    as they are, or one that descends into the cone they leave.
+    """
+    rows = reduced.loose / np.maximum(np.linalg.norm(reduced.loose, axis=1), np.finfo(float).tiny)[:, None]
+    for sign in (1.0, -1.0):
+        if (rows @ (sign * v) >= -CONE_MISS).all():
+            return value, sign * v
+    basis = reduced.null_space(np.vstack([reduced.strict, reduced.loose]))
+    best, kept = np.inf, np.zeros_like(v)
+    if basis.shape[1]:
+        values, vectors, _ = _extremes(reduced, basis)
+        best, kept = float(values[0]), vectors[:, 0]
+    if best < -error:
+        return best, kept
+    strict = reduced.null_space(reduced.strict)
+    for sign in (1.0, -1.0):
+        d = _onto_cone(sign * strict.T @ v, rows @ strict)
+        for _ in range(CONE_STEPS):
+            length = float(np.linalg.norm(d))
+            if length <= CONE_MISS:
+                break
+            d /= length
+            image = strict.T @ reduced.apply(strict @ d)
+            found = float(d @ image)
+            if found < best:
+                best, kept = found, strict @ d
+            if best < -error:
+                return best, kept
+            d = _onto_cone(d - (image - found * d) / largest, rows @ strict)
+    return best, kept
+
+
+def _onto_cone(d: Array, rows: Array) -> Array:
+    """The nearest direction along which no row falls: d + rows' y, y >= 0 (non-negative least squares)."""
+    from scipy.optimize import nnls
+
+    weights, _ = nnls(np.vstack([rows.T, np.zeros((1, rows.shape[0]))]), np.append(-d, 0.0))
+    return np.asarray(d + rows.T @ weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reduced:
+    """The reduced Hessian as an operator on v in units of the root of the metric.
+
+    Attributes:
+        tangents: from v to nodes and controls.
+        between: from there to all points at which limits are imposed, the nodes among them.
+        root: lower Cholesky factor of the metric of v.
+        product: Hessian of the Lagrangian by points and controls there, times a direction of them.
+        strict: slopes by v of the rows held with a multiplier, (rows, V), in these units.
+        loose: of those without, such that a direction is allowed along which none falls.
+    """
+
+    tangents: Tangents
+    between: Between
+    root: Array
+    product: Callable[[Array], Array]
+    strict: Array
+    loose: Array
+
+    @staticmethod
+    def of(extremal: Extremal) -> _Reduced | None:
+        """The operator along an extremal; None where nothing can move."""
+        from scipy.linalg import block_diag, cholesky  # here: importing scipy takes longer than all of covocp
+
+        st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+        fine = refined(extremal)
+        held = held_by(fine)
+        fine = held.bare(fine)
+        own, touching = held.controls[:: mesh.points], held.touching[:: mesh.points]  # those between follow from them
+        tangents = tangents_along(extremal, own == 0, _free_start(extremal))
+        if not tangents.size:
+            return None
+        between = _between(extremal, fine)
+        given = arguments(fine, _costates(fine, through=tangents.gain is None))
+        product, jacobian = second_order(st, fine.mesh, held.entries)
+        free = tangents.free.ravel()
+        metric = mass_matrix(mesh, t.duration, st.nu)[np.ix_(free, free)]
+        weights = t.duration * (_scales(t.u).mean() / _scales(t.x)[list(tangents.start)]) ** 2
+        root = cholesky(block_diag(metric, np.diag(weights)), lower=True)
+        rows = _by_v(tangents, *between.backward(*_split(fine, np.asarray(jacobian(*given).full()))), root)
+        if not np.isfinite(rows).all():
+            return None
+        at_bounds = np.flatnonzero(touching * tangents.free)
+        units = np.zeros((tangents.free.size, at_bounds.size))
+        units[at_bounds, np.arange(at_bounds.size)] = 1.0
+        still = np.zeros((mesh.intervals + 1, node_size(st), at_bounds.size))
+        loose = np.vstack([rows[~held.strict], _by_v(tangents, still, units.reshape(*t.u.shape, -1), root)])
+        side = np.concatenate([held.side[~held.strict], touching.ravel()[at_bounds]])
+        return _Reduced(
+            tangents=tangents,
+            between=between,
+            root=root,
+            product=lambda direction: np.asarray(product(*given, direction).full()).ravel(),
+            strict=rows[held.strict],
+            loose=-side[:, None] * loose,
+        )
+
+    def unscaled(self, v: Array) -> Array:
+        """v of the tangents."""
+        from scipy.linalg import solve_triangular
+
+        return np.asarray(solve_triangular(self.root.T, v, lower=False))
+
+    def apply(self, v: Array) -> Array:
+        """The reduced Hessian times v."""
+        from scipy.linalg import solve_triangular
+
+        z, u = self.between.forward(*self.tangents.forward(self.unscaled(v)[:, None]))
+        image = self.product(np.concatenate([z.ravel(), u.ravel()]))
+        slopes = self.between.backward(image[: z.size].reshape(z.shape), image[z.size :].reshape(u.shape))
+        by_v = self.tangents.backward(*slopes)
+        return np.asarray(solve_triangular(self.root, by_v[:, 0], lower=True))
+
+    def null_space(self, rows: Array) -> Array:
+        """Orthonormal basis of the directions along which no row changes, (V, number)."""
+        return null_space(rows, self.root.shape[0])
+
+
+def null_space(rows: Array, size: int) -> Array:
+    """Orthonormal basis of the vectors of some size that are across all rows, whatever the units of each row."""
+    lengths = np.linalg.norm(rows, axis=1)
+    kept = rows[lengths > 0] / lengths[lengths > 0][:, None]
+    if not kept.shape[0]:
+        return np.eye(size)
+    _, values, vectors = np.linalg.svd(kept)
+    return np.asarray(vectors[int(np.sum(values > DEPENDENT * values[0])) :].T)
+
+
+def _by_v(tangents: Tangents, by_z: Array, by_u: Array, root: Array) -> Array:
+    """Slopes of rows by v, (rows, V), in units of the root of the metric, from those by nodes and controls."""
+    from scipy.linalg import solve_triangular
+
+    if not by_z.shape[2]:
+        return np.zeros((0, tangents.size))
+    return np.asarray(solve_triangular(root, tangents.backward(by_z, by_u), lower=True).T)
+
+
+def _split(extremal: Extremal, rows: Array) -> tuple[Array, Array]:
+    """Slopes of rows by nodes (N + 1, n, rows) and controls (N + 1 or N, nu, rows), from a Jacobian by both."""
+    u, nodes, n = extremal.trajectory.u, extremal.mesh.intervals + 1, node_size(extremal.statement)
+    by_z, by_u = rows[:, : n * nodes].T, rows[:, n * nodes :].T
+    return by_z.reshape(nodes, n, rows.shape[0]), by_u.reshape(*u.shape, rows.shape[0])
+
+
+def _between(extremal: Extremal, fine: Extremal) -> Between:
+    """From the nodes of an extremal to those of its refined one."""
+    constant = extremal.mesh.control == "constant"
+    if extremal.mesh.points == 1:
+        none = np.zeros((extremal.mesh.intervals, 1, 0, 0))  # there is nothing to pass through
+        return Between(A=none, before=none, after=none, constant=constant)
+    slopes = interval_slopes(fine)
+    if constant:
+        slopes = (slopes[0], slopes[1] + slopes[2], np.zeros_like(slopes[2]))
+    A, before, after = (v.reshape(extremal.mesh.intervals, extremal.mesh.points, *v.shape[1:]) for v in slopes)
+    return Between(A=A, before=before, after=after, constant=constant)
+
+
+def tangents_along(
+    extremal: Extremal, free: NDArray[np.bool_], start: tuple[int, ...] = (), *, feedback: bool = True
+) -> Tangents:
+    """The linearised nominal along an extremal, as a map from the controls that are free and the initial states."""
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    A, before, after = interval_slopes(extremal)
+    z = t.x if not st.coupled else np.hstack([t.x, t.e])
+    scales = (_scales(z), _scales(t.u))
+    constant = mesh.control == "constant"
+    if constant:
+        before = before + after
+    if not feedback:
+        return Tangents(A=A, before=before, after=None if constant else after, free=free, start=start, gain=None)
+    return Tangents.of(A, before, None if constant else after, free, start, scales)
+
+
+def _costates(extremal: Extremal, *, through: bool) -> Costates:
+    """Costates at the nodes: through the whole horizon from its end, or from the end of each shooting segment.
+
+    The first are exact for every trajectory, the second where the multipliers of the continuity are, but the plant
+    amplifies the error at the end of a segment only, not of the horizon.
+    """
+    if through:
+        none = np.zeros((0, extremal.statement.nx))
+        extremal = replace(extremal, multipliers=replace(extremal.multipliers, gaps=none))
+    return discrete_costates(extremal)[0]
+
+
+def _scales(values: Array) -> Array:
+    """Largest magnitude of each column; 1 where it is always zero."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    return np.asarray(np.where(largest > 0, largest, 1.0))
+
+
+def _free_start(extremal: Extremal) -> tuple[int, ...]:
+    """Entries of the initial state that are free and not at a bound."""
+    st, x = extremal.statement, extremal.trajectory.x
+    lower, upper = st.state_bounds
+    room = np.minimum(x[0] - lower, upper - x[0]) > 1e-5 * _scales(x)
+    return tuple(np.flatnonzero(np.isnan(st.boundary_values(extremal.parameters)[0]) & room).tolist())
+
+
+def held_jacobian(extremal: Extremal) -> Array:
+    """Jacobian by the control values, node by node, of what is held by conditions, inequalities and state bounds."""
+    fine = refined(extremal)
+    held = held_by(fine)
+    fine = held.bare(fine)
+    _, jacobian = second_order(fine.statement, fine.mesh, held.strictly)
+    everything = np.ones(extremal.trajectory.u.shape, dtype=bool)
+    tangents = tangents_along(extremal, everything, feedback=False)
+    rows = np.asarray(jacobian(*arguments(fine, _costates(fine, through=True))).full())
+    slopes = _between(extremal, fine).backward(*_split(fine, rows))
+    return _by_v(tangents, *slopes, np.eye(tangents.size))
+
+
+def mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:
+    """The matrix of int du' du dt for the control values, each of `count` entries."""
+    h = np.diff(mesh.nodes) * duration
+    if mesh.control == "constant":
+        matrix = np.diag(h)
+    else:
+        matrix = np.diag(np.append(h, 0.0) + np.append(0.0, h)) / 3.0 + (np.diag(h, 1) + np.diag(h, -1)) / 6.0
+    return np.asarray(np.kron(matrix, np.eye(count)))

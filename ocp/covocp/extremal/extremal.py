@@ -1,0 +1,103 @@
+"""A candidate solution as plain data: the trajectory at the nodes and the multipliers of what binds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Multipliers, Trajectory
+
+# How a method says, among its counts, that it lost its way: it was stopped, or ended by itself.
+STOPPED, ENDED = "stopped", "ended"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extremal:
+    """Trajectory, multipliers, and what is needed to evaluate anything along them."""
+
+    statement: Statement
+    mesh: Mesh
+    trajectory: Trajectory
+    parameters: Array
+    multipliers: Multipliers
+
+    @property
+    def time(self) -> Array:
+        """Times of the nodes [s]."""
+        return self.mesh.nodes * self.trajectory.duration
+
+    @property
+    def controls(self) -> Array:
+        """Controls at all N + 1 nodes; a constant control holds its last value at the last node."""
+        u = self.trajectory.u
+        return u if u.shape[0] == self.mesh.intervals + 1 else np.vstack([u, u[-1:]])
+
+    def columns(self) -> tuple[Array | float, ...]:
+        """Arguments (x, u, e, t, T, p) at the nodes, a column each, for a mapped function of the statement."""
+        count = self.mesh.intervals + 1
+        return (
+            self.trajectory.x.T,
+            self.controls.T,
+            self.trajectory.e.T,
+            self.time[None, :],
+            np.full((1, count), self.trajectory.duration),
+            np.tile(self.parameters[:, None], (1, count)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a method returns: an extremal, its cost by term, and how the run ended.
+
+    Args:
+        extremal: the last iterate.
+        cost_terms: terminal and running cost.
+        converged: whether the method's own test was met.
+        message: how it ended, a sentence.
+        violations: largest violation of each violated constraint by its name.
+        stats: iterations, times, what the method counts; `wandered` where it lost its way (STOPPED or ENDED).
+    """
+
+    extremal: Extremal
+    cost_terms: Mapping[str, float]
+    converged: bool
+    message: str
+    violations: Mapping[str, float]
+    stats: Mapping[str, Any]
+
+
+class Prepared(Protocol):
+    """What `prepare` of a method's module returns: the problem made ready, solved as often as wanted."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """The resolved mesh."""
+
+    def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
+        """Solve for these parameters from this guess."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guess:
+    """Where to start, and how sure that is.
+
+    Args:
+        trajectory: nominal and matrices at the nodes of the mesh.
+        multipliers: of a related solution on the same mesh, or None.
+        costates: p and the costates of the half-vectors at the nodes that belong to them, or None.
+        warm: whether it comes from a solution.
+        tentative: whether there are others: a method that loses its way should stop.
+    """
+
+    trajectory: Trajectory
+    multipliers: Multipliers | None = None
+    costates: tuple[Array, Array] | None = None
+    warm: bool = False
+    tentative: bool = False

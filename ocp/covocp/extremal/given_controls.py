@@ -1,0 +1,99 @@
+"""The extremal of given controls: one run along them, what it costs, and what it misses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.extremal.extremal import Extremal, Outcome
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import resolve_mesh, starts
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.shooting import single_shooting
+from covocp.transcription.trajectory import Multipliers, Trajectory
+
+# Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions absolute.
+MISS = 1e-6
+# By how much Ipopt may pass a bound of a variable of the order of 1: a nominal of its is no miss.
+RELAXED = 1e-8
+
+
+def evaluation_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
+    """One segment over the whole time, with the matrices propagated along it."""
+    mesh = resolve_mesh(statement, options, parameters)
+    return replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
+
+
+def evaluate_controls(
+    statement: Statement, mesh: Mesh, u: Array, duration: float, parameters: Array, start: Array | None = None
+) -> Outcome:
+    """The outcome of given controls: states and matrices from the start, costs, what is missed.
+
+    Args:
+        statement: the problem.
+        mesh: of one segment.
+        u: control values, (N + 1 or N, nu).
+        duration: T [s].
+        parameters: of the statement.
+        start: state at the start; None: the statement's, free entries guessed.
+    """
+    x0, e0 = starts(statement, mesh, parameters)
+    x0 = x0 if start is None else start
+    symbols = [
+        ca.MX.sym("u", statement.nu, mesh.control_nodes),
+        ca.MX.sym("x0", statement.nx),
+        ca.MX.sym("e0", statement.ne),
+        ca.MX.sym("T"),
+        ca.MX.sym("p", statement.np),
+    ]
+    x, e, cost = single_shooting(statement, mesh, symbols[0], tuple(symbols[1:]))
+    outputs = ca.Function("along", symbols, [x, e, ca.sum2(cost)])(u.T, x0, e0, duration, parameters)
+    at_nodes, halves, running = (np.asarray(value.full()) for value in outputs)
+    trajectory = Trajectory(x=at_nodes.T, u=u, e=halves.T, duration=duration)
+    terminal = float(statement.terminal(trajectory.x[-1], trajectory.e[-1], duration, parameters))
+    extremal = Extremal(
+        statement=statement,
+        mesh=mesh,
+        trajectory=trajectory,
+        parameters=parameters,
+        multipliers=Multipliers.zero(statement, mesh),
+    )
+    finite = bool(np.isfinite(at_nodes).all() and np.isfinite(halves).all() and np.isfinite(running).all())
+    return Outcome(
+        extremal=extremal,
+        cost_terms={"terminal": terminal, "running": float(running.item())},
+        converged=finite,
+        message="evaluated along a given nominal" if finite else "the model becomes NaN or inf along this nominal",
+        violations=missed(extremal) if finite else {},
+        stats={},
+    )
+
+
+def missed(extremal: Extremal) -> dict[str, float]:
+    """Prescribed final values, bounds, terminal and path inequalities that the nominal does not meet, by name."""
+    st, t = extremal.statement, extremal.trajectory
+    result = {}
+    target = st.boundary_values(extremal.parameters)[1]
+    scale = np.maximum(np.abs(t.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(target)))
+    for name, value, goal, size in zip(st.state_names, t.x[-1], target, scale, strict=True):
+        if abs(value - goal) > MISS * size:  # NaN where it is free
+            result[f"final value of {name}"] = float(abs(value - goal))
+    for names, rows, (lower, upper) in (
+        (st.state_names, t.x, st.state_bounds),
+        (st.control_names, t.u, st.control_bounds),
+    ):
+        excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=0.0)
+        allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED
+        result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
+    columns = [np.asarray(c) for c in extremal.columns()]
+    for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(-1, None))):
+        if not conditions.size:
+            continue
+        chosen = [c[:, at] for c in columns]
+        rows = np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
+        excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)
+        result |= {n: float(v) for n, v in zip(conditions.names, excess, strict=True) if v > MISS}
+    return result

@@ -1,0 +1,125 @@
+"""The Lagrangian of a discretised problem with every node of the nominal a variable, and its second derivatives.
+
+Each interval is a shooting segment, so nothing passes through the whole horizon but the matrices, which are propagated
+along the nodes (where they drive the nominal they are variables like it).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.extremal.active_constraints import Entries
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.hamiltonian import Costates
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.shooting import common_columns, matrices_along
+from covocp.transcription.steps import KEPT, full_interval, nominal_interval
+
+
+def node_size(statement: Statement) -> int:
+    """Entries of a node: the states, and the half-vectors where these drive them."""
+    return statement.nx + (statement.ne if statement.coupled else 0)
+
+
+def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
+    """The arguments of `second_order`: nodes and controls stacked, half-vectors at 0, T, parameters, multipliers."""
+    st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
+    z, costate = t.x, costates.state
+    if st.coupled:
+        z, costate = np.hstack([z, t.e]), np.hstack([costate, costates.matrices])
+    final_matrices = m.final_matrices.copy()
+    final_matrices[st.entries(st.behind)] = 0.0  # they start there: nothing holds them
+    return (
+        *(np.concatenate([z.ravel(), t.u.ravel()]), t.e[0], t.duration, extremal.parameters, costate.T),
+        *(m.final, final_matrices, m.start, m.end, m.path.T, m.states.T, m.matrices.T),
+    )
+
+
+@lru_cache(maxsize=4)
+def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Function, ca.Function]:
+    """The Hessian of the Lagrangian times a direction, and the Jacobian of what is held.
+
+    Returns:
+        (*arguments, direction) -> the product; (*arguments) -> Jacobian of the rows held. Directions and columns: the
+        nodes one after the other, then the controls.
+    """
+    st, n = statement, mesh.intervals
+    size = node_size(st)
+    split = size * (n + 1)
+    w = ca.MX.sym("w", split + st.nu * mesh.control_nodes)
+    z, u = ca.reshape(w[:split], size, n + 1), ca.reshape(w[split:], st.nu, mesh.control_nodes)
+    lengths = {"e0": st.ne, "T": 1, "p": st.np}
+    e0, duration, p = (ca.MX.sym(name, length) for name, length in lengths.items())
+    costate = ca.MX.sym("costate", size, n + 1)
+    lengths = {"final": st.nx, "final_e": st.ne, "start": st.start.size, "end": st.end.size}
+    final, final_e, start, end = (ca.MX.sym(name, length) for name, length in lengths.items())
+    lengths = {"path": st.path.size, "states": st.nx, "matrices": st.ne}
+    path, states, matrices = (ca.MX.sym(name, length, n + 1) for name, length in lengths.items())
+    common = common_columns(mesh, u, duration, p)
+    x = z[: st.nx, :]
+    if st.coupled:
+        ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
+        e = z[st.nx :, :]
+    else:
+        ends, fine, cost = nominal_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
+        e = ca.MX(0, n + 1)
+        if st.matrices:
+            e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, e0)
+            cost += matrix_cost
+    value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])
+    value += ca.dot(final, x[:, -1]) + ca.dot(final_e, e[:, -1]) + ca.dot(states, x) + ca.dot(matrices, e)
+    rows = {"final": x[:, -1], "final_matrices": e[:, -1], "states": x, "matrices": e}
+    at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1])
+    time = duration * ca.DM(mesh.nodes).T
+    for kind, conditions, weights, at in (
+        ("path", st.path, path, list(range(n + 1))),
+        ("start", st.start, start, [0]),
+        ("end", st.end, end, [n]),
+    ):
+        if conditions.size:
+            places = (x[:, at], at_nodes[:, at], e[:, at], time[:, at])
+            rows[kind] = conditions.columns(places, duration, p)
+            value += ca.dot(weights, rows[kind])
+    kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
+    inputs = [w, e0, duration, p, costate, final, final_e, start, end, path, states, matrices]
+    direction = ca.MX.sym("direction", w.shape[0])
+    product = ca.densify(ca.jtimes(ca.gradient(value, w), w, direction))
+    jacobian = ca.jacobian(ca.vertcat(ca.MX(0, 1), *kept), w)
+    return ca.Function("product", [*inputs, direction], [product]), ca.Function("held", inputs, [jacobian])
+
+
+@lru_cache(maxsize=KEPT)
+def _interval_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
+    """(nodes, controls, T, parameters) -> slopes of the ends of the intervals, (n, N n), (n, N nu), (n, N nu)."""
+    st = statement
+    step = full_interval(st, mesh.substeps, mesh.step) if st.coupled else nominal_interval(st, mesh.substeps, mesh.step)
+    symbols = step.mx_in()
+    end = step(*symbols)[0]
+    slopes = [ca.densify(ca.jacobian(end, symbols[i])) for i in range(3)]
+    return ca.Function("slopes", symbols, slopes).map(mesh.intervals)
+
+
+def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
+    """Slopes of the node after each interval by the node before it and by the controls at its two ends.
+
+    Returns:
+        (N, n, n), (N, n, nu), (N, n, nu); of constant controls the last two are shares of the same control.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    z = t.x if not st.coupled else np.hstack([t.x, t.e])
+    common = common_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
+    values = _interval_slopes(st, mesh)(z[:-1].T, *common)
+    n, count = z.shape[1], mesh.intervals
+
+    def each(value: Any) -> Array:
+        numbers = np.asarray(value.full())
+        return numbers.reshape(n, count, -1).transpose(1, 0, 2)
+
+    A, first, last = (each(v) for v in values)
+    return A, first, last

@@ -1,0 +1,172 @@
+"""What the mesh costs: the change of the cost by halving the integration steps."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.hamiltonian import discrete_costates
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import magnitudes
+from covocp.transcription.halved_steps import Refined, refined_end, refined_run
+from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.trajectory import Trajectory
+
+# Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
+COARSE_MESH = 2e-4
+# Costs below this count as zero: a tracking cost whose optimum is zero is known to roundoff only, and no share of it.
+NO_COST = 1e-12
+# Relative change from which on halving the steps does not tell how far they are off: they are divided in more parts.
+FAR, MANY_PARTS = 0.05, 16
+# Roundoff of a step, relative: an unstable nominal that makes more of it than the change it suffers tells nothing.
+STEP_ROUNDOFF = 1e-13
+# Change of what is at a node by halving the steps, relative to its range, that is told.
+LONG_STEPS = 1e-2
+# Largest such change that default steps leave along a nominal, and where the nominal is optimised: shorter steps would
+# make that two to four times slower (chains of masses), and the cost has fewer digits than the nodes.
+ALONG, OPTIMISED = 1e-4, 2e-3
+# Order of the steps, by how much they are divided at a time at most, and how many there may be in an interval.
+ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
+# Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
+LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
+
+
+def mesh_error(extremal: Extremal, running: float) -> float:
+    """Relative change of the cost by halving the integration steps, to first order.
+
+    Where rates depend on the time explicitly, they may jump: then that of the states over a segment, where it is more.
+
+    Each shooting segment is run again from its start. The jumps at the ends of the segments count with the multipliers
+    of the continuity, which are the costates there: this is the change of the optimal cost. Along the controls
+    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more.
+
+    Args:
+        extremal: trajectory and multipliers.
+        running: its running cost.
+
+    Returns:
+        |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
+    """
+    st, t = extremal.statement, extremal.trajectory
+    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    change, missed, moved = _change(extremal, running, 2)
+    if abs(change) > FAR * abs(cost):
+        with np.errstate(over="ignore", invalid="ignore"):
+            further = _change(extremal, running, MANY_PARTS)
+        change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
+    error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
+    return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
+
+
+def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, float, float]:
+    """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    finer = refined_run(st, mesh, t, extremal.parameters, parts) if parts > 2 else _halved(extremal)
+    jumps = finer.jumps
+    weights = extremal.multipliers.gaps
+    if weights.shape != jumps.shape:  # a method without segments
+        costates, _, _ = discrete_costates(extremal)
+        weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
+    change = float(np.sum(weights * jumps)) + finer.running - running
+    change += _at_the_end(extremal, finer.matrices[-1]) - _at_the_end(extremal, t.e[-1])
+    return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
+
+
+def _halved(extremal: Extremal) -> Refined:
+    """The run with steps of half the length."""
+    return _halved_run(extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()))
+
+
+@lru_cache(maxsize=2)
+def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
+    return refined_run(statement, mesh, trajectory, np.array(parameters))
+
+
+def node_error(extremal: Extremal) -> float:
+    """Largest change of a state or of an entry of a matrix at a node by halving the steps, relative to its range.
+
+    What is a variable where a segment starts changes inside the segments and by the jumps at their ends, summed up.
+
+    Args:
+        extremal: the trajectory.
+
+    Returns:
+        The largest of them; nan where the run is not finite.
+    """
+    t, finer = extremal.trajectory, _halved(extremal)
+    scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
+    magnitude = np.concatenate([scales.x, scales.e])
+    least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
+    size = np.maximum(np.ptp(values, axis=0), least)
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved, inside = np.cumsum(finer.jumps, axis=0), np.hstack([finer.states, finer.matrices]) - values
+        total = np.abs(inside).max(axis=0)
+        total[: moved.shape[1]] += np.abs(moved).max(axis=0)
+        return float((total / size).max(initial=0.0))
+
+
+def finer_steps(extremal: Extremal, options: Options, allowed: float = ALONG) -> Options | None:
+    """The options with so many integration steps that halving them moves little at the nodes.
+
+    Args:
+        extremal: a solution on the mesh of the options.
+        options: those of this mesh.
+        allowed: largest change, relative to the range of each entry.
+
+    Returns:
+        None where the steps are short enough, or cannot be shorter.
+    """
+    mesh = extremal.mesh
+    error = node_error(extremal)
+    if not allowed < error < np.inf:  # where halving them diverges nothing can be said
+        return None
+    order = 2 if mesh.step == "strang" else ORDER
+    factor = int(np.clip(np.ceil((error / allowed) ** (1 / order)), 2, MOST_TIMES))
+    substeps = min(factor, MOST_SUBSTEPS // mesh.substeps) * mesh.substeps
+    if substeps <= mesh.substeps:
+        return None
+    return with_substeps(options, mesh, substeps)
+
+
+def _moved(jumps: Array, x: Array) -> float:
+    """Largest change of a state over a segment, relative to its range; where nothing moves, to its size.
+
+    A rate that jumps inside an interval, which steps cannot see, need not change the cost.
+    """
+    size = np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), np.abs(x).max(axis=0))
+    return float((np.abs(jumps).max(axis=0) / np.where(size > 0, size, 1.0)).max(initial=0.0))
+
+
+def _missed(extremal: Extremal, jumps: Array, parts: int) -> float:
+    """Multipliers of the final values times what one run along the controls misses of them.
+
+    Zero where the nominal is so unstable that roundoff alone would miss as much.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    multipliers = extremal.multipliers.final
+    if st.coupled or not multipliers.any():
+        return 0.0
+    if len(mesh.segments) == 1:
+        return float(multipliers @ jumps[-1, : st.nx])
+    drift = refined_end(st, mesh, t, extremal.parameters, parts) - t.x[-1]
+    scale = np.abs(t.x).max(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    suffered = float((np.abs(jumps[:, : st.nx]) / scale).max())
+    amplified = float((np.abs(drift) / scale).max())
+    if not np.isfinite(drift).all() or amplified * STEP_ROUNDOFF > COARSE_MESH * suffered:
+        return 0.0
+    return float(multipliers @ drift)
+
+
+def _at_the_end(extremal: Extremal, matrices: Array) -> float:
+    """Terminal cost and conditions, with their multipliers, for other half-vectors at the end."""
+    st, t, multipliers = extremal.statement, extremal.trajectory, extremal.multipliers
+    value = float(st.terminal(t.x[-1], matrices, t.duration, extremal.parameters))
+    value += float(multipliers.final_matrices @ matrices)
+    if st.end.size:
+        arguments = (t.x[-1], extremal.controls[-1], matrices, t.duration, t.duration, extremal.parameters)
+        value += float(multipliers.end @ np.asarray(st.end.function(*arguments).full()).ravel())
+    return value

@@ -1,0 +1,51 @@
+"""What is evaluated along a trajectory when a method is done: rates at the nodes, the gain of the filter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from covocp.base.matrices import Array, unpack
+from covocp.extremal.extremal import Extremal
+from covocp.transcription.rosenbrock import one_sided
+
+
+def rates_along(extremal: Extremal) -> tuple[Array, Array]:
+    """Rates of x and e stacked at the starts of the intervals and the end, and at the ends of the intervals.
+
+    Each with the control of its interval and the limit of the time from inside it.
+    """
+    function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
+
+    def stacked(u: Any, time: Array) -> Array:
+        state, matrices, _ = function(x, u, e, time[None, :], *rest)
+        return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
+
+    x, u, e, _, *rest = extremal.columns()
+    t = extremal.time
+    h = np.diff(t)
+    rates = stacked(u, np.append(t[:-1] + one_sided(0.0) * h, t[-1] - one_sided(0.0) * h[-1]))
+    if extremal.mesh.control == "linear" and extremal.statement.autonomous:
+        return rates, rates[1:].copy()
+    before = u if extremal.mesh.control == "linear" else np.hstack([np.asarray(u)[:, :1], np.asarray(u)[:, :-1]])
+    return rates, stacked(before, np.append(t[0], t[1:] - one_sided(0.0) * h))[1:]
+
+
+def filter_gain(extremal: Extremal) -> Array | None:
+    """Kalman gain K = E M' U^-1 at the nodes [Schmidt 2.5-3]."""
+    st = extremal.statement
+    block = next((b for b in st.matrices if b.estimation), None)
+    if block is None or st.measurement is None:
+        return None
+    x, u, _, t, duration, p = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    _, jacobian, density = st.measurement.map(count)(x, u, t, duration, p)
+    size, m = block.size, density.shape[0]
+    M = np.asarray(jacobian.full()).reshape(m, count, size).transpose(1, 0, 2)
+    U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
+    E = unpack(extremal.trajectory.e[:, block.span], size)
+    try:
+        return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
+    except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
+        return None

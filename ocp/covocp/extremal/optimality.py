@@ -1,0 +1,370 @@
+"""Residuals of the necessary conditions, gathered in one record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.matrices import Array
+from covocp.base.residuals import complementary
+from covocp.extremal.closed_loop import ClosedLoop
+from covocp.extremal.curvature import smallest_curvature
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
+from covocp.extremal.hamiltonian import (
+    Costates,
+    along,
+    discrete_costates,
+    duration_slope,
+    hamiltonian,
+    integrated_costates,
+    passage_end,
+)
+from covocp.extremal.mesh_error import node_error
+from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.transcription.first_guess import state_jacobian
+from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
+from covocp.transcription.steering import quadrature_weights
+
+# A multiplier of a control bound above this share of the largest slope counts the bound as active.
+ACTIVE = 1e-5
+# Costs below this count as zero.
+NO_COST = 1e-12
+# Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
+QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimality:
+    """How well a solution meets the necessary conditions; None where one does not apply.
+
+    Attributes:
+        stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
+            neighbourhood of a node), bounds' multipliers included; relative to the largest sum of the
+            absolute terms of H_u (or |H_uu| |u|, where more).
+        complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
+            cost: a multiplier of a bound that is not active makes a slope look like none.
+        control_slope: root mean square of H_u at the nodes with free controls; of the order of the square of the
+            interval for piecewise-linear controls; same normalisation.
+        costate_difference: largest difference between the costates of the multipliers and those integrated backward,
+            relative to the largest costate of each kind.
+        hamiltonian_variation: (largest - smallest H) / (largest sum of the absolute terms of H); None where the problem
+            depends on time explicitly.
+        transversality: k_T + H(T) with all multipliers, relative to the largest terms of H; None for a fixed duration.
+        mesh_error: relative change of the cost by halving the integration steps.
+        node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
+            relative to its range.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
+        smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
+        curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
+            to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
+            had. Negative: the solution is a saddle.
+        cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
+            cost (E-1) from the covariances of the loop; None without a closed loop.
+        cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
+            without a closed loop.
+        conservation: largest relative error of the variances E + Xhat that no control changes, such as those of unknown
+            constants; None where there are none.
+    """
+
+    stationarity: float | None
+    control_slope: float | None
+    costate_difference: float | None
+    hamiltonian_variation: float | None
+    transversality: float | None
+    mesh_error: float
+    node_error: float
+    control_error: float | None
+    smallest_eigenvalue: float
+    curvature: float | None
+    complementarity: float | None = None
+    cost_identity: float | None = None
+    cross_covariance: float | None = None
+    conservation: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The values by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __str__(self) -> str:
+        """One line a residual."""
+        return "\n".join(
+            f"{name.replace('_', ' '):24s}{'-' if value is None else format(value, '.3g')}"
+            for name, value in self.as_dict().items()
+        )
+
+
+def assess(
+    extremal: Extremal,
+    costates: Costates,
+    mesh_error: float,
+    smallest_eigenvalue: float,
+    loop: ClosedLoop | None = None,
+    cost_identity: float | None = None,
+) -> Optimality:
+    """Evaluate all necessary conditions along an extremal.
+
+    Args:
+        extremal: the solution.
+        costates: of its multipliers.
+        mesh_error: estimated before.
+        smallest_eigenvalue: of its covariances.
+        loop: its closed loop.
+        cost_identity: difference of its cost and of that from the covariances of the loop.
+
+    Returns:
+        The record.
+    """
+    st = extremal.statement
+    slope, curvature, values, size = _along(extremal, costates)
+    _, slopes, _ = discrete_costates(extremal)
+    scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
+    weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
+    residual = (
+        (slopes + _path_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
+    )
+    free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
+    control_slope, control_error = 0.0, 0.0
+    if st.nu and free is not None:
+        free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
+        if not st.path.size:
+            control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
+            control_error = _control_error(extremal, costates, free[:-1] & free[1:])
+    return Optimality(
+        stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
+        control_slope=control_slope / scale,
+        costate_difference=_costate_difference(extremal, costates),
+        hamiltonian_variation=_variation(values) if st.autonomous else None,
+        transversality=_transversality(extremal, costates, values) if st.duration.free else None,
+        mesh_error=mesh_error,
+        node_error=node_error(extremal),
+        control_error=control_error,
+        smallest_eigenvalue=smallest_eigenvalue,
+        curvature=_curvature(extremal),
+        complementarity=complementarity(extremal),
+        cost_identity=cost_identity,
+        **_loop_identities(loop),
+    )
+
+
+def complementarity(extremal: Extremal) -> float:
+    """Sum of |multiplier| times distance from the bound, of controls, states, matrices and conditions, by the cost."""
+    extremal = refined(extremal)  # limits act at all its nodes
+    st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
+    columns = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    groups: list[tuple[Array, Array, Array, Array]] = [
+        (m.controls, t.u, *st.control_bounds),
+        (m.states, t.x, *st.state_bounds),
+        (m.matrices, t.e, st.matrix_lower, np.full(st.ne, np.inf)),
+    ]
+    for conditions, weights, at in ((st.path, m.path, slice(None)), (st.start, m.start, 0), (st.end, m.end, count - 1)):
+        if conditions.size:
+            rows = np.asarray(conditions.function.map(count)(*columns).full()).T
+            groups.append((weights, rows[at], conditions.lower, conditions.upper))
+    total = 0.0
+    for weights, values, lower, upper in groups:
+        kept, distance = complementary(weights, values, lower, upper)
+        total += float(np.sum(np.abs(kept) * distance))
+    return total / max(_absolute_cost(extremal), NO_COST)
+
+
+def identities(
+    extremal: Extremal,
+    mesh_error: float,
+    smallest_eigenvalue: float,
+    loop: ClosedLoop | None,
+    cost_identity: float | None,
+) -> Optimality:
+    """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
+    return Optimality(
+        stationarity=None,
+        control_slope=None,
+        costate_difference=None,
+        hamiltonian_variation=None,
+        transversality=None,
+        mesh_error=mesh_error,
+        node_error=node_error(extremal),
+        control_error=None,
+        smallest_eigenvalue=smallest_eigenvalue,
+        curvature=None,
+        cost_identity=cost_identity,
+        **_loop_identities(loop),
+    )
+
+
+def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
+    """What must hold along every nominal: it checks the integration, not the optimum [spec of chapter 6, 2.1]."""
+    if loop is None:
+        return {}
+    tiny = np.finfo(float).tiny
+    errors, estimates = (np.sqrt(np.diagonal(v, axis1=1, axis2=2).clip(0.0)) for v in (loop.E, loop.X))
+    size = errors[:, :, None] * estimates[:, None, :]
+    cross = np.abs(loop.Z) / np.where(size > tiny, size, np.inf)
+    return {
+        "cross_covariance": float(cross.max(initial=0.0)),
+        "conservation": loop.conservation,
+    }
+
+
+def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array, Array]:
+    """At the nodes H_u (K, nu), H_uu (K, nu, nu), [H, sum of its absolute terms] (K, 2), sizes of H_u (K, nu)."""
+    st = extremal.statement
+    make = hamiltonian(st)
+
+    def select(h: Any, x: Any, u: Any, e: Any, t: Any) -> list[Any]:
+        return [h, ca.gradient(h, u), ca.hessian(h, u)[0] if st.nu else ca.DM(0, 0)]
+
+    function = make("along", select)
+    h, slope, curvature = along(function, extremal, costates)
+    (size,) = along(slope_terms(st), extremal, costates)
+    curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
+    values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
+    terms = np.abs(costates.state * np.asarray(values[0].full()).T).sum(axis=1)
+    terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1)
+    terms = terms + np.abs(np.asarray(values[2].full()).ravel())
+    sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
+    return slope, curvature, np.column_stack([h[:, 0], terms]), sizes
+
+
+def _path_slopes(extremal: Extremal) -> Array:
+    """Slopes by the control values of the path constraints times their multipliers."""
+    st, mesh = extremal.statement, extremal.mesh
+    if mesh.points > 1:
+        return np.asarray(prolongation(mesh).T @ _path_slopes(refined(extremal)))
+    result = np.zeros((mesh.control_nodes, st.nu))
+    if not st.path.size:
+        return result
+    symbolic: Any = st.symbolic
+    symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate((st.nx, st.nu, st.ne, 1, 1, st.np))]
+    weights = symbolic.sym("mu", st.path.size)
+    slope = ca.gradient(ca.dot(weights, st.path.function(*symbols)), symbols[1])
+    function = ca.Function("slopes", [*symbols, weights], [ca.densify(slope)])
+    count = mesh.intervals + 1
+    values = np.asarray(function.map(count)(*extremal.columns(), extremal.multipliers.path.T).full()).T
+    result += values[: mesh.control_nodes]
+    if mesh.control == "constant":
+        result[-1] += values[-1]
+    return result
+
+
+def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_]) -> float:
+    """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
+
+    H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
+    (not `free`, of each interval) do not count; nan where H_uu is not positive definite.
+    """
+    points = extremal.mesh.points
+    if points > 1:  # costates jump inside the intervals
+        fine = refined(extremal)
+        return _control_error(fine, discrete_costates(fine)[0], np.repeat(free, points, axis=0))
+    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
+    values = fine_trajectory(extremal, 2 * mesh.substeps)
+    h = np.diff(extremal.time)[:, None]
+    after, rates = np.hstack([costates.state, costates.matrices]), _costate_rates(extremal, costates)
+    middle = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
+    u = extremal.controls
+    ends = u[:-1] if mesh.control == "constant" else u[1:]
+    function = hamiltonian(st)("point", lambda v, x, w, e, t: [ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
+    slopes, curvatures = [], []
+    for j, costate in enumerate((after[:-1], middle, after[1:])):
+        z = values[:, j * mesh.substeps, :]
+        arguments = (
+            z[:, : st.nx].T,
+            (u[:-1] + j / 2 * (ends - u[:-1])).T,
+            z[:, st.nx :].T,
+            extremal.time[None, :-1] + j / 2 * h.T,
+            np.full((1, n), extremal.trajectory.duration),
+            np.tile(extremal.parameters[:, None], (1, n)),
+            costate[:, : st.nx].T,
+            costate[:, st.nx :].T,
+        )
+        slope, curvature = (np.asarray(v.full()) for v in function(*arguments))
+        slopes.append(np.where(free, slope.T, 0.0))
+        curvatures.append(curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2))
+    if (np.linalg.eigvalsh(curvatures)[..., 0] <= 0).any():
+        return float("nan")
+    steps = np.linalg.solve(curvatures[1], np.array(slopes)[..., None])[..., 0]
+    total = np.einsum("jk,jni,kni,n->", QUADRATIC_PRODUCTS, slopes, steps, h[:, 0])
+    return float(0.5 * total / max(_absolute_cost(extremal), np.finfo(float).tiny))
+
+
+def _absolute_cost(extremal: Extremal) -> float:
+    """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
+    st, t = extremal.statement, extremal.trajectory
+    terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    running = np.asarray(st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())[2].full()).ravel()
+    return abs(terminal) + abs(float(np.trapezoid(running, extremal.time)))
+
+
+def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
+    """-H_x and -H_e at the nodes, stacked."""
+    make = hamiltonian(extremal.statement)
+    function = make("rates", lambda h, x, u, e, t: [-ca.gradient(h, x), -ca.gradient(h, e)])
+    return np.hstack(along(function, extremal, costates))
+
+
+def _costate_difference(extremal: Extremal, costates: Costates) -> float | None:
+    """Largest relative difference to the costates that are integrated backward; None where that would take too long."""
+    pairs = _explicit_pairs(extremal)
+    if pairs is None:
+        return None
+    other = integrated_costates(extremal, pairs)
+    largest = 0.0
+    for one, two in ((costates.state, other.state), (costates.matrices, other.matrices)):
+        size = np.abs(one).max(initial=0.0)
+        if size > 0:
+            largest = max(largest, float(np.abs(one - two).max() / size))
+    return largest
+
+
+def _explicit_pairs(extremal: Extremal) -> int | None:
+    """Explicit steps an interval for the adjoint equations; None where a stiff nominal would need too many."""
+    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
+    if mesh.step != "rodas":
+        return max(1, mesh.substeps)
+    slopes = np.asarray(state_jacobian(st).map(n + 1)(*extremal.columns()).full())
+    matrices = slopes.reshape(st.nx, n + 1, st.nx).transpose(1, 0, 2)
+    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=1)
+    needed = float((np.maximum(rates[1:], rates[:-1]) * np.diff(extremal.time)).max()) / STIFFNESS_PER_STEP
+    return int(np.ceil(needed)) if needed <= LARGEST_SUBSTEPS else None
+
+
+def _variation(values: Array) -> float:
+    """Variation of H relative to its terms."""
+    return float(np.ptp(values[:, 0]) / max(float(values[:, 1].max()), np.finfo(float).tiny))
+
+
+def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
+    """k_T + slope of the end conditions + int H_T dt + H(T), relative to the largest terms of H."""
+    if extremal.mesh.points > 1:  # costates jump inside the intervals
+        extremal = refined(extremal)
+        costates = discrete_costates(extremal)[0]
+    st, trajectory = extremal.statement, extremal.trajectory
+    duration = ca.MX.sym("T")
+    value = st.terminal(trajectory.x[-1], trajectory.e[-1], duration, extremal.parameters)
+    if st.end.size:
+        arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
+        value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
+    slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
+    behind = st.entries(st.behind)
+    slope += passage_end(extremal, costates.matrices[-1, behind])[1]
+    (explicit,) = along(duration_slope(st), extremal, costates)
+    slope += float(np.trapezoid(explicit[:, 0], extremal.time))
+    residual = slope + float(values[-1, 0])
+    at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
+    at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
+    if (at_lower and residual > 0) or (at_upper and residual < 0):
+        residual = 0.0  # the bound holds what would go on
+    return abs(residual) / max(float(values[:, 1].max()), abs(slope), float(np.finfo(float).tiny))
+
+
+def _curvature(extremal: Extremal) -> float | None:
+    result = smallest_curvature(extremal)
+    if result is None or result.verdict == "flat":
+        return None if result is None else 0.0
+    return result.value / max(result.largest, np.finfo(float).tiny)

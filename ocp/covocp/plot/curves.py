@@ -1,0 +1,231 @@
+"""What figures are made of: curves and panels as plain numbers, and solutions sampled for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.base.threads import cached
+from covocp.solution.sample import Sample
+from covocp.solution.solution import Solution
+from covocp.statement.names import block_of
+from covocp.statement.statement import Block
+
+# Curves are sampled at the nodes, on coarser meshes at least this often.
+SAMPLES = 200
+# Vectors up to this size get a panel an entry, larger ones share one.
+SEPARATE_ENTRIES = 3
+LONGEST_LABEL = 40
+# The gain of a feedback with constraints is a control, or a constant state, of this name.
+GAIN = "C"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """One curve.
+
+    Args:
+        t: times [s], or whatever else it is drawn over.
+        y: values, the shape of t.
+        deviation: standard deviation, the shape of t; None: no band.
+        order: number of its solution.
+        entry: number of its entry in a panel of several.
+        steps: whether the value holds until the next time.
+        target: value asked for at the end.
+    """
+
+    t: Array
+    y: Array
+    deviation: Array | None = None
+    order: int = 0
+    entry: int = 0
+    steps: bool = False
+    target: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ellipse:
+    """A covariance (2, 2) of abscissa and ordinate about a point (2,) of a path, of the solution of some number."""
+
+    centre: Array
+    covariance: Array
+    order: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+        label: of the ordinate.
+        entries: names of its entries; one: all curves are of the same.
+        curves: what is drawn.
+        bounds: of the quantity.
+        legend: whether the entries are explained in it.
+        key: name of what it shows where that is one entry of one symbol; "" otherwise.
+        path: whether it is one state over another.
+        equal: whether a unit is as long along both axes.
+        ellipses: covariances along a path.
+    """
+
+    label: str
+    entries: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    bounds: tuple[float, ...] = ()
+    legend: bool = True
+    key: str = ""
+    path: bool = False
+    equal: bool = False
+    ellipses: tuple[Ellipse, ...] = ()
+
+
+class Drawn:
+    """A solution sampled for drawing."""
+
+    def __init__(self, solution: Solution, order: int) -> None:
+        """Choose the times."""
+        self.solution, self.order = solution, order
+        self.covariance = next((b for b in solution.blocks if b.estimation and b.covariance), None)
+        nodes, parts = solution.t, -(-SAMPLES // solution.mesh.intervals)
+        if solution.mesh.control == "constant":  # rates jump at the nodes, which a smooth curve would follow
+            parts = 1
+        inner = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
+        regular = np.append(inner.ravel(), nodes[-1])
+        # where something happens between the nodes; what a closed loop shows is known at its nodes
+        knots = solution.dense.knots if solution.loop is None else solution.mesh.nodes
+        self.t = np.union1d(regular, knots[~np.isin(knots, solution.mesh.nodes)] * solution.duration)
+
+    def knows(self, name: str) -> bool:
+        """Whether a name, or the vector of an entry, is in the solution."""
+        return block_of(name, self.solution.blocks) is not None
+
+    @cached
+    def sample(self) -> Sample:
+        """Values between the nodes."""
+        return self.solution.at(self.t)
+
+    def rows(self, name: str) -> list[int]:
+        """Rows of the covariance that belong to a state or an unknown."""
+        if self.covariance is None:
+            return []
+        labels = self.covariance.labels
+        return [i for i, label in enumerate(labels) if name in (label, label.split("[")[0])]
+
+    def deviation(self, block: Block) -> Array | None:
+        """Half the width of a band at the times, (K, size); None where nothing is uncertain.
+
+        Of a state: of the actual system. Of an unknown constant: of the estimate, which alone changes. Of a control:
+        what the feedback adds to it.
+        """
+        loop, rows = self.solution.loop, self.rows(block.name)
+        if self.covariance is None or (loop is None and block.kind == "control"):
+            return None
+        if loop is None:
+            variances = self.sample[self.covariance.name][:, rows, rows]
+        elif block.kind == "control":
+            gain = loop.gain[:, block.span]
+            at_nodes = np.einsum("kui,kij,kuj->ku", gain, loop.Xhat, gain)
+            return self.between(np.sqrt(np.maximum(at_nodes, 0.0)))
+        else:
+            return self.between(np.sqrt(np.maximum((loop.E if block.kind == "unknown" else loop.X)[:, rows, rows], 0)))
+        return np.sqrt(np.maximum(variances, 0.0))
+
+    def between(self, values: Array) -> Array:
+        """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""
+        from scipy.interpolate import PchipInterpolator
+
+        if self.t.size == values.shape[0] or not np.isfinite(values).all():
+            columns = values.reshape(values.shape[0], -1).T
+            flat = np.array([np.interp(self.t, self.solution.t, column) for column in columns]).T
+            return flat.reshape(self.t.size, *values.shape[1:])
+        return np.asarray(PchipInterpolator(self.solution.t, values, axis=0)(self.t))
+
+    def spread(self, key: Any) -> tuple[Array, Array, Array]:
+        """Root mean squares at the times, each (K, size): deviation, its error of the estimate, its estimate.
+
+        The deviation of an expression g(x, b, u) is g_x dx + g_u du, with dx = x' - e and du = -C x'.
+        """
+        loop, by_state, by_control = self.solution.loop, *self._slopes(key)
+        assert self.covariance is not None
+        E = self.solution.values[self.covariance.name] if loop is None else loop.E
+        error = np.einsum("kri,kij,krj->kr", by_state, E, by_state)
+        if loop is None:
+            return self._roots(error, error, np.zeros_like(error))
+        by_estimate = by_state - by_control @ loop.gain
+        estimate = np.einsum("kri,kij,krj->kr", by_estimate, loop.Xhat, by_estimate)
+        total = error + estimate - 2 * np.einsum("kri,kij,krj->kr", by_state, loop.Z, by_estimate)
+        return self._roots(total, error, estimate)
+
+    def _roots(self, *variances: Array) -> tuple[Array, Array, Array]:
+        """Roots of three variances at the nodes, at the times."""
+        total, error, estimate = (self.between(np.sqrt(np.maximum(v, 0.0))) for v in variances)
+        return total, error, estimate
+
+    def _slopes(self, key: Any) -> tuple[Array, Array]:
+        """Slopes of a name or an expression by the augmented state (K, rows, n) and by the control (K, rows, nu)."""
+        solution, augmented = self.solution, self.solution.augmented
+        controls = tuple(b for b in solution.blocks if b.kind == "control" and not (solution.loop and b.name == GAIN))
+        count, width = solution.t.size, sum(b.size for b in controls)
+        if isinstance(key, str):
+            block = solution.block(key)
+            by_state, by_control = np.zeros((block.size, len(augmented))), np.zeros((block.size, width))
+            if block.kind == "control":
+                by_control[:, block.span] = np.eye(block.size)
+            else:
+                by_state[:, self.rows(key)] = np.eye(block.size)
+            return tuple(np.tile(v, (count, 1, 1)) for v in (by_state, by_control))  # type: ignore[return-value]
+        symbols = solution.extremal.statement.symbols  # not known where the solution was read from a file alone
+        states = dict.fromkeys(label.split("[")[0] for label in augmented)
+        results = []
+        for names, size in ((states, len(augmented)), ([b.name for b in controls], width)):
+            slope = ca.densify(ca.horzcat(*(ca.jacobian(key, symbols[name]) for name in names)))
+            results.append(solution[slope].reshape(count, key.shape[0] * key.shape[1], size))
+        return results[0], results[1]
+
+    def target(self, block: Block) -> Array:
+        """What a state should be at the end, NaN where it is free."""
+        if block.kind != "state":
+            return np.full(block.size, np.nan)
+        return self.solution.targets[block.span]
+
+
+def shortened(expression: Any) -> str:
+    """An expression as a label."""
+    text = str(expression)
+    return text if len(text) <= LONGEST_LABEL else text[: LONGEST_LABEL - 3] + "..."
+
+
+def unit_of(name: str, units: Mapping[str, str]) -> str:
+    """The unit of a symbol as it stands on an axis; "" where none is known."""
+    word = _unit(name, units)
+    return f" [{word}]" if word else ""
+
+
+def _unit(name: str, units: Mapping[str, str]) -> str:
+    """The unit of a symbol, or of the vector that it is an entry of; "" where none is known."""
+    return units.get(name) or units.get(name.split("[")[0], "")
+
+
+def product_unit(owners: list[str], units: Mapping[str, str]) -> str:
+    """Unit of a covariance between two symbols."""
+    words = [_unit(owner, units) for owner in owners]
+    if not all(words):
+        return ""
+    words = [_bracketed(word) for word in words]
+    return f" [{words[0]}²]" if words[0] == words[-1] else f" [{words[0]} {words[1]}]"
+
+
+def ratio_unit(above: str, below: str, units: Mapping[str, str]) -> str:
+    """Unit of a gain from one symbol to another."""
+    words = _unit(above, units), _unit(below, units)
+    return f" [{_bracketed(words[0])}/{_bracketed(words[1])}]" if all(words) else ""
+
+
+def _bracketed(word: str) -> str:
+    """A unit that may stand in a product."""
+    return word if word.isalnum() else f"({word})"

@@ -1,0 +1,378 @@
+"""Figures of solutions: states with bands, controls, estimates, covariances, costates; several solutions in one."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from covocp.base.arguments import checked, either, optional, positives, sequence, text, texts_by_name, truth
+from covocp.base.errors import ProblemError, describe, no_option
+from covocp.base.files import check_target, written_whole
+from covocp.plot.curves import Panel
+from covocp.plot.legends import fold_title, place_legend
+from covocp.plot.panels import abscissa_label, choose_panels
+from covocp.plot.paths import outline
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from covocp.solution.solution import Solution
+
+SUFFIXES = (".png", ".pdf", ".svg")
+# Okabe and Ito's palette, distinct for all kinds of colour vision and in grey: blue, vermillion, green, purple, orange,
+# sky blue, black.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1.2)))
+WARNING = "#A8002D"
+BOUND: dict[str, Any] = {"color": "#666666", "linewidth": 0.8, "linestyle": (0, (4, 3))}
+TARGET: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 4.5,
+    "markerfacecolor": "white",
+    "markeredgecolor": "black",
+    "markeredgewidth": 0.9,
+}
+START: dict[str, Any] = {"marker": "s", "markersize": 4.0, "markerfacecolor": "black", "markeredgecolor": "black"}
+ELLIPSE_WIDTH = 0.7
+PATH_MARGIN = 0.05  # of the range, on both sides
+BAND = 0.13  # opacity
+NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
+# Curves that change by less than this share of their size are drawn as constants: what is left is a solver's tolerance.
+CONSTANT = 1e-5
+CONSTANT_RANGE = 0.05  # of the value, on both sides
+PANEL = (3.3, 2.15)  # width, height in inches
+LONGEST_LINE = 26  # characters along the height of a panel
+SINGLE = (4.8, 3.2)  # of a panel alone
+HEAD = 0.6  # inches for title and legend
+RESOLUTION = 200  # dots an inch
+# Backends of matplotlib that show nothing by themselves.
+SILENT = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
+STYLE: Any = {
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.use_mathtext": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#DDDDDD",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "legend.handlelength": 2.6,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+}
+
+
+@checked(
+    "plot()",
+    labels=optional(either(text, sequence)),
+    costates=truth,
+    gains=truth,
+    sigmas=positives,
+    units=optional(texts_by_name),
+    title=optional(text),
+)
+def plot_solutions(
+    solutions: Sequence[Solution],
+    *names: Any,
+    labels: Sequence[str] | None = None,
+    costates: bool = False,
+    gains: bool = False,
+    over: Any = None,
+    sigmas: Sequence[float] = (1.0,),
+    units: Mapping[str, str] | None = None,
+    title: str | None = None,
+    path: str | Path | None = None,
+) -> Figure:
+    """Draw solutions over time, a panel a quantity.
+
+    Args:
+        solutions: one or more, of the same problem or of problems with the same names.
+        names: what to draw: symbols or names of states, controls, unknowns and matrices, or entries of them ("p[0]"),
+            pairs of states and unknowns (entries of the covariance of the actual deviations), other expressions of the
+            problem's symbols; a list of them shares a panel: plot(["x", "y"]). Besides
+            "rms" (root mean squares), "C" and "K" (gains of feedback and filter), "X", "Xhat" and "Z" (covariances of
+            the closed loop); ("rms", h), ("C", h), ("K", h) those of one symbol, or of an expression ("rms"). A dict
+            gives labels: {"load factor [g]": expression}. None: states, controls and unknowns with bands, then
+            covariances and other matrices (of large ones the diagonal), of a closed loop root mean squares instead.
+        labels: of the solutions, for the legend; by default what tells them apart.
+        costates: whether to draw the costates of the states and matrices drawn.
+        gains: whether to add the gains of feedback and filter.
+        over: what is the abscissa: a scalar state, control or expression; None: time. Of one state over another the
+            figure is a path, with ellipses of their covariance in place of bands, and axes of the same scale where the
+            units agree.
+        sigmas: widths of the bands in standard deviations, such as (1, 3); (): none. The bands are those of the actual
+            states, of what the feedback adds to the controls, and of the estimates of the unknowns.
+        units: by name, for the axes, such as {"y": "m"}, where the problem does not say or says something else.
+        title: of the figure; by default the name of the problem. A solution that did not converge is named below it.
+        path: also write the figure there (.png, .pdf or .svg).
+
+    Returns:
+        The figure. It belongs to pyplot (so that it can be shown) only where an interactive backend is active.
+
+    Raises:
+        ProblemError: no solution, a name is unknown, or the labels do not fit.
+        ExportError: the file cannot be written.
+    """
+    import matplotlib
+
+    if path is not None:
+        check_target(path, SUFFIXES)
+    given = list(solutions)
+    legend = _labels(given, labels)
+    known = {block.name: block.unit for solution in given for block in solution.blocks}
+    words = known | dict(units or {})
+    panels = choose_panels(given, names, costates=costates, gains=gains, over=over, units=words)
+    abscissa = "time [s]" if over is None else abscissa_label(given, over, words)
+    rows, columns = _grid(len(panels))
+    with matplotlib.rc_context(STYLE):
+        width, height = SINGLE if len(panels) == 1 else PANEL
+        figure = _figure((width * columns, height * rows + HEAD))
+        axes = figure.subplots(rows, columns, squeeze=False)
+        for place, panel in zip(axes.ravel(), panels, strict=False):
+            _draw(place, panel, len(given), tuple(sigmas))
+        _arrange(figure, axes, len(panels), abscissa)
+        _title(figure, given, legend, title)
+        _legend(figure, given, legend, panels, tuple(sigmas))
+        if path is not None:
+            with written_whole(path, SUFFIXES) as part:
+                figure.savefig(part, dpi=RESOLUTION)
+    return figure
+
+
+def check_plot_options(given: Mapping[str, Any], function: Callable[..., Any] = plot_solutions) -> None:
+    """Options of a figure must be those of the function that draws it.
+
+    Raises:
+        ProblemError: one is not.
+    """
+    parameters = inspect.signature(function).parameters.values()
+    known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    for name, value in given.items():
+        if name not in known:
+            raise no_option("plot()", name, value, known)
+
+
+def _arrange(figure: Figure, axes: Any, count: int, abscissa: str) -> None:
+    """Hide the places without panels, and label the lowest panel of each column."""
+    rows, columns = axes.shape
+    for place in axes.ravel()[count:]:
+        place.set_visible(False)
+    for column in range(columns):
+        last = max(row for row in range(rows) if row * columns + column < count)
+        axes[last, column].set_xlabel(_plain(abscissa))
+    figure.align_ylabels(list(axes.ravel()[:count]))
+
+
+def _labels(solutions: list[Solution], labels: Sequence[str] | None) -> list[str]:
+    """Labels of the solutions: the given ones, else methods or names where they differ, else numbers."""
+    if not solutions:
+        raise ProblemError(
+            describe(
+                "There is nothing to draw.", expected="at least one solution", received="none", remedy="solve first"
+            )
+        )
+    if labels is not None:
+        words = [str(label) for label in labels]
+        if isinstance(labels, str) or len(words) != len(solutions):
+            raise ProblemError(
+                describe(
+                    "The labels do not fit the solutions.",
+                    expected=f"{len(solutions)} labels",
+                    received=repr(labels),
+                    remedy="give one label for each solution",
+                )
+            )
+        return words
+    for candidates in ([s.method for s in solutions], [s.name for s in solutions], [_kind(s) for s in solutions]):
+        if len(set(candidates)) == len(solutions):
+            return candidates
+    return [f"{i + 1}: {s.method}" for i, s in enumerate(solutions)]
+
+
+def _kind(solution: Solution) -> str:
+    """How the nominal came about."""
+    if solution.method == "evaluate":
+        return "evaluated"
+    return "classical" if solution.stats.get("nominal") == "deterministic" else "combined"
+
+
+def _grid(count: int) -> tuple[int, int]:
+    """Rows and columns for a number of panels."""
+    columns = 1 if count == 1 else 2 if count in (2, 4) else 3
+    return -(-count // columns), columns
+
+
+def _figure(size: tuple[float, float]) -> Figure:
+    """An empty figure: pyplot's where it can be shown, else one that no global state knows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is None and hasattr(sys, "ps1"):
+        import matplotlib.pyplot as pyplot
+    if pyplot is not None:
+        backend = pyplot.get_backend().lower()
+        if backend not in SILENT and "inline" not in backend:
+            shown: Figure = pyplot.figure(figsize=size, layout="constrained")
+            return shown
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: str | None) -> None:
+    """Name of the problem, and below it a warning of solutions that did not converge."""
+    names = list(dict.fromkeys(s.name for s in solutions if s.name))
+    text = title if title is not None else names[0] if len(names) == 1 else ""
+    failed = [
+        f"{label}: {s.status}" if len(solutions) > 1 else s.status
+        for s, label in zip(solutions, labels, strict=True)
+        if not s.converged
+    ]
+    if lines := [_plain(line) for line in (text, *failed) if line]:
+        figure.suptitle(fold_title(figure, lines), fontsize=10, color=WARNING if failed else "black")
+
+
+def _legend(
+    figure: Figure, solutions: list[Solution], labels: list[str], panels: list[Panel], sigmas: tuple[float, ...]
+) -> None:
+    """Which solution is which, and what bands, circles and thin dashes mean."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = []
+    if len(solutions) > 1:
+        handles += [
+            Line2D([], [], label=_plain(label if s.converged else f"{label} (not converged)"), **_line(i))
+            for i, (s, label) in enumerate(zip(solutions, labels, strict=True))
+        ]
+    curves = [curve for panel in panels for curve in panel.curves]
+    if sigmas and any(curve.deviation is not None for curve in curves):
+        widths = " and ".join(f"{width:g}" for width in sigmas)
+        plural = "s" if sigmas[-1] != 1 else ""
+        handles.append(
+            Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths} standard deviation{plural}")
+        )
+    if sigmas and any(panel.ellipses for panel in panels):
+        widths = " and ".join(f"{width:g}" for width in sigmas)
+        plural = "s" if sigmas[-1] != 1 else ""
+        label = f"ellipses of {widths} standard deviation{plural}"
+        handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=label))
+    if any(panel.path for panel in panels):
+        handles.append(Line2D([], [], linestyle="none", label="start", **START))
+    if any(curve.target is not None for curve in curves):
+        handles.append(Line2D([], [], linestyle="none", label="required at the end", **TARGET))
+    if any(_near_bounds(panel) for panel in panels):
+        handles.append(Line2D([], [], label="bound", **BOUND))
+    place_legend(figure, handles)
+
+
+def _line(i: int) -> dict[str, Any]:
+    """Colour, dashes and width of the i-th line; later ones are thinner, so that equal curves all show."""
+    return {
+        "color": COLOURS[i % len(COLOURS)],
+        "linestyle": DASHES[i % len(DASHES)],
+        "linewidth": 2.0 if i == 0 else 1.4,
+    }
+
+
+def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> None:
+    """One panel: bands, lines, targets, bounds, legend of its entries.
+
+    One solution: the entries differ by colour. Several: the solutions differ by colour, the entries by dashes.
+    """
+    grouped = len(panel.entries) > 1
+    for curve in panel.curves:
+        line = _line(curve.order if count > 1 else curve.entry)
+        style: Any = "steps-post" if curve.steps else "default"
+        if count > 1 and grouped:
+            line["linestyle"] = DASHES[curve.entry % len(DASHES)]
+        for width in sorted(sigmas, reverse=True):
+            if curve.deviation is None:
+                break
+            low, high = curve.y - width * curve.deviation, curve.y + width * curve.deviation
+            step: Any = "post" if curve.steps else None
+            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0, step=step)
+            for edge in (low, high):
+                axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7, drawstyle=style)
+        axes.plot(curve.t, curve.y, drawstyle=style, **line)
+    for ellipse in panel.ellipses:
+        for width in sigmas:
+            x, y = ellipse.centre[:, None] + outline(ellipse.covariance, width)
+            axes.plot(x, y, color=_line(ellipse.order)["color"], linewidth=ELLIPSE_WIDTH, alpha=0.8)
+    _targets(axes, panel)
+    for bound in _near_bounds(panel):
+        axes.axhline(bound, zorder=1, **BOUND)
+    axes.set_ylabel(_plain(_folded(panel.label)))
+    axes.margins(x=PATH_MARGIN if panel.path else 0)
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    low, high = axes.dataLim.intervaly
+    size = max(abs(low), abs(high))
+    if 0 < high - low < CONSTANT * size:
+        axes.set_ylim(low - CONSTANT_RANGE * size, high + CONSTANT_RANGE * size)
+    if grouped and panel.legend:
+        _entry_legend(axes, panel, count)
+
+
+def _targets(axes: Axes, panel: Panel) -> None:
+    """Circles where states must arrive, and squares where paths start."""
+    for curve in panel.curves:
+        if panel.path:
+            axes.plot(curve.t[:1], curve.y[:1], linestyle="none", zorder=5, **START)
+        if curve.target is not None:
+            axes.plot([curve.t[-1]], [curve.target], linestyle="none", clip_on=False, zorder=5, **TARGET)
+
+
+def _near_bounds(panel: Panel) -> list[float]:
+    """The bounds that the curves come near."""
+    finite = np.concatenate([np.zeros(0), *(curve.y[np.isfinite(curve.y)] for curve in panel.curves)])
+    if not finite.size:
+        return []
+    low, high = float(finite.min()), float(finite.max())
+    margin = NEAR * (high - low)
+    return [bound for bound in panel.bounds if low - margin <= bound <= high + margin]
+
+
+def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
+    """Which entry is which, within the panel."""
+    from matplotlib.lines import Line2D
+
+    styles = [
+        _line(k) if count == 1 else {"color": "#555555", "linestyle": _line(k)["linestyle"]} for k in _used(panel)
+    ]
+    handles = [
+        Line2D([], [], label=_plain(panel.entries[k]), **style) for k, style in zip(_used(panel), styles, strict=True)
+    ]
+    axes.legend(handles=handles, ncols=1 if len(handles) < 4 else 2, fontsize=7, handlelength=2.0, labelspacing=0.3)
+
+
+def _used(panel: Panel) -> list[int]:
+    """Numbers of the entries that are drawn."""
+    return sorted({curve.entry for curve in panel.curves})
+
+
+def _folded(label: str) -> str:
+    """A label whose unit stands on a line of its own where the axis is too short for both."""
+    name, bracket, unit = label.rpartition(" [")
+    return label if len(label) <= LONGEST_LINE or not name else f"{name}\n{bracket.strip()}{unit}"
+
+
+def _plain(text: str) -> str:
+    """Text in which a dollar sign is a dollar sign."""
+    return text.replace("$", r"\$")

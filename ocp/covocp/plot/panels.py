@@ -1,0 +1,423 @@
+"""What a figure of solutions shows: panels of curves as plain numbers, before anything is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array, half_indices
+from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
+from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
+from covocp.plot.paths import over_panels
+from covocp.solution.solution import Solution
+from covocp.statement.names import block_of, name_of, sizes_of
+from covocp.statement.statement import Block, Statement, entry_names
+
+# Matrices up to this size are shown whole, larger ones by their diagonal.
+WHOLE_MATRIX = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """What a panel shows that is no symbol: a word of `loop_panels`, and of which symbol or expression."""
+
+    word: str
+    of: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """Keys that share a panel."""
+
+    keys: tuple[Any, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Labelled:
+    """A key with a label of its own."""
+
+    label: str
+    key: Any
+
+
+def choose_panels(
+    solutions: list[Solution],
+    names: tuple[Any, ...],
+    *,
+    costates: bool,
+    gains: bool = False,
+    over: Any = None,
+    units: Mapping[str, str],
+) -> list[Panel]:
+    """The panels of a figure; see `covocp.plot.figure.plot_solutions`.
+
+    Raises:
+        ProblemError: a name is in none of the solutions.
+    """
+    drawn = [Drawn(solution, i) for i, solution in enumerate(solutions)]
+    blocks: dict[str, Block] = {}
+    for solution in solutions:
+        for block in solution.blocks:
+            blocks.setdefault(block.name, block)
+    keys = [key for name in names for key in _keys(solutions, name)] or _usual(drawn, blocks)
+    if gains:
+        keys += [Quantity(word=w) for w in (GAIN, FILTER) if any(knows(solution, w) for solution in solutions)]
+    panels: list[Panel] = []
+    for key in keys:
+        panels += _of_key(drawn, key, blocks, units)
+    for key in keys if costates else ():
+        if isinstance(key, str) and (block := _block(key, blocks)).kind in ("state", "matrix"):
+            panels += _costates(drawn, block)
+    panels = _explained_once(panels)
+    return panels if over is None else over_panels(drawn, panels, _resolved(solutions, over), units)
+
+
+def _explained_once(panels: list[Panel]) -> list[Panel]:
+    """Where several panels have the same entries the first one explains them."""
+    return [replace(p, legend=all(p.entries != other.entries for other in panels[:i])) for i, p in enumerate(panels)]
+
+
+def _usual(drawn: list[Drawn], blocks: Mapping[str, Block]) -> list[Any]:
+    """What is drawn where nothing is asked for.
+
+    Of closed loops root mean squares stand in place of the covariances that they come from.
+    """
+    kinds = ("state", "control", "unknown", "matrix")
+    ordered = [b for kind in kinds for b in blocks.values() if b.kind == kind]
+    if all(d.solution.loop is None for d in drawn):
+        return [b.name for b in ordered]
+    plain = [b for b in ordered if b.name not in (GAIN, *COVARIANCES) and not (b.estimation or b.backward)]
+    uncertain = [b.name for b in plain if b.kind == "state" and any(_varies(d, b) for d in drawn)]
+    return [*(b.name for b in plain), *(Quantity(word=RMS, of=name) for name in uncertain)]
+
+
+def _varies(drawn: Drawn, block: Block) -> bool:
+    """Whether a state is uncertain."""
+    deviation = drawn.deviation(block) if drawn.knows(block.name) else None
+    return deviation is not None and bool(np.any(deviation))
+
+
+def _keys(solutions: list[Solution], name: Any) -> list[Any]:
+    """What a name given by the user stands for; a dict gives its entries labels.
+
+    Raises:
+        ProblemError: no solution knows it.
+    """
+    if isinstance(name, Mapping):
+        return [Labelled(label=str(label), key=_resolved(solutions, key)) for label, key in name.items()]
+    return [_resolved(solutions, name)]
+
+
+def _of_key(drawn: list[Drawn], key: Any, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
+    """Panels of one quantity."""
+    if isinstance(key, Labelled):
+        panels = _of_key(drawn, key.key, blocks, units)
+        if len(panels) == 1:
+            return [replace(panels[0], label=key.label)]
+        return [replace(panel, label=f"{key.label}: {panel.label}") for panel in panels]
+    if isinstance(key, Together):
+        return [_shared([panel for part in key.keys for panel in _of_key(drawn, part, blocks, units)])]
+    if isinstance(key, Quantity):
+        return _quantity([d for d in drawn if knows(d.solution, key.word)], key, blocks, units)
+    if isinstance(key, tuple):
+        return _pair(drawn, key, units)
+    if not isinstance(key, str):
+        return _expression(drawn, key)
+    block = _block(key, blocks)
+    if block.kind == "matrix":
+        return _matrix([(d, d.t, d.sample[key]) for d in drawn if d.knows(key)], block, units)
+    return _vector(drawn, block, units)
+
+
+def _shared(panels: list[Panel]) -> Panel:
+    """Several panels as one whose entries they are; the unit stands on the axis where it is the same.
+
+    Raises:
+        ProblemError: there are none.
+    """
+    if not panels:
+        raise ProblemError(
+            describe(
+                "A panel has nothing to show.",
+                expected="a list of names or symbols that share it",
+                received="an empty list",
+                remedy="name what is to be drawn, or leave the list out",
+            )
+        )
+    entries: list[str] = []
+    curves: list[Curve] = []
+    parts = [panel.label.rpartition(" [") if panel.label.endswith("]") else ("", "", panel.label) for panel in panels]
+    plain = [name or whole for name, _, whole in parts]
+    units = {unit if name else "" for name, _, unit in parts}
+    for panel, name in zip(panels, plain, strict=True):
+        curves += [replace(curve, entry=curve.entry + len(entries)) for curve in panel.curves]
+        own = name if len(units) == 1 else panel.label
+        entries += [own] if len(panel.entries) == 1 else list(panel.entries)
+    unit = units.pop() if len(units) == 1 else ""
+    label = shortened(", ".join(plain)) + (f" [{unit}" if unit else "")
+    bounds = tuple(dict.fromkeys(bound for panel in panels for bound in panel.bounds))
+    return Panel(label=label, entries=tuple(entries), curves=tuple(curves), bounds=bounds)
+
+
+def _block(name: str, blocks: Mapping[str, Block]) -> Block:
+    """Where a name that was found, or an entry of it, lies."""
+    found = block_of(name, blocks.values())
+    assert found is not None
+    return found
+
+
+def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
+    """Root mean squares, gains or covariances, of the solutions that have them."""
+    if isinstance(key.of, str):
+        drawn = [d for d in drawn if d.knows(key.of)]
+    if key.word in (GAIN, FILTER):
+        return gain(drawn, key.word, key.of, units)
+    if key.word == RMS:
+        every = [b.name for b in blocks.values() if b.kind in ("state", "unknown") and drawn[0].rows(b.name)]
+        chosen = every if key.of is None else [key.of]
+        return [panel for of in chosen for panel in rms(drawn, of, blocks, units)]
+    labels = drawn[0].solution.augmented
+    block = Block(name=key.word, kind="matrix", size=len(labels), offset=0, labels=labels, estimation=True)
+    return _matrix([(d, d.t, d.between(getattr(d.solution.loop, key.word))) for d in drawn], block, units)
+
+
+def _resolved(solutions: list[Solution], key: Any) -> Any:
+    """A name, a pair of names, a quantity, or the expression itself.
+
+    Raises:
+        ProblemError: no solution knows it.
+    """
+    if isinstance(key, tuple):
+        word = key[0] if len(key) == 2 and isinstance(key[0], str) and key[0] in (RMS, GAIN, FILTER) else ""
+        if word and any(knows(solution, word) for solution in solutions) and not _declared(solutions, word):
+            return Quantity(word=word, of=_uncertain(solutions, word, key[1]))
+        return tuple(_resolved(solutions, part) for part in key)
+    if isinstance(key, list):
+        return Together(keys=tuple(_resolved(solutions, part) for part in key))
+    error: ProblemError | None = None
+    if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
+        if any(knows(solution, key) for solution in solutions):
+            return Quantity(word=key)
+        raise _unknown_word(key)
+    for solution in solutions:
+        try:
+            names = tuple(b.name for b in solution.blocks)
+            return name_of(key, solution.symbols, names, sizes=sizes_of(solution.blocks))
+        except ProblemError as unknown:
+            error = unknown
+    if error is None or isinstance(key, ca.MX):
+        return key
+    raise error
+
+
+def _uncertain(solutions: list[Solution], word: str, key: Any) -> Any:
+    """What a root mean square or a gain may be of.
+
+    Raises:
+        ProblemError: it is something else.
+    """
+    of = _resolved(solutions, key)
+    if word == RMS and isinstance(of, ca.MX):
+        return of
+    names = {label.split("[")[0] for solution in solutions for label in solution.augmented}
+    if word == RMS:
+        loops = [solution for solution in solutions if solution.loop is not None]
+        names |= {b.name for solution in loops for b in solution.blocks if b.kind == "control" and b.name != GAIN}
+    if not isinstance(of, str) or not names & {of, of.split("[")[0]}:
+        raise ProblemError(
+            describe(
+                f"There is no ('{word}', {shortened(key)}).",
+                expected="a state or an unknown with a covariance: " + ", ".join(sorted(names)),
+                received=shortened(key),
+                remedy="choose one of them" + (", or an expression of them" if word == RMS else ""),
+            )
+        )
+    return of
+
+
+def _declared(solutions: list[Solution], word: str) -> bool:
+    """Whether a word is a name of the user's; the gain of a constrained feedback is drawn as a gain."""
+    names = [(b.name, solution) for solution in solutions for b in solution.blocks]
+    return any(name == word and not (word == GAIN and solution.loop) for name, solution in names)
+
+
+def _unknown_word(word: str) -> ProblemError:
+    needed = {FILTER: "a measurement and an estimation covariance", RMS: "an estimation covariance"}
+    return ProblemError(
+        describe(
+            f"'{word}' is not in this solution.",
+            expected=f"a problem with {needed.get(word, 'minimize_expected()')}",
+            received=f"'{word}' of a problem without",
+            remedy="draw something else",
+        )
+    )
+
+
+def abscissa_label(solutions: list[Solution], over: Any, units: Mapping[str, str]) -> str:
+    """Label of an abscissa that is not time."""
+    key = _resolved(solutions, over)
+    return key + unit_of(key, units) if isinstance(key, str) else shortened(key)
+
+
+def _expression(drawn: list[Drawn], key: Any) -> list[Panel]:
+    """An expression of the symbols with its band, through its values at the nodes."""
+    curves: list[Curve] = []
+    count = 1
+    for d in drawn:
+        values = d.between(d.solution[key].reshape(d.solution.t.size, -1))
+        count = values.shape[1]
+        spread = d.spread(key)[0] if d.covariance is not None and key.shape[1] == 1 else np.zeros_like(values)
+        curves += [
+            Curve(
+                t=d.t,
+                y=values[:, i],
+                deviation=spread[:, i] if np.any(spread[:, i]) else None,
+                order=d.order,
+                entry=i,
+            )
+            for i in range(count)
+        ]
+    return [Panel(label=shortened(key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
+
+
+def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[Panel]:
+    """A state with its band and target, a control, an unknown or a parameter with its band."""
+    curves = []
+    for d in drawn:
+        if not d.knows(block.name):
+            continue
+        own = d.solution.block(block.name)
+        t, values = d.t, d.sample[block.name]
+        steps = own.kind == "control" and d.solution.mesh.control == "constant"
+        if steps:
+            t, values = d.solution.t, d.solution[block.name]
+        values = values.reshape(t.size, -1)
+        deviation = d.deviation(own) if own.kind in ("state", "unknown", "control") else None
+        target = d.target(own)
+        curves += [
+            Curve(
+                t=t,
+                y=values[:, i],
+                deviation=None if deviation is None else deviation[:, i],
+                order=d.order,
+                entry=i,
+                steps=steps,
+                target=None if np.isnan(target[i]) else float(target[i]),
+            )
+            for i in range(own.size)
+        ]
+    bounds = _bounds(drawn[0].solution.statement, block)
+    suffix = " (estimate)" if block.kind == "unknown" else ""
+    return _separated(block, suffix + unit_of(block.name, units), curves, bounds)
+
+
+def _bounds(statement: Statement | None, block: Block) -> Array:
+    """Lower and upper bounds of a state or a control, (2, size); infinite where there are none."""
+    if statement is None or block.kind not in ("state", "control"):
+        return np.tile([[-np.inf], [np.inf]], (1, block.size))
+    bounds = statement.state_bounds if block.kind == "state" else statement.control_bounds
+    return np.array([bound[block.span] for bound in bounds])
+
+
+def _separated(block: Block, suffix: str, curves: list[Curve], bounds: Array) -> list[Panel]:
+    """A panel an entry, or one for many of them (then without bands)."""
+    entries = entry_names((block,))
+    if len(entries) > SEPARATE_ENTRIES:
+        plain = tuple(replace(curve, deviation=None) for curve in curves)
+        return [Panel(label=block.name + suffix, entries=entries, curves=plain)]
+    return [
+        Panel(
+            label=entry + suffix,
+            entries=(entry,),
+            key=entry,
+            curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
+            bounds=tuple(float(b) for b in bounds[:, i] if np.isfinite(b)),
+        )
+        for i, entry in enumerate(entries)
+    ]
+
+
+def _matrix(histories: list[tuple[Drawn, Array, Array]], block: Block, units: Mapping[str, str]) -> list[Panel]:
+    """Entries of a matrix, of a large one its diagonal, grouped by the symbols of its rows."""
+    panels = []
+    for pairs in _pairs(block):
+        names = tuple(f"{block.name}[{block.labels[i]}, {block.labels[j]}]" for i, j in pairs)
+        if len(pairs) > 1:
+            names = tuple(block.labels[i] for i, _ in pairs)
+        elif block.size == 1:
+            names = (block.name,)
+        curves = [
+            Curve(t=t, y=values[:, i, j], order=d.order, entry=k)
+            for d, t, values in histories
+            for k, (i, j) in enumerate(pairs)
+        ]
+        owners = [block.labels[i].split("[")[0] for i in pairs[0]]
+        group = f" of {owners[0]}" if block.estimation else ""
+        label = names[0] if len(pairs) == 1 else f"{block.name}, diagonal{group}"
+        unit = product_unit(owners, units) if block.estimation else unit_of(block.name, units)
+        panels.append(Panel(label=label + unit, entries=tuple(names), curves=tuple(curves)))
+    return panels
+
+
+def _pairs(block: Block) -> list[list[tuple[int, int]]]:
+    """Entries of a matrix, those that share a panel together."""
+    if block.size <= WHOLE_MATRIX:
+        return [[(int(min(pair)), int(max(pair)))] for pair in zip(*half_indices(block.size), strict=True)]
+    groups: dict[str, list[tuple[int, int]]] = {}
+    for i, label in enumerate(block.labels):
+        groups.setdefault(label.split("[")[0] if block.estimation else "", []).append((i, i))
+    return [
+        part
+        for group in groups.values()
+        for part in ([group] if len(group) > SEPARATE_ENTRIES else [[pair] for pair in group])
+    ]
+
+
+def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) -> list[Panel]:
+    """A block of the covariance of the actual deviations, at the nodes."""
+    curves: list[Curve] = []
+    names: tuple[str, ...] = ()
+    for d in drawn:
+        values = d.solution.covariance(*key)
+        names = tuple(f"{i}, {j}" for i in range(values.shape[1]) for j in range(values.shape[2]))
+        flat = values.reshape(values.shape[0], -1)
+        curves += [Curve(t=d.solution.t, y=flat[:, k], order=d.order, entry=k) for k in range(flat.shape[1])]
+    closed = any(d.solution.loop is not None for d in drawn)
+    matrix = COVARIANCES[0] if closed else next(b.name for b in drawn[0].solution.blocks if b.estimation)
+    label = f"{matrix}[{key[0]}, {key[1]}]" + product_unit(list(key), units)
+    return [Panel(label=label, entries=names, curves=tuple(curves))]
+
+
+def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
+    """Costates of a state or a matrix, at the nodes."""
+    chosen = [d for d in drawn if d.knows(block.name)]
+    name = f"costate of {block.name}"
+    if block.kind == "state":
+        curves = [
+            Curve(t=d.solution.t, y=values, order=d.order, entry=i)
+            for d in chosen
+            for i, values in enumerate(d.solution.costate(block.name).reshape(d.solution.t.size, -1).T)
+        ]
+        if block.size > SEPARATE_ENTRIES:
+            return [Panel(label=name, entries=entry_names((block,)), curves=tuple(curves))]
+        return [
+            Panel(
+                label=f"costate of {entry}",
+                entries=(entry,),
+                curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
+            )
+            for i, entry in enumerate(entry_names((block,)))
+        ]
+    pairs = [pair for group in _pairs(block) for pair in group]
+    entries = tuple(f"{block.labels[i]}, {block.labels[j]}" for i, j in pairs)
+    curves = [
+        Curve(t=d.solution.t, y=d.solution.costate(block.name)[:, i, j], order=d.order, entry=k)
+        for d in chosen
+        for k, (i, j) in enumerate(pairs)
+    ]
+    return [Panel(label=name, entries=entries, curves=tuple(curves))]

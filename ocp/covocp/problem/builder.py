@@ -1,0 +1,514 @@
+"""The builder: symbols, dynamics, noise, measurements, costs and constraints of a vector-matrix problem."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.arguments import checked, text
+from covocp.base.checks import (
+    as_expression,
+    as_number,
+    bound_columns,
+    caller,
+    check_bounds,
+    check_constrains,
+    check_inside,
+    check_kind,
+    check_limits,
+    check_name,
+    check_positive,
+    check_size,
+    check_symmetric,
+    column,
+    column_expression,
+    density_matrix,
+    find_name,
+    is_scalar,
+    is_symbolic,
+    scale_column,
+)
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import pack_symbolic
+from covocp.base.threads import methods_one_at_a_time
+from covocp.problem.boundary_values import check_free, end_value
+from covocp.problem.declarations import (
+    Constraint,
+    Control,
+    Dynamics,
+    Expansion,
+    Expected,
+    Free,
+    Gain,
+    Guess,
+    Matrix,
+    Measurement,
+    Parameter,
+    Place,
+    State,
+    Unknown,
+    declare_matrix,
+)
+from covocp.problem.estimation_covariance import EstimationCovariance, augmented_names
+from covocp.problem.expected_cost import check_first_cost, derive, expected_cost
+from covocp.problem.freeze import freeze
+from covocp.problem.measurement_information import stated_noise
+from covocp.statement.statement import Statement
+
+
+@methods_one_at_a_time
+class Problem:
+    """An optimal control problem whose state holds vectors and symmetric (covariance) matrices.
+
+    Args:
+        duration: terminal time [s], or `Free(guess, lower, upper)`.
+        name: appears in printouts and plots.
+
+    Raises:
+        ProblemError: where the duration is not positive.
+    """
+
+    def __init__(self, duration: float | Free, name: str = "") -> None:
+        """Start an empty problem."""
+        if not isinstance(duration, Free):
+            duration = check_positive("duration", duration, unit="s")
+        check_kind(name, str, "give name= in words")
+        self.name = name
+        self.free_duration: Free | None = duration if isinstance(duration, Free) else None
+        self._time = ca.MX.sym("time")
+        self._duration: Any = ca.MX.sym("duration") if isinstance(duration, Free) else duration
+        self.states: list[State] = []
+        self.unknowns: list[Unknown] = []
+        self.parameters: list[Parameter] = []
+        self.controls: list[Control] = []
+        self.matrices: list[Matrix] = []
+        self.rates: dict[str, Dynamics] = {}
+        self.measurements: list[Measurement] = []
+        self.constraints: list[Constraint] = []
+        self.cost: tuple[ca.MX, ca.MX] | None = None
+        self.expected: Expected | None = None
+        self.expansion: Expansion | None = None
+        self._mentioned = False  # whether what may be forgotten in it was said
+        self._frozen: Statement | None = None
+
+    def __repr__(self) -> str:
+        """What is declared, by name."""
+        groups: tuple[Any, ...] = (self.states, self.unknowns, self.controls, self.matrices)
+        parts = zip(("states", "unknowns", "controls", "matrices"), groups, strict=True)
+        listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in parts if group)
+        return f"Problem('{self.name}'{listed})"
+
+    @property
+    def time(self) -> ca.MX:
+        """Symbol of the running time [s]."""
+        return self._time
+
+    @property
+    def duration(self) -> Any:
+        """Symbol of the terminal time [s], or its number where it is fixed."""
+        return self._duration
+
+    @checked(unit=text)
+    def state(
+        self,
+        name: str,
+        shape: int = 1,
+        *,
+        initial: Any,
+        final: Any = None,
+        lower: Any = -np.inf,
+        upper: Any = np.inf,
+        guess: Guess = None,
+        scale: Any = None,
+        variance: Any = None,
+        unit: str = "",
+    ) -> ca.MX:
+        """Declare a nominal vector state.
+
+        Args:
+            name: unique name.
+            shape: number of components.
+            initial: start values, shape () or (shape,); numbers or expressions in parameters; None, also in a sequence:
+                free.
+            final: values to reach at the end; None, also in a sequence such as [1.0, None]: free.
+            lower: lower bounds along the path, at the nodes of the mesh.
+            upper: upper bounds along the path, at the nodes of the mesh.
+            guess: a number, an array over the nodes, or a function of s = t/T; None: simulated from the controls.
+            scale: typical magnitude; None: from bounds, guess and simulated trajectory.
+            variance: of the error of the initial estimate: scalar, vector (diagonal) or matrix; None: zero.
+            unit: for the axes of plots.
+
+        Returns:
+            The symbol, shape (shape, 1).
+
+        Raises:
+            ProblemError: name used twice, shapes that do not fit, bounds crossed, values outside the bounds, NaN or
+                inf in data, variance not positive semidefinite.
+        """
+        size = self._declare(name, shape)
+        low, high = bound_columns(name, lower, upper, size)
+        check_bounds(name, low, high)
+        declaration = State(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            unit=unit,
+            initial=end_value(name, "initial", initial, low, high),
+            final=end_value(name, "final", final, low, high),
+            lower=low,
+            upper=high,
+            guess=guess,
+            scale=scale_column(name, scale, size),
+            variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
+        )
+        self.states.append(declaration)
+        return declaration.symbol
+
+    @checked(unit=text)
+    def unknown(self, name: str, mean: Any, variance: Any, *, unit: str = "") -> ca.MX:
+        """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
+
+        Args:
+            name: unique name.
+            mean: its expected value, a number or a vector.
+            variance: of that value: scalar, vector (diagonal) or matrix; numbers or expressions in parameters.
+            unit: for the axes of plots.
+
+        Returns:
+            The symbol, shape (n, 1).
+
+        Raises:
+            ProblemError: name used twice, NaN or inf, variance not positive semidefinite or of the wrong size.
+        """
+        size = self._declare(name, int(np.size(as_number(name, "mean", mean))))
+        declaration = Unknown(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            unit=unit,
+            mean=column(name, "mean", mean, size),
+            variance=density_matrix(name, "variance", variance, size),
+        )
+        self.unknowns.append(declaration)
+        return declaration.symbol
+
+    @checked(unit=text)
+    def parameter(self, name: str, value: Any, *, unit: str = "") -> ca.MX:
+        """Declare a known number (or vector) that may change from solve to solve without rebuilding.
+
+        Raises:
+            ProblemError: name used twice, NaN or inf.
+        """
+        size = self._declare(name, int(np.size(as_number(name, "value", value))))
+        declaration = Parameter(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            unit=unit,
+            value=column(name, "value", value, size),
+        )
+        self.parameters.append(declaration)
+        return declaration.symbol
+
+    @checked(unit=text)
+    def control(
+        self,
+        name: str,
+        shape: int = 1,
+        *,
+        lower: Any = -np.inf,
+        upper: Any = np.inf,
+        guess: Guess = 0.0,
+        scale: Any = None,
+        unit: str = "",
+    ) -> ca.MX:
+        """Declare a control vector with its bounds, guess and scale (as for states), and unit for the axes of plots.
+
+        Returns:
+            The symbol, shape (shape, 1).
+
+        Raises:
+            ProblemError: name used twice, shapes that do not fit, bounds crossed.
+        """
+        size = self._declare(name, shape)
+        low, high = bound_columns(name, lower, upper, size)
+        check_bounds(name, low, high)
+        declaration = Control(
+            name=name,
+            symbol=ca.MX.sym(name, size),
+            size=size,
+            where=caller(),
+            unit=unit,
+            lower=low,
+            upper=high,
+            guess=guess,
+            scale=scale_column(name, scale, size),
+        )
+        self.controls.append(declaration)
+        return declaration.symbol
+
+    @checked(unit=text)
+    def symmetric(
+        self,
+        name: str,
+        size: int,
+        *,
+        initial: Any,
+        final: Any = None,
+        lower: float | None = None,
+        guess: Any = None,
+        unit: str = "",
+    ) -> ca.MX:
+        """Declare a general symmetric matrix state, stored as its half-vector.
+
+        Args:
+            name: unique name.
+            size: number of rows.
+            initial: matrix (size, size), or a scalar where size is 1; None, or None for an entry: free.
+            final: as `initial`; None: free.
+            lower: lower bound of the diagonal entries at the nodes; 0 or more also declares it positive semidefinite.
+            guess: a matrix, used where the matrix is an NLP variable and cannot be simulated; None: simulated.
+            unit: of its entries, for the axes of plots.
+
+        Returns:
+            The full symmetric matrix, shape (size, size).
+
+        Raises:
+            ProblemError: name used twice, shape that does not fit, NaN or inf, not symmetric; with `lower` >= 0 an
+                initial matrix that is not positive semidefinite.
+        """
+        size = self._declare(name, size)
+        for what, value in (("initial value", initial), ("final value", final)):
+            check_free(name, what, value)
+        lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
+        if lower is not None and initial is not None and not is_symbolic(initial):
+            diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
+            check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
+        declaration = declare_matrix(
+            name,
+            labels=tuple(str(i) for i in range(size)),
+            where=caller(),
+            unit=unit,
+            initial=initial,
+            final=final,
+            lower=lower,
+            guess=guess,
+            covariance=lower is not None and lower >= 0,
+        )
+        self.matrices.append(declaration)
+        return declaration.matrix
+
+    def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
+        """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
+
+        Its rate is F E + E F' + Q - E M' U^-1 M E, with F and M the Jacobians of dynamics and measurements along the
+        nominal, Q and U the noise densities given to `dynamics` and `measurement`.
+
+        Args:
+            initial: covariance at the start; None: from the variances of states and unknowns.
+
+        Returns:
+            The covariance; `E[x, b]` gives entries and blocks.
+
+        Raises:
+            ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
+        """
+        entries: list[Any] = [*self.states, *self.unknowns]
+        labels = augmented_names(entries)
+        if not labels:
+            raise ProblemError(
+                describe(
+                    "There is nothing to estimate.",
+                    expected="states and unknowns declared before estimation_covariance()",
+                    received="none",
+                    remedy="call estimation_covariance() after the last state() and unknown()",
+                )
+            )
+        self._declare("E", len(labels))
+        if initial is None:
+            initial = ca.diagcat(*(entry.variance for entry in entries))
+        declaration = declare_matrix(
+            "E", labels=labels, where=caller(), initial=initial, lower=0.0, covariance=True, estimation=True
+        )
+        self.matrices.append(declaration)
+        return EstimationCovariance(entries, declaration)
+
+    def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
+        """Give the rate of a state or of a symmetric matrix state.
+
+        Args:
+            symbol: what `state` or `symmetric` returned, or its name.
+            rate: d(symbol)/dt, of the shape of the symbol, per second.
+            noise: power spectral density of additive white noise: scalar, vector (diagonal) or matrix; may depend on
+                state, control and time. Only for vector states.
+
+        Raises:
+            ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
+        """
+        name = find_name(symbol, "dynamics", self._declared, (*self.states, *self.matrices))
+        for state in self.states:
+            if state.name == name:
+                value = as_expression(name, "rate", rate, (state.size, 1))
+                density = None if noise is None else density_matrix(name, "noise density", noise, state.size)
+                break
+        else:
+            matrix = next((entry for entry in self.matrices if entry.name == name and not entry.estimation), None)
+            if matrix is None or noise is not None:
+                raise ProblemError(
+                    describe(
+                        f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
+                        expected="a state, or a symmetric matrix without noise",
+                        received=f"'{name}'",
+                        remedy="unknowns are constant, and the estimation covariance has its rate already",
+                    )
+                )
+            full = as_expression(name, "rate", rate, (matrix.size, matrix.size))
+            check_symmetric(name, "rate", full)
+            value, density = pack_symbolic(full), None
+        if name in self.rates:
+            raise ProblemError(
+                describe(
+                    f"The rate of '{name}' is given twice.",
+                    expected="one call of dynamics() for each state",
+                    received=f"a first one at {self.rates[name].where}",
+                    remedy="remove one of them",
+                )
+            )
+        one = density is not None and is_scalar(noise)
+        self.rates[name] = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
+        self._frozen = None
+
+    @checked(unit=text)
+    def measurement(
+        self, name: str, expression: Any, noise: Any = None, *, information: Any = None, unit: str = ""
+    ) -> None:
+        """Add a continuous measurement m = expression + v with white noise v.
+
+        Args:
+            name: unique name.
+            expression: of states, unknowns, controls and time, shape (m, 1).
+            noise: power spectral density of v: scalar, vector (diagonal) or matrix (correlated), positive definite.
+            information: its inverse in place of it: scalar or vector (diagonal), not negative. Where it is zero nothing
+                is measured: a sensor that a control switches off, information=w/U, w in [0, 1].
+            unit: for exported code.
+
+        Raises:
+            ProblemError: name used twice, singular, negative or of the wrong size, both or neither given.
+        """
+        value = column_expression(name, "measurement", expression)
+        size = self._declare(name, value.shape[0])
+        density, inverse = stated_noise(name, noise, information, size)
+        self.measurements.append(
+            Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
+        )
+
+    def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
+        """State the deterministic cost: terminal + integral of running over [0, T].
+
+        Args:
+            running: L(x, u, E, t), scalar, cost per second.
+            terminal: k(x(T), E(T), T), scalar; tr(C E(T)) is written as such.
+
+        Raises:
+            ProblemError: not scalar, or given twice.
+        """
+        check_first_cost(self, "minimize")
+        self.cost = (
+            as_expression("minimize", "running cost", running, (1, 1)),
+            as_expression("minimize", "terminal cost", terminal, (1, 1)),
+        )
+        self._frozen = None
+
+    def minimize_expected(
+        self,
+        running: Any = 0.0,
+        terminal: Any = 0.0,
+        *,
+        terminal_weight: Any = None,
+        control_weight: Any = None,
+        gain: Gain | None = None,
+    ) -> None:
+        """State the expected cost <terminal + integral of running> of the actual system under linear feedback.
+
+        The actual control is u - C dx', dx' the Kalman filter's estimate of the deviation from the nominal. The cost is
+        expanded to second order about the nominal [Schmidt 6.3]; nominal, filter and gain are chosen together.
+
+        Args:
+            running: L(x, u, t), scalar, cost per second.
+            terminal: k(x(T), T), scalar.
+            terminal_weight: added to k_xx, by symbol or name, also of an entry: {x: 2.0, p[0]: 1.0}; what missing a
+                prescribed final value costs.
+            control_weight: weight B of the deviations of the controls, by symbol or name, in place of L_uu; needed
+                where L_uu is not positive definite.
+            gain: constraints on the gain C (structure, constancy, bounds); None: the best one.
+
+        Raises:
+            ProblemError: not scalar, cost given twice, weights that do not fit or are negative.
+        """
+        check_first_cost(self, "minimize_expected")
+        self.expected = expected_cost(self, running, terminal, terminal_weight, control_weight, gain)
+        self._frozen = None
+
+    def subject_to(
+        self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None
+    ) -> None:
+        """Require lower <= expression <= upper.
+
+        Path constraints hold at the nodes of the mesh, and at the ends of the integration steps where an interval has
+        several (`points=` of `solve`); `Solution.check_path` looks between them. With constant controls a path
+        constraint holds at each node with the control of the interval that starts there (at the last node: the last
+        control).
+
+        Args:
+            expression: of states, controls, matrix states, time; a column or a scalar.
+            lower: numbers, shape of the expression.
+            upper: numbers, shape of the expression; 0 by default.
+            at: "path", "initial" or "final".
+            name: appears in every diagnostic; "constraint k" by default.
+
+        Raises:
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place.
+        """
+        label = name if name is not None else f"constraint {len(self.constraints) + 1}"
+        if not isinstance(at, str) or at not in ("path", "initial", "final"):
+            raise ProblemError(
+                describe(
+                    f"'{label}' has an unknown place.",
+                    expected="at='path', 'initial' or 'final'",
+                    received=repr(at),
+                    remedy="choose one of the three",
+                )
+            )
+        value = column_expression(label, "constraint", expression)
+        constants = [q.symbol for q in self.parameters] + [q.symbol for q in self.unknowns] + [self._time]
+        check_constrains(label, value, constants)
+        size = self._declare(label, value.shape[0])
+        low, high = bound_columns(label, lower, upper, size)
+        check_limits(label, low, high)
+        self.constraints.append(Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller()))
+
+    def statement(self) -> Statement:
+        """The frozen problem that solvers read; built once and kept until something is added.
+
+        Raises:
+            ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
+        """
+        if self._frozen is None:
+            self._frozen = freeze(self if self.expected is None else derive(self))
+        return self._frozen
+
+    def _declare(self, name: str, size: Any) -> int:
+        """Check that the name is new and the size sensible; forget the frozen statement."""
+        check_name(name, self._declared)
+        self._frozen, self._mentioned = None, False
+        return check_size(name, size)
+
+    @property
+    def _declared(self) -> list[Any]:
+        symbols: list[Any] = [*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices]
+        return [*symbols, *self.measurements, *self.constraints]

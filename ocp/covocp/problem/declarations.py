@@ -1,0 +1,282 @@
+"""What is declared, name by name: the records that `Problem` collects and `freeze` turns into a statement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.arguments import check_argument, truth
+from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
+from covocp.base.matrices import Array, half_length, unpack_symbolic
+
+Guess = float | Array | Callable[[Array], Any] | None
+Place = Literal["path", "initial", "final"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """A terminal time that the solver chooses.
+
+    Args:
+        guess: where to start [s].
+        lower: smallest terminal time allowed [s], positive; a thousandth of the guess where it is not given.
+        upper: largest terminal time allowed [s].
+
+    Raises:
+        ProblemError: where 0 < lower <= guess <= upper does not hold.
+    """
+
+    guess: float
+    lower: float
+    upper: float
+
+    def __init__(self, guess: float, lower: float | None = None, upper: float = np.inf) -> None:
+        """Check and keep the three numbers."""
+        start = check_positive("duration", guess, unit="s")
+        object.__setattr__(self, "guess", start)
+        object.__setattr__(self, "lower", 1e-3 * start if lower is None else one_number("Free", "lower bound", lower))
+        object.__setattr__(self, "upper", one_number("Free", "upper bound", upper))
+        check_times(self.guess, self.lower, self.upper)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """A vector state of the nominal; data are columns of numbers or of expressions in the parameters.
+
+    estimated: whether it is part of the augmented state; constants to be chosen are not, and come last.
+    """
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    unit: str
+    initial: ca.MX
+    final: ca.MX
+    lower: Array
+    upper: Array
+    guess: Guess
+    scale: Array | None
+    variance: ca.MX
+    estimated: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unknown:
+    """A constant unknown parameter of the actual system."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    unit: str
+    mean: Array
+    variance: ca.MX
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parameter:
+    """A known number."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    unit: str
+    value: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Control:
+    """A control vector."""
+
+    name: str
+    symbol: ca.MX
+    size: int
+    where: str
+    unit: str
+    lower: Array
+    upper: Array
+    guess: Guess
+    scale: Array | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matrix:
+    """A symmetric matrix state; `symbol` is its half-vector, `matrix` the full matrix that the user sees."""
+
+    name: str
+    symbol: ca.MX
+    matrix: ca.MX
+    size: int
+    where: str
+    unit: str
+    initial: ca.MX | None
+    final: ca.MX | None
+    lower: float | None
+    guess: Any
+    covariance: bool
+    estimation: bool
+    labels: tuple[str, ...]
+    backward: Backward | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Backward:
+    """What makes a matrix run backward in time: its value at the end, and the Riccati form of its rate.
+
+    end: the matrix at T, an expression of states, parameters, unknowns and the duration.
+    form: F, Q, W of V = F E + E F' + Q - E W E, the rate in forward time; expressions of nominal, time, parameters.
+    """
+
+    end: ca.MX
+    form: tuple[ca.MX, ca.MX, ca.MX]
+
+
+def declare_matrix(
+    name: str,
+    *,
+    labels: tuple[str, ...],
+    where: str,
+    unit: str = "",
+    initial: Any = None,
+    final: Any = None,
+    lower: float | None = None,
+    guess: Any = None,
+    covariance: bool = False,
+    estimation: bool = False,
+    backward: Backward | None = None,
+) -> Matrix:
+    """A symmetric matrix state with a symbol of its own, a row for each label.
+
+    Raises:
+        ProblemError: end values of another shape or not symmetric; those of a covariance indefinite.
+    """
+    size = len(labels)
+    half = ca.MX.sym(name, half_length(size))
+    ends = [
+        None if value is None else symmetric_data(name, what, value, size, semidefinite=covariance)
+        for what, value in (("initial value", initial), ("final value", final))
+    ]
+    return Matrix(
+        name=name,
+        symbol=half,
+        matrix=unpack_symbolic(half, size),
+        size=size,
+        where=where,
+        unit=unit,
+        initial=ends[0],
+        final=ends[1],
+        lower=lower,
+        guess=guess,
+        covariance=covariance,
+        estimation=estimation,
+        labels=labels,
+        backward=backward,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dynamics:
+    """Rate of a state or of the half-vector of a matrix; `noise` is a square density matrix, None without noise.
+
+    `one_density`: whether the noise was given as one number for all rows.
+    """
+
+    rate: ca.MX
+    noise: ca.MX | None
+    where: str
+    one_density: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """A continuous measurement and the density matrix of its noise.
+
+    information: the inverse density where it was stated in place of the density (a diagonal matrix that may be zero),
+        else None. `noise` is then what stands for the density where a filter or a simulation needs one.
+    """
+
+    name: str
+    expression: ca.MX
+    noise: ca.MX
+    unit: str
+    where: str
+    information: ca.MX | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Constraint:
+    """lower <= expression <= upper along the path, at the start or at the end."""
+
+    name: str
+    expression: ca.MX
+    lower: Array
+    upper: Array
+    at: Place
+    where: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """A feedback gain with constraints, optimised instead of the unconstrained optimal one.
+
+    Args:
+        structure: which entries may differ from zero, shape (controls, augmented states), truth values; None: all.
+        constant: whether each entry is one number for the whole time.
+        lower: lower bounds of the entries, a number or an array of that shape.
+        upper: upper bounds.
+        guess: where the entries start; None: zero.
+    """
+
+    structure: Any = None
+    constant: bool = False
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    guess: Any = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no truth value; the arrays are checked with the problem that they belong to."""
+        check_argument("Gain()", "constant", truth, self.constant)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expected:
+    """An expected cost: L and k of the actual system, and the weights of what their second derivatives leave out.
+
+    terminal_weight: added to k_xx, matrix over the augmented state or None; control_weight: B where it is given, a
+    matrix over the controls, None where L_uu is taken.
+    """
+
+    running: ca.MX
+    terminal: ca.MX
+    terminal_weight: Any
+    control_weight: Any
+    gain: Gain | None
+    where: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expansion:
+    """What the feedback sees of the actual system along the nominal; expressions of the user's symbols.
+
+    F, G: slopes of the rates by the augmented state and by the control; A, B, N: second derivatives of the running
+    cost with the weights; Q: process noise; end: S(T); running, terminal: L and k; gain: the feedback gain C.
+    """
+
+    F: ca.MX
+    G: ca.MX
+    A: ca.MX
+    B: ca.MX
+    N: ca.MX
+    Q: ca.MX
+    end: ca.MX
+    running: ca.MX
+    terminal: ca.MX
+    gain: ca.MX
+    alternative: ca.MX | None = None
+    product: ca.MX | None = None

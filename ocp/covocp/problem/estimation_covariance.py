@@ -1,0 +1,95 @@
+"""The covariance of the estimation error of the augmented state, as the user sees and indexes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+
+from covocp.base.checks import is_symbolic
+from covocp.base.errors import ProblemError, describe
+from covocp.base.threads import methods_one_at_a_time
+from covocp.problem.declarations import Matrix, State, Unknown
+
+Entry = State | Unknown
+
+
+def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
+    """Names of the rows of the estimation covariance: states, then unknowns."""
+    return tuple(
+        entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
+    )
+
+
+@methods_one_at_a_time
+class EstimationCovariance:
+    """The covariance of the estimation error of the augmented state (states, then unknowns).
+
+    `E[a, b]` is the block between two symbols, names (also of components, "x[0]"), or expressions of them (to first
+    order, by their Jacobians); `E.matrix` is the whole symmetric matrix.
+    """
+
+    def __init__(self, entries: Sequence[Entry], declaration: Matrix) -> None:
+        """Keep the entries of the augmented state and the declared matrix."""
+        self._entries = tuple(entries)
+        self._declaration = declaration
+
+    @property
+    def matrix(self) -> ca.MX:
+        """The full symmetric matrix, shape (n, n), n entries of the augmented state."""
+        return self._declaration.matrix
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the rows."""
+        return self._declaration.labels
+
+    def __getitem__(self, key: Any) -> ca.MX:
+        """Covariance between two symbols or names, shape (size of a, size of b).
+
+        Raises:
+            ProblemError: where a name is unknown, or an expression contains no augmented state.
+        """
+        if not isinstance(key, tuple) or len(key) != 2:
+            raise ProblemError(
+                describe(
+                    "A covariance is indexed by two symbols.",
+                    expected="E[a, b] with a, b of " + ", ".join(self.labels),
+                    received=f"E[{key}]",
+                    remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
+                )
+            )
+        left, right = (self._rows(entry) for entry in key)
+        if isinstance(left, slice) and isinstance(right, slice):
+            return self.matrix[left, right]
+        unit = ca.MX.eye(self.matrix.shape[0])
+        rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
+        return rows @ self.matrix @ columns.T
+
+    def _rows(self, key: Any) -> Any:
+        """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
+        if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
+            row = self.labels.index(key)
+            return slice(row, row + 1)
+        offset, jacobians = 0, []
+        for entry in self._entries:
+            span = slice(offset, offset + entry.size)
+            if key is entry.symbol or (isinstance(key, str) and key == entry.name):
+                return span
+            if is_symbolic(key):
+                if key.is_symbolic() and ca.is_equal(key, entry.symbol):
+                    return span
+                jacobians.append(ca.jacobian(key, entry.symbol))
+            offset = span.stop
+        jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
+        if jacobian.nnz() == 0:
+            raise ProblemError(
+                describe(
+                    f"'{key}' is not part of the estimated state.",
+                    expected="a symbol or name of " + ", ".join(self.labels),
+                    received=str(key),
+                    remedy="index the covariance with states and unknowns of this problem",
+                )
+            )
+        return ca.densify(jacobian)

@@ -1,0 +1,149 @@
+"""The actual system to second order about the nominal [Schmidt 6.2, 6.3]: slopes, second derivatives and weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import check_dynamics, density_matrix
+from covocp.base.errors import ProblemError, describe
+from covocp.problem.declarations import Expansion, Expected
+
+if TYPE_CHECKING:
+    from covocp.problem.builder import Problem
+
+
+def expand(problem: Problem, expected: Expected) -> Expansion:
+    """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    check_dynamics(problem.states, problem.rates)
+    augmented = [entry.symbol for entry in entries]
+    controls = [entry.symbol for entry in problem.controls]
+    count = sum(entry.size for entry in problem.unknowns)
+    rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
+    noises = [problem.rates[s.name].noise for s in problem.states]
+    noise = ca.diagcat(
+        *(ca.MX(s.size, s.size) if q is None else q for s, q in zip(problem.states, noises, strict=True)),
+        ca.MX(count, count),
+    )
+    by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
+    at_end = _slope(expected.terminal, augmented).T
+    weight = _weight_matrix(expected.terminal_weight, entries, "terminal weight")
+    end = _slope(at_end, augmented) + (0 if weight is None else weight)
+    _check_terminal_weights(problem, end)
+    return Expansion(
+        F=_slope(rates, augmented),
+        G=_slope(rates, controls),
+        A=_slope(by_state, augmented),
+        B=_control_weights(problem, expected, _slope(by_control, controls)),
+        N=_slope(by_state, controls),
+        Q=noise,
+        end=end,
+        running=expected.running,
+        terminal=expected.terminal,
+        gain=ca.MX(),
+    )
+
+
+def measurement_slope(problem: Problem, size: int) -> tuple[Any, Any]:
+    """M and U of all measurements."""
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    augmented = [entry.symbol for entry in entries]
+    if not problem.measurements:
+        return ca.MX(0, size), ca.MX(0, 0)
+    value = ca.vertcat(*(m.expression for m in problem.measurements))
+    return _slope(value, augmented), ca.diagcat(*(m.noise for m in problem.measurements))
+
+
+def _slope(expression: Any, symbols: list[Any]) -> Any:
+    """Jacobian by several symbols, side by side.
+
+    An interpolation table expands to scalar operations and its derivative does not, so that of its expansion is taken.
+    """
+    slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+    own = ca.symvar(expression)
+    try:
+        ca.Function("slope", own, [slope]).expand()
+    except RuntimeError:
+        try:
+            expression = ca.Function("expression", own, [expression]).expand()(*own)
+        except RuntimeError:  # nor does the expression: the statement is in matrix operations
+            return slope
+        slope = ca.horzcat(*(ca.jacobian(expression, symbol) for symbol in symbols))
+    return slope
+
+
+def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
+    """One matrix over some entries from weights by name, a number or a matrix; None without weights."""
+    if weights is None:
+        return None
+    if isinstance(weights, Mapping):
+        return ca.diagcat(*(weights.get(e.name, ca.MX(e.size, e.size)) for e in entries))
+    return density_matrix("minimize_expected", what, weights, sum(e.size for e in entries))
+
+
+def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> Any:
+    """B: the given weights, L_uu where none is given [Schmidt 6.6]; every control needs one."""
+    given = expected.control_weight
+    if given is None:
+        weights = curvature
+    elif not isinstance(given, Mapping):
+        weights = _weight_matrix(given, problem.controls, "control weight")
+    else:
+        rows = []
+        for a in problem.controls:
+            blocks = []
+            for b in problem.controls:
+                block = ca.jacobian(ca.gradient(expected.running, a.symbol), b.symbol)
+                replaced = a.name in given or b.name in given
+                blocks.append((given[a.name] if a is b else ca.MX(a.size, b.size)) if replaced else block)
+            rows.append(ca.horzcat(*blocks))
+        weights = ca.vertcat(*rows)
+    names = [e.name if e.size == 1 else f"{e.name}[{i}]" for e in problem.controls for i in range(e.size)]
+    constant = not ca.symvar(weights)  # constants that CasADi has not folded among them
+    numbers = ca.evalf(weights).full() if constant else None
+    for i, name in enumerate(names):
+        if not weights.sparsity().has_nz(i, i) or (numbers is not None and numbers[i, i] == 0):
+            raise ProblemError(
+                describe(
+                    f"The control '{name}' has no weight: the second derivative of the running cost by it is zero.",
+                    expected="a positive weight of its deviations, or the feedback gain would be infinite",
+                    received=f"running = {expected.running}",
+                    remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
+                )
+            )
+    if numbers is not None and np.linalg.eigvalsh(numbers)[0] <= 0:
+        raise ProblemError(
+            describe(
+                f"The weight of the controls {', '.join(names)} is not positive definite.",
+                expected="a minimum of the running cost by the controls, or control_weight= in its place",
+                received=f"second derivatives {numbers.tolist()}",
+                remedy="give control_weight={...} to minimize_expected(), or correct the running cost",
+            )
+        )
+    return ca.sparsify(ca.evalf(weights)) if constant else weights
+
+
+def _check_terminal_weights(problem: Problem, end: Any) -> None:
+    """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
+    offset = 0
+    for state in problem.states:
+        free = [True] * state.size
+        if state.final.is_constant():
+            free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()
+        for i in range(state.size):
+            if not free[i] and not end.sparsity().has_nz(offset + i, offset + i):
+                raise ProblemError(
+                    describe(
+                        f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
+                        expected="a weight of its deviation at the end: only the nominal meets a terminal condition "
+                        "exactly, the actual system scatters around it",
+                        received=f"final value of {state.name}, no terminal cost or weight of it",
+                        remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
+                        "to scatter",
+                    )
+                )
+        offset += state.size

@@ -1,0 +1,394 @@
+"""Expected cost -> deterministic vector-matrix problem: the closed loop of G. T. Schmidt, Sc.D. thesis, chapter 6.
+
+The actual system dx = f dt + n, measured as h + v, is controlled by u - C x', x' the estimate of its deviation by the
+Kalman filter along the nominal. To second order the expected cost is (6.3-14)
+
+    J = k + int L dt + 1/2 tr S(T) X(T) + 1/2 int tr(A X + B C X' C' - 2 N C X') dt,      X = E + X',
+
+E the covariance of the estimate's error, X' that of the estimate itself (called Xhat). With the best gain,
+
+    C = B^-1 (G' S + N'),    -dS/dt = F' S + S F + A - C' B C,    S(T) = k_xx + weights,          (6.3-19 .. 6.3-24)
+
+tr(S X) may be integrated by parts (E-20), and once more with E in place of X, which leaves
+
+    J = k + int L dt + 1/2 tr S(T) E(T) + 1/2 int tr(A E + S E W E) dt,      W = M' U^-1 M.
+
+On any part of the time the last two are equal but for the ends, d tr(S E) = tr(S Q + C'B C E - A E - S E W E) dt. The
+first is smooth where S is steep, towards the end, the second where E is steep, at the start: there S E W E is a spike
+of width U/E(0). So the integral is taken in the second form over the first half of the time, in the first over the
+rest (`integrators.simpson_interval`).
+
+So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had afterwards. The costate of S is
+-Xhat/2. Where the gain is constrained (`Gain`), C is a control and the matrices are E and Xhat instead.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import as_expression, as_number, caller, density_matrix, find_name
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import pack_symbolic
+from covocp.base.riccati_rates import inverse
+from covocp.problem.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, State, declare_matrix
+from covocp.problem.estimation_covariance import augmented_names
+from covocp.problem.expansion import expand, measurement_slope
+from covocp.problem.measurement_information import inverse_density
+from covocp.statement.names import name_of, split_entry
+
+if TYPE_CHECKING:
+    from covocp.problem.builder import Problem
+
+# Names of what the derived problem adds to the user's symbols.
+FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
+
+
+def expected_cost(
+    problem: Problem, running: Any, terminal: Any, terminal_weight: Any, control_weight: Any, gain: Gain | None
+) -> Expected:
+    """Check and keep what `Problem.minimize_expected` was given."""
+    if gain is not None and not isinstance(gain, Gain):
+        raise ProblemError(
+            describe(
+                "The gain of minimize_expected() is not a description of a gain.",
+                expected="Gain(structure=..., constant=..., lower=..., upper=...), or None for the best gain",
+                received=repr(gain)[:100],
+                remedy="correct gain=, or leave it out",
+            )
+        )
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    return Expected(
+        running=as_expression("minimize_expected", "running cost", running, (1, 1)),
+        terminal=as_expression("minimize_expected", "terminal cost", terminal, (1, 1)),
+        terminal_weight=_by_name("terminal_weight", terminal_weight, entries),
+        control_weight=_by_name("control_weight", control_weight, problem.controls),
+        gain=gain,
+        where=caller(),
+    )
+
+
+def check_first_cost(problem: Any, call: str) -> None:
+    """A problem has one cost, stated by `minimize` or by `minimize_expected`."""
+    former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
+    if former:
+        raise ProblemError(
+            describe(
+                "The cost is given twice.",
+                expected="one call of minimize() or minimize_expected()",
+                received=f"{call}() after {former}()",
+                remedy="add the terms up in one call"
+                if call == former
+                else "use one of the two: minimize_expected() stands in place of minimize()",
+            )
+        )
+
+
+def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
+    """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
+    if not isinstance(weights, Mapping):
+        return weights
+    result: dict[str, Any] = {}
+    word = what.replace("_", " ")
+    symbols, sizes = {e.name: e.symbol for e in entries}, {e.name: e.size for e in entries}
+    for key, value in weights.items():
+        name = name_of(key, symbols, tuple(sizes), missing_ok=True, sizes=sizes)
+        entry = split_entry(name)
+        if name in sizes or entry is None:
+            name = find_name(key, what, entries, tuple(entries))
+            weight = density_matrix(name, word, value, sizes[name])
+        else:
+            name, k = entry
+            own = density_matrix(f"{name}[{k}]", word, value, 1)
+            weight = ca.diagcat(ca.MX(k, k), own, ca.MX(sizes[name] - k - 1, sizes[name] - k - 1))
+        result[name] = result[name] + weight if name in result else weight
+    return result
+
+
+def derive(problem: Problem) -> Problem:
+    """The deterministic vector-matrix problem of a problem with an expected cost.
+
+    Args:
+        problem: with `minimize_expected`.
+
+    Returns:
+        A problem on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
+
+    Raises:
+        ProblemError: the system is deterministic or has no control, it contains matrices, a control has no weight, a
+            terminal condition has none.
+    """
+    expected = problem.expected
+    assert expected is not None
+    _check_random(problem)
+    _check_contents(problem, expected)
+    derived = _copied(problem)
+    if not any(matrix.estimation for matrix in derived.matrices):
+        derived.estimation_covariance()
+    _check_free_names(derived)
+    expansion = expand(derived, expected)
+    E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
+    size = E.shape[0]
+    jacobian, density = measurement_slope(derived, size)
+    innovation = E @ jacobian.T  # K U
+    information = ca.MX(size, size)
+    if jacobian.shape[0]:
+        blocks = [(entry.noise, entry.information) for entry in derived.measurements]
+        information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
+    if expected.gain is None:
+        S, expansion = _add_feedback(derived, expansion)
+        fed = S @ expansion.G + expansion.N
+        regained = _trace(S, expansion.Q) + _trace(fed @ _inverse(expansion.B) @ fed.T, E)
+        expansion = replace(expansion, alternative=expansion.running + regained / 2, product=_trace(S, E) / 2)
+        running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
+        terminal = expansion.terminal + _trace(expansion.end, E) / 2
+    else:
+        X, expansion = _add_free_gain(derived, expansion, expected.gain, information)
+        C = expansion.gain
+        fed = _trace(expansion.B @ C, X @ C.T) - 2 * _trace(expansion.N, C @ X)
+        running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
+        terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
+    derived.cost = (running, terminal)
+    derived.expansion = expansion
+    return derived
+
+
+def deterministic(problem: Problem) -> Problem:
+    """The problem without its noise: what quadratic synthesis takes the nominal from [Schmidt 6.3].
+
+    Raises:
+        ProblemError: no expected cost, constrained gains, or a deterministic part of the cost that depends on nothing
+            that can be chosen.
+    """
+    expected = problem.expected
+    if expected is None:
+        raise ProblemError(
+            describe(
+                "nominal='deterministic' needs an expected cost.",
+                expected="a problem with minimize_expected()",
+                received=f"'{problem.name}' with minimize()",
+                remedy="leave nominal= out: the cost is deterministic already",
+            )
+        )
+    if expected.gain is not None:
+        raise ProblemError(
+            describe(
+                "nominal='deterministic' needs the best gain.",
+                expected="minimize_expected() without gain=: the gain follows from the nominal",
+                received=str(expected.gain),
+                remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
+            )
+        )
+    plain = _copied(problem)
+    plain.cost = (expected.running, expected.terminal)
+    used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
+    plain.matrices = [m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation]
+    entries: list[Any] = [*problem.states, *problem.controls, *plain.matrices]
+    chosen = {entry.symbol.__hash__() for entry in entries}
+    if problem.free_duration is not None:
+        chosen.add(problem.duration.__hash__())
+    if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*plain.cost))):
+        raise ProblemError(
+            describe(
+                "The deterministic part of the expected cost depends on nothing that can be chosen.",
+                expected="a running or terminal cost of states, controls or the free duration",
+                received=f"running = {expected.running}, terminal = {expected.terminal}",
+                remedy="evaluate(problem, nominal=...) takes any nominal; or add a small deterministic cost",
+            )
+        )
+    return plain
+
+
+def _copied(problem: Problem) -> Problem:
+    """The same declarations and symbols, in lists of its own."""
+    derived = copy.copy(problem)
+    for name in ("states", "unknowns", "parameters", "controls", "matrices", "measurements", "constraints"):
+        setattr(derived, name, list(getattr(problem, name)))
+    derived.rates = dict(problem.rates)
+    derived.expected, derived._frozen = None, None
+    return derived
+
+
+def _check_random(problem: Problem) -> None:
+    """Something must be uncertain, or the expected cost is the deterministic one."""
+    entries: list[Any] = [*problem.states, *problem.unknowns]
+    variances = [entry.variance for entry in entries]
+    densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    started = [m.initial for m in problem.matrices if m.estimation]
+    uncertain = [*(started or variances), *densities]
+    if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
+        raise ProblemError(
+            describe(
+                "The expected cost is deterministic: nothing in the system is uncertain.",
+                expected="variance= of a state or an unknown, or noise= in dynamics()",
+                received="no initial variance and no process noise",
+                remedy="use minimize() for a deterministic problem, or say what is uncertain",
+            )
+        )
+
+
+def _check_contents(problem: Problem, expected: Expected) -> None:
+    """There is a control, the actual system contains no matrices, and the weights no symbols of another problem."""
+    if not problem.controls:
+        raise ProblemError(
+            describe(
+                "An expected cost needs a control: without one nothing is fed back.",
+                expected="control(...), whose deviations the feedback chooses",
+                received="none",
+                remedy="declare one; or state a cost of the covariance, by estimation_covariance() and minimize()",
+            )
+        )
+    own: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
+    known = {symbol.__hash__() for symbol in (problem.time, problem.duration, *(entry.symbol for entry in own))}
+    matrices = {entry.symbol.__hash__(): entry.name for entry in problem.matrices}
+    contents: list[tuple[str, Any]] = [("running cost", expected.running), ("terminal cost", expected.terminal)]
+    for what, given in (("terminal weight", expected.terminal_weight), ("control weight", expected.control_weight)):
+        values = given.values() if isinstance(given, Mapping) else [given]
+        contents += [(what, value) for value in values if isinstance(value, ca.MX)]
+    rates = [(s.name, problem.rates[s.name]) for s in problem.states if s.name in problem.rates]
+    contents += [(f"rate of '{name}'", entry.rate) for name, entry in rates]
+    contents += [(f"noise of '{name}'", entry.noise) for name, entry in rates if entry.noise is not None]
+    contents += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
+    for what, expression in contents:
+        for symbol in ca.symvar(expression):
+            matrix = matrices.get(symbol.__hash__())
+            if matrix is not None or (symbol.__hash__() not in known and what.endswith("weight")):
+                content = f"the matrix '{matrix}'" if matrix else f"'{symbol.name()}', which is not a symbol of it"
+                raise ProblemError(
+                    describe(
+                        f"The {what} of a problem with an expected cost contains {content}.",
+                        expected="states, unknowns, controls, parameters, time: the actual system has no covariance",
+                        received=str(expression)[:200],
+                        remedy="state a cost or a condition of covariances by minimize() or subject_to()"
+                        if matrix
+                        else f"declare '{symbol.name()}' in this problem",
+                    )
+                )
+
+
+def _check_free_names(problem: Problem) -> None:
+    """The names of the derived matrices must not be taken."""
+    for entry in problem._declared:
+        if entry.name in (FEEDBACK, ESTIMATE, GAIN):
+            raise ProblemError(
+                describe(
+                    f"The name '{entry.name}' is taken by minimize_expected().",
+                    expected=f"any name but {FEEDBACK}, {ESTIMATE}, {GAIN}: they are the matrices of the feedback",
+                    received=f"'{entry.name}', declared at {entry.where}",
+                    remedy="choose another name",
+                )
+            )
+
+
+def _trace(a: Any, b: Any) -> Any:
+    """tr(a b)."""
+    return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
+
+
+def _inverse(density: Any) -> Any:
+    """`inverse`, in scalar operations where it is a full matrix of expressions: CasADi solves those numerically."""
+    if density.is_constant() or density.sparsity().is_diag():
+        return inverse(density)
+    entries = ca.SX.sym("entries", *density.shape)
+    return ca.Function("inverse", [entries], [ca.inv(entries)])(density)
+
+
+def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansion]:
+    """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
+    labels = augmented_names([*problem.states, *problem.unknowns])
+    F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
+    weight = _inverse(expansion.B)
+    form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
+    backward = Backward(end=expansion.end, form=form)
+    feedback = declare_matrix(FEEDBACK, labels=labels, where="minimize_expected()", backward=backward)
+    problem.matrices.append(feedback)
+    S = feedback.matrix
+    return S, replace(expansion, gain=weight @ (G.T @ S + N.T))
+
+
+def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, information: Any) -> tuple[Any, Expansion]:
+    """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
+    labels = augmented_names([*problem.states, *problem.unknowns])
+    size, rows = len(labels), sum(control.size for control in problem.controls)
+    pattern, low, high, guess = _gain_entries(gain, (rows, size))
+    where = np.flatnonzero(pattern.ravel(order="F"))
+    symbol = ca.MX.sym(GAIN, where.size)
+    position = ca.DM.zeros(rows * size, where.size)
+    for k, index in enumerate(where.tolist()):
+        position[index, k] = 1.0
+    C = ca.reshape(ca.sparsify(position) @ symbol, rows, size)
+    common: dict[str, Any] = {
+        "name": GAIN,
+        "symbol": symbol,
+        "size": int(where.size),
+        "where": "minimize_expected()",
+        "unit": "",
+        "lower": low.ravel(order="F")[where],
+        "upper": high.ravel(order="F")[where],
+        "guess": guess.ravel(order="F")[where],
+        "scale": None,
+    }
+    if gain.constant:
+        free = ca.MX(ca.DM.nan(where.size, 1))
+        nothing = ca.MX(where.size, where.size)
+        problem.states.append(State(**common, initial=free, final=free, variance=nothing, estimated=False))
+        problem.rates[GAIN] = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
+    else:
+        problem.controls.append(Control(**common))
+    estimate = declare_matrix(
+        ESTIMATE,
+        labels=labels,
+        where="minimize_expected()",
+        initial=np.zeros((size, size)),
+        lower=0.0,
+        covariance=True,
+    )
+    problem.matrices.append(estimate)
+    X, closed = estimate.matrix, expansion.F - expansion.G @ C
+    rate = closed @ X + X @ closed.T + information
+    problem.rates[ESTIMATE] = Dynamics(rate=pack_symbolic(rate), noise=None, where="minimize_expected()")
+    return X, replace(expansion, gain=C)
+
+
+def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:
+    """Pattern, bounds and guess of a gain, all of its shape.
+
+    Raises:
+        ProblemError: where one does not fit.
+    """
+    values = []
+    for what, value in (
+        ("structure", np.ones(shape) if gain.structure is None else gain.structure),
+        ("lower", gain.lower),
+        ("upper", gain.upper),
+        ("guess", 0.0 if gain.guess is None else gain.guess),
+    ):
+        numbers = as_number(GAIN, what, value)
+        if numbers.size == 1:
+            numbers = np.full(shape, float(numbers.reshape(())))
+        if numbers.shape != shape or np.isnan(numbers).any():
+            raise ProblemError(
+                describe(
+                    f"The {what} of the gain does not fit.",
+                    expected=f"a number, or an array of shape {shape}: controls by augmented states, without NaN",
+                    received=f"shape {numbers.shape}",
+                    remedy=f"correct Gain({what}=...)",
+                )
+            )
+        values.append(numbers)
+    pattern, low, high, guess = values
+    if not pattern.any() or (low > high).any():
+        raise ProblemError(
+            describe(
+                "The gain leaves nothing to choose.",
+                expected="a structure with at least one entry, and lower <= upper",
+                received=str(gain),
+                remedy="correct Gain(...)",
+            )
+        )
+    return pattern != 0, low, high, np.clip(guess, low, high)

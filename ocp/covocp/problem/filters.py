@@ -1,0 +1,164 @@
+"""The extended Kalman filter of a problem: its actual system, with the unknowns as states that stay constant."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, overload
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import check_kind
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array, unpack
+from covocp.blocks.bucy import time_step
+from covocp.blocks.extended import bucy_slopes, corrected_by, propagated
+from covocp.blocks.updates import Form, Missing
+
+if TYPE_CHECKING:
+    from covocp.problem.builder import Problem
+    from covocp.problem.declarations import State, Unknown
+    from covocp.statement.statement import Statement
+
+
+@overload
+def extended_filter(problem: Problem, *, step: None = None, duration: float | None = None) -> ca.Function: ...
+@overload
+def extended_filter(
+    problem: Problem,
+    *,
+    step: float,
+    substeps: int = 1,
+    form: Form = "joseph",
+    missing: Missing = "raise",
+    duration: float | None = None,
+) -> tuple[ca.Function, ca.Function]: ...
+def extended_filter(
+    problem: Problem,
+    *,
+    step: float | None = None,
+    substeps: int = 1,
+    form: Form = "joseph",
+    missing: Missing = "raise",
+    duration: float | None = None,
+) -> ca.Function | tuple[ca.Function, ca.Function]:
+    """Extended Kalman filter of the actual system of a problem; its rows are those of the estimation covariance.
+
+    Continuous: the Kalman-Bucy filter with slopes at the estimate [Schmidt 2.5-3]. Discrete: the same model sampled
+    (item 8); a reading is the mean of the measurement over a step, so its noise has the covariance density / step.
+
+    Args:
+        problem: with noise and measurements as declared; parameters have their values.
+        step: between readings [s], controls are held over it; None: continuous.
+        substeps: of a step.
+        form: of the update, see `kalman.update`.
+        missing: "raise": readings are trusted, "skip": a row that is NaN is no measurement.
+        duration: T [s], where it is free and the system depends on it; None: its guess.
+
+    Returns:
+        Continuous: (x, P, u, y, t) -> dx/dt, dP/dt. Discrete: predict (x, P, u, t) -> x, P a step later, with t at the
+        start of it, and update (x, P, y, u, t) -> x, P after the reading.
+
+    Raises:
+        ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive.
+    """
+    system = _System(problem, duration)
+    x, P, u, t = system.symbols
+    readings = 0 if system.measurement is None else system.measurement.size1_out(0)
+    y = type(x).sym("y", readings)
+    value, density = (type(x)(0, 1), type(x)(0, 0)) if system.measurement is None else system.measurement(x, t, u)
+    names = ["estimate", "covariance"]
+    if step is None:
+        slopes = bucy_slopes(x, P, y, (system.rate(x, t, u), system.noise(x, t, u)), (value, density))
+        return ca.Function("rate", [x, P, u, y, t], slopes, ["x", "P", "u", "y", "t"], ["dx", "dP"])
+    length = time_step(step)
+    ahead = propagated(system.rate, system.noise, (x, P, t, u), length, substeps)
+    after = corrected_by(x, P, y, (value, density / length), form, missing) if readings else [x, P]
+    return (
+        ca.Function("predict", [x, P, u, t], ahead, ["x", "P", "u", "t"], names),
+        ca.Function("update", [x, P, y, u, t], after, ["x", "P", "y", "u", "t"], names),
+    )
+
+
+def initial_estimate(problem: Problem) -> tuple[Array, Array]:
+    """Where the filter of a problem starts: initial states and means of the unknowns, and their covariance.
+
+    Args:
+        problem: with the variances as declared, or with an initial estimation covariance.
+
+    Returns:
+        Estimate (n,), NaN where an initial state is free, and covariance (n, n).
+
+    Raises:
+        ProblemError: no `Problem` or an incomplete one.
+    """
+    statement = _statement(problem)
+    means = _parameters(statement)[1]
+    starts = statement.boundary_values(statement.values)
+    estimate = np.concatenate([starts[0][: len(statement.augmented) - means.size], means])
+    for block in statement.matrices:
+        if block.estimation:
+            return estimate, unpack(starts[2][block.span], block.size)
+    entries: list[State | Unknown] = [*problem.states, *problem.unknowns]
+    variances = ca.diagcat(*(entry.variance for entry in entries))
+    covariance = ca.Function("variances", [entry.symbol for entry in problem.parameters], [variances])
+    values = covariance.call([ca.DM(entry.value) for entry in problem.parameters])
+    return estimate, np.asarray(values[0].full())
+
+
+class _System:
+    """Rates, process noise and measurement of the augmented state, functions of (x, t, u)."""
+
+    def __init__(self, problem: Problem, duration: float | None) -> None:
+        statement = _statement(problem)
+        if statement.coupled:
+            raise ProblemError(
+                describe(
+                    "The dynamics depend on matrices of the problem.",
+                    expected="rates of states, unknowns, controls and time",
+                    received="rates that contain a covariance or another matrix state",
+                    remedy="build the filter from f and h with kalman.extended",
+                )
+            )
+        kind: Any = statement.symbolic
+        known, means = _parameters(statement)
+        size, controls = len(statement.augmented), sum(entry.size for entry in problem.controls)
+        estimated = size - means.size
+        x, t, u = kind.sym("x", size), kind.sym("t"), kind.sym("u", controls)
+        self.symbols = x, kind.sym("P", size, size), u, t
+        # what a derived problem adds to states and controls (gains, for instance) moves nothing in the actual system
+        state = ca.vertcat(x[:estimated], kind.zeros(statement.nx - estimated))
+        control = ca.vertcat(u, kind.zeros(statement.nu - controls))
+        length = statement.duration.guess if duration is None else duration
+        at = (state, control, t, length, ca.vertcat(known, x[estimated:]))
+        nominal: Any = statement.nominal
+        rate = ca.vertcat(nominal(*at)[0][:estimated], kind.zeros(means.size))
+        self.rate = ca.Function("rate", [x, t, u], [ca.densify(rate)])
+        expression = statement.expression(_process_noise(problem, means.size))
+        noise = expression(state, control, kind.zeros(statement.ne), *at[2:])
+        self.noise = ca.Function("noise", [x, t, u], [ca.densify(noise)])
+        self.measurement: ca.Function | None = None
+        if statement.measurement is not None:
+            value, _, density = statement.measurement(*at)
+            self.measurement = ca.Function("measurement", [x, t, u], [value, density])
+
+
+def _statement(problem: Problem) -> Statement:
+    from covocp.problem.builder import Problem
+
+    check_kind(problem, Problem, "give the problem itself, not its solution")
+    return problem.statement()
+
+
+def _parameters(statement: Statement) -> tuple[Array, Array]:
+    """Values of the known parameters, means of the unknowns."""
+    count = sum(block.length for block in statement.of_kind("unknown"))
+    return statement.values[: statement.np - count], statement.values[statement.np - count :]
+
+
+def _process_noise(problem: Problem, unknowns: int) -> Any:
+    """Density of the process noise of the augmented state, in the user's symbols."""
+    noises: list[Any] = []
+    for state in problem.states:
+        density = problem.rates[state.name].noise
+        noises.append(ca.MX(state.size, state.size) if density is None else density)
+    return ca.diagcat(*noises, ca.MX(unknowns, unknowns))

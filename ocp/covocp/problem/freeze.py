@@ -1,0 +1,493 @@
+"""Problem -> frozen statement: everything that a user declared becomes CasADi functions of stacked vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import check_dynamics
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import pack_symbolic, unpack_symbolic
+from covocp.base.riccati_rates import inverse, recognise, riccati_rate
+from covocp.problem.declarations import Constraint, Matrix, Place
+from covocp.problem.estimation_covariance import augmented_names
+from covocp.problem.measurement_information import check_readings, inverse_density
+from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement
+
+if TYPE_CHECKING:
+    from covocp.problem.builder import Problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stacked:
+    """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them."""
+
+    inputs: tuple[Any, ...]
+    estimated: int
+    unknowns: int
+    substitute: Callable[..., list[Any]]
+    symbolic: type
+
+    def function(self, name: str, expressions: list[Any], *, without: tuple[str, ...] = ()) -> ca.Function:
+        """A function of the stacked vectors, with named inputs."""
+        kept = [(symbol, label) for symbol, label in zip(self.inputs, INPUTS, strict=True) if label not in without]
+        outputs = [f"out{i}" for i in range(len(expressions))]
+        return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
+
+
+def freeze(problem: Problem) -> Statement:
+    """Build the statement of a problem.
+
+    Raises:
+        ProblemError: dynamics or cost missing, symbols of another problem, a cost that depends on nothing, a
+            measurement noise that is singular.
+    """
+    _check_complete(problem)
+    stacked = _stack(problem)
+    x, u, e, t, _, p = stacked.inputs
+    rates = _state_rates(problem, stacked)
+    matrix_rates, riccati, measurement = _matrix_rates(problem, stacked, rates)
+    running, terminal = stacked.substitute(*(problem.cost or ()))
+    coupled = bool(ca.depends_on(rates, e)) if problem.matrices else False
+    running_uses = bool(ca.depends_on(running, e)) if problem.matrices else False
+    nominal = None
+    if not coupled:
+        cost = ca.DM(0) if running_uses else running
+        nominal = stacked.function("nominal", [rates, cost], without=("matrices",))
+    everything = ca.veccat(rates, matrix_rates, running)
+    return Statement(
+        name=problem.name,
+        blocks=_blocks(problem),
+        duration=_duration(problem),
+        values=np.concatenate(
+            [np.zeros(0), *(q.value for q in problem.parameters), *(q.mean for q in problem.unknowns)]
+        ),
+        nominal=nominal,
+        rates=stacked.function("rates", [rates, matrix_rates, running]),
+        terminal=stacked.function("terminal", [terminal], without=("control", "time")),
+        boundary=_boundary(problem, stacked),
+        matrix_end=_matrix_end(problem, stacked),
+        loop=_loop(problem, stacked),
+        riccati=riccati,
+        measurement=measurement,
+        measurements=_measured(problem),
+        information=_information(problem, stacked),
+        path=_conditions(problem, stacked, "path"),
+        start=_conditions(problem, stacked, "initial"),
+        end=_conditions(problem, stacked, "final"),
+        state_bounds=_bounds(problem.states),
+        control_bounds=_bounds(problem.controls),
+        matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
+        guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
+        scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
+        augmented=augmented_names(_estimated(problem)),
+        coupled=coupled,
+        symbolic=stacked.symbolic,
+        autonomous=not ca.depends_on(everything, t),
+        noise_varies=_noise_varies(problem),
+        running_uses_matrices=running_uses,
+        symbols=_symbols(problem),
+        expression=_expression_builder(problem, stacked),
+    )
+
+
+def _estimated(problem: Problem) -> list[Any]:
+    """The declarations of the augmented state: states, then unknowns."""
+    return [*(state for state in problem.states if state.estimated), *problem.unknowns]
+
+
+def _all(*groups: Iterable[Any]) -> list[Any]:
+    """Declarations of several kinds in one list."""
+    return [entry for group in groups for entry in group]
+
+
+def _check_complete(problem: Problem) -> None:
+    """Everything that must be declared is there, and nothing comes from another problem."""
+    moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
+    check_dynamics(moving, problem.rates)
+    if not problem.states:
+        raise ProblemError(
+            describe(
+                "The problem has no state.", expected="at least one state", received="none", remedy="add one by state()"
+            )
+        )
+    if problem.cost is None:
+        raise ProblemError(
+            describe(
+                "The problem has no cost.",
+                expected="minimize(running=..., terminal=...), or minimize_expected",
+                received="none",
+                remedy="say what is to be minimised",
+            )
+        )
+    if not problem.controls and problem.free_duration is None:
+        free = [s for s in problem.states if not s.initial.is_constant() or np.isnan(ca.evalf(s.initial).full()).any()]
+        if not free:
+            raise ProblemError(
+                describe(
+                    "There is nothing to choose.",
+                    expected="a control, a free initial value or a free duration",
+                    received="none of them",
+                    remedy="declare a control by control()",
+                )
+            )
+    entry_augmented = sum(entry.size for entry in _estimated(problem))
+    covariance = next((m for m in problem.matrices if m.estimation), None)
+    if covariance is not None and covariance.size != entry_augmented:
+        raise ProblemError(
+            describe(
+                "States or unknowns were declared after estimation_covariance().",
+                expected="estimation_covariance() after the last state() and unknown()",
+                received=f"a covariance of {covariance.size} rows for {entry_augmented} states and unknowns",
+                remedy="move the call down",
+            )
+        )
+    _check_symbols(problem)
+    check_readings(problem.measurements, problem.matrices)
+
+
+def _check_symbols(problem: Problem) -> None:
+    """Every symbol in every expression belongs to this problem; the cost depends on something."""
+    known = _symbols(problem)
+    hashes = {symbol.__hash__() for symbol in known.values()}
+    expressions: list[tuple[str, Any]] = [
+        (f"the rate of '{name}'", entry.rate) for name, entry in problem.rates.items()
+    ]
+    expressions += [(f"the noise of '{k}'", v.noise) for k, v in problem.rates.items() if v.noise is not None]
+    expressions += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
+    expressions += [(f"'{c.name}'", c.expression) for c in problem.constraints]
+    expressions += [("the cost", ca.veccat(*(problem.cost or ())))]
+    for what, expression in expressions:
+        for symbol in ca.symvar(expression):
+            if symbol.__hash__() not in hashes:
+                twin = symbol.name() in known
+                raise ProblemError(
+                    describe(
+                        f"There is an unknown symbol '{symbol.name()}' in {what}.",
+                        expected="symbols of this problem: " + ", ".join(known),
+                        received=str(expression)[:200] + (" with a symbol of another problem" if twin else ""),
+                        remedy=f"use the '{symbol.name()}' that was declared in this problem"
+                        if twin
+                        else f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
+                    )
+                )
+    passing: list[Any] = [*problem.controls, SimpleNamespace(name="time", symbol=problem.time)]
+    terminal_cost = problem.cost[1] if problem.cost is not None else ca.MX(0)
+    terminal = {symbol.__hash__() for symbol in ca.symvar(terminal_cost)}
+    for entry in passing:
+        if entry.symbol.__hash__() in terminal:
+            raise ProblemError(
+                describe(
+                    f"The terminal cost contains '{entry.name}'.",
+                    expected="states, matrix states, parameters and the duration",
+                    received=str(terminal_cost)[:200],
+                    remedy="use Problem.duration for the terminal time; controls belong into the running cost",
+                )
+            )
+    constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
+    constants.add(problem.time.__hash__())
+    if all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
+        raise ProblemError(
+            describe(
+                "The cost depends on nothing that can be chosen.",
+                expected="a cost of states, controls, matrix states or the free duration",
+                received="running = {}, terminal = {}".format(*problem.cost or ()),
+                remedy="check the arguments of minimize()",
+            )
+        )
+
+
+def _symbols(problem: Problem) -> dict[str, Any]:
+    """All symbols by name."""
+    entries = _all(problem.states, problem.controls, problem.matrices, problem.unknowns, problem.parameters)
+    symbols = {entry.name: entry.symbol for entry in entries} | {"time": problem.time}
+    if problem.free_duration is not None:
+        symbols["duration"] = problem.duration
+    return symbols
+
+
+def _stack(problem: Problem) -> Stacked:
+    """Stacked symbols, SX where every expression can be expanded, and the substitution of the user's symbols."""
+    groups: list[Any] = [problem.states, problem.controls, problem.matrices, problem.parameters, problem.unknowns]
+    own = [entry.symbol for group in groups for entry in group] + [problem.time]
+    if problem.free_duration is not None:
+        own.append(problem.duration)
+    every = [entry.rate for entry in problem.rates.values()]
+    every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    every += [value for m in problem.measurements for value in (m.expression, m.noise)]
+    every += [c.expression for c in problem.constraints] + list(problem.cost or ())
+    symbolic: type = ca.SX
+    try:
+        ca.Function("everything", own, every).expand()
+    except RuntimeError:  # interpolation tables and external functions have no SX form
+        symbolic = ca.MX
+    sizes = [sum(entry.symbol.shape[0] for entry in group) for group in groups]
+    sizes[3:] = [sizes[3] + sizes[4]]
+    x, u, e, p = (symbolic.sym(n, k) for n, k in zip(("x", "u", "e", "p"), sizes, strict=True))  # type: ignore[attr-defined]
+    t, duration = symbolic.sym("t"), symbolic.sym("T")  # type: ignore[attr-defined]
+    arguments: list[Any] = []
+    groups[3:] = [[*problem.parameters, *problem.unknowns]]
+    for group, vector in zip(groups, (x, u, e, p), strict=True):
+        offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
+        arguments += [vector[i:j] for i, j in pairwise(offsets)]
+    arguments += [t, duration] if problem.free_duration is not None else [t]
+
+    def substitute(*expressions: Any) -> list[Any]:
+        function = ca.Function("substitute", own, list(expressions))
+        return list(function.call(arguments, True, False))
+
+    return Stacked(
+        inputs=(x, u, e, t, duration, p),
+        estimated=sum(entry.size for entry in problem.states if entry.estimated),
+        unknowns=sum(entry.size for entry in problem.unknowns),
+        substitute=substitute,
+        symbolic=symbolic,
+    )
+
+
+def _state_rates(problem: Problem, stacked: Stacked) -> Any:
+    """Rate of the stacked state."""
+    return ca.vertcat(*stacked.substitute(*(problem.rates[state.name].rate for state in problem.states)))
+
+
+def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, tuple[Any, ...], Any]:
+    """Rates of all half-vectors, their Riccati forms where they have one, and the measurement."""
+    e = stacked.inputs[2]
+    measurement = _measurement(problem, stacked)
+    values: list[Any] = []
+    forms: list[Any] = []
+    offset = 0
+    for entry in problem.matrices:
+        half = e[offset : offset + entry.symbol.shape[0]]
+        offset += entry.symbol.shape[0]
+        if entry.estimation:
+            form: Any = _kalman_form(problem, stacked, rates, measurement)
+            values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
+        elif entry.backward is not None:
+            form = tuple(stacked.substitute(*entry.backward.form))
+            values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
+        else:
+            values += stacked.substitute(problem.rates[entry.name].rate)
+            form = recognise(values[-1], half, entry.size) if stacked.symbolic is ca.SX else None
+        if form is not None and ca.depends_on(ca.veccat(*form), e):
+            form = None
+        forms.append(form and stacked.function(f"riccati_{len(forms)}", list(form), without=("matrices",)))
+    function = measurement and stacked.function("measurement", list(measurement), without=("matrices",))
+    empty = stacked.symbolic(0, 1)
+    return ca.vertcat(empty, *values), tuple(forms), function
+
+
+def _augmented_jacobian(stacked: Stacked, expression: Any) -> Any:
+    """Jacobian with respect to the augmented state (states, then unknowns)."""
+    x, p = stacked.inputs[0], stacked.inputs[5]
+    by_state = ca.jacobian(expression, x)[:, : stacked.estimated]
+    return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
+
+
+def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | None:
+    """Stacked measurement, its Jacobian M and the noise density U."""
+    if not problem.measurements:
+        return None
+    values = stacked.substitute(*(m.expression for m in problem.measurements))
+    density = ca.diagcat(*stacked.substitute(*(m.noise for m in problem.measurements)))
+    value = ca.vertcat(*values)
+    return value, _augmented_jacobian(stacked, value), density
+
+
+def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: Any) -> tuple[Any, Any, Any]:
+    """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
+    size = stacked.estimated + stacked.unknowns
+    constants = ca.DM.zeros(stacked.unknowns, 1)
+    drift = _augmented_jacobian(stacked, ca.vertcat(rates[: stacked.estimated], constants))
+    noises = []
+    for state in (entry for entry in problem.states if entry.estimated):
+        density = problem.rates[state.name].noise
+        noises.append(ca.DM(state.size, state.size) if density is None else stacked.substitute(density)[0])
+    count = sum(entry.size for entry in problem.unknowns)
+    noise = ca.diagcat(*noises, ca.DM(count, count))
+    if measurement is None:
+        return drift, noise, stacked.symbolic(size, size)
+    _, jacobian, density = measurement
+    blocks = [
+        (stacked.substitute(m.noise)[0], None if m.information is None else stacked.substitute(m.information)[0])
+        for m in problem.measurements
+    ]
+    return drift, noise, jacobian.T @ inverse_density(density, blocks, inverse) @ jacobian
+
+
+def _information(problem: Problem, stacked: Stacked) -> ca.Function | None:
+    """What is stated as information, one below the other."""
+    stated = [ca.diag(entry.information) for entry in problem.measurements if entry.information is not None]
+    if not stated:
+        return None
+    return stacked.function("information", stacked.substitute(ca.vertcat(*stated)), without=("matrices",))
+
+
+def _noise_varies(problem: Problem) -> bool:
+    """Whether a noise density depends on more than parameters."""
+    densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    densities += [entry.noise for entry in problem.measurements]
+    constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
+    return any(symbol.__hash__() not in constants for density in densities for symbol in ca.symvar(density))
+
+
+def _blocks(problem: Problem) -> tuple[Block, ...]:
+    """Where each symbol lies."""
+    blocks = []
+    parameters = 0
+    for kind, group in (
+        ("state", problem.states),
+        ("control", problem.controls),
+        ("matrix", problem.matrices),
+        ("parameter", problem.parameters),
+        ("unknown", problem.unknowns),
+    ):
+        offset = parameters if kind == "unknown" else 0
+        for entry in group:
+            blocks.append(
+                Block(
+                    name=entry.name,
+                    kind=kind,  # type: ignore[arg-type]
+                    size=entry.size,
+                    offset=offset,
+                    labels=entry.labels if isinstance(entry, Matrix) else (),
+                    covariance=isinstance(entry, Matrix) and entry.covariance,
+                    estimation=isinstance(entry, Matrix) and entry.estimation,
+                    backward=isinstance(entry, Matrix) and entry.backward is not None,
+                    unit=entry.unit,
+                )
+            )
+            offset += blocks[-1].length
+        if kind == "parameter":
+            parameters = offset
+    return tuple(blocks)
+
+
+def _measured(problem: Problem) -> tuple[Block, ...]:
+    """Where each measurement lies."""
+    sizes = [m.expression.shape[0] for m in problem.measurements]
+    offsets = np.cumsum([0, *sizes]).tolist()
+    return tuple(
+        Block(name=m.name, kind="measurement", size=size, offset=offset, unit=m.unit)
+        for m, size, offset in zip(problem.measurements, sizes, offsets, strict=False)
+    )
+
+
+def _duration(problem: Problem) -> Duration:
+    """The terminal time."""
+    free = problem.free_duration
+    if free is None:
+        number = float(problem.duration)
+        return Duration(guess=number, lower=number, upper=number)
+    return Duration(guess=free.guess, lower=free.lower, upper=free.upper)
+
+
+def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
+    """Initial and final values of states and matrices as functions of the parameters."""
+    own = [entry.symbol for entry in _all(problem.parameters, problem.unknowns)]
+    free = [ca.MX(ca.DM.nan(entry.symbol.shape)) for entry in problem.matrices]
+    outputs = [
+        ca.vertcat(ca.MX(0, 1), *(entry.initial for entry in problem.states)),
+        ca.vertcat(ca.MX(0, 1), *(entry.final for entry in problem.states)),
+        ca.vertcat(
+            ca.MX(0, 1),
+            *(m.initial if m.initial is not None else f for m, f in zip(problem.matrices, free, strict=True)),
+        ),
+        ca.vertcat(
+            ca.MX(0, 1), *(m.final if m.final is not None else f for m, f in zip(problem.matrices, free, strict=True))
+        ),
+    ]
+    p = ca.MX.sym("parameters", sum(symbol.shape[0] for symbol in own))
+    offsets = np.cumsum([0, *(symbol.shape[0] for symbol in own)]).tolist()
+    known = {symbol.__hash__() for symbol in own}
+    for symbol in ca.symvar(ca.veccat(*outputs)):
+        if symbol.__hash__() not in known:
+            raise ProblemError(
+                describe(
+                    f"An initial or final value contains '{symbol.name()}'.",
+                    expected="numbers, or expressions of parameters of this problem",
+                    received=f"'{symbol.name()}'",
+                    remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
+                )
+            )
+    arguments = [p[i:j] for i, j in pairwise(offsets)]
+    values = ca.Function("boundary", own, outputs).call(arguments, True, False)
+    names = ["initial_state", "final_state", "initial_matrices", "final_matrices"]
+    return ca.Function("boundary", [p], values, ["parameters"], names)
+
+
+def _matrix_end(problem: Problem, stacked: Stacked) -> ca.Function | None:
+    """Half-vectors of the matrices that run backward, at the end."""
+    ends = [entry.backward.end for entry in problem.matrices if entry.backward is not None]
+    if not ends:
+        return None
+    values = ca.vertcat(*(pack_symbolic(end) for end in stacked.substitute(*ends)))
+    return stacked.function("matrix_end", [values], without=("control", "matrices", "time"))
+
+
+def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
+    """What the feedback of an expected cost sees, as functions."""
+    v = problem.expansion
+    if v is None:
+        return None
+    slopes = [ca.densify(entry) for entry in stacked.substitute(v.F, v.G, v.A, v.B, v.N, v.Q)]
+    (gain, running, terminal, end) = stacked.substitute(v.gain, v.running, v.terminal, v.end)
+    u = stacked.inputs[1][: slopes[3].shape[0]]
+    by_parts = None
+    if v.alternative is not None:
+        by_parts = stacked.function("by_parts", stacked.substitute(v.alternative, v.product))
+    return Loop(
+        expansion=stacked.function("expansion", slopes, without=("matrices",)),
+        gain=stacked.function("gain", [ca.densify(gain)]),
+        running=stacked.function("running", [running], without=("matrices",)),
+        terminal=stacked.function("terminal", [terminal, ca.densify(end)], without=("control", "matrices", "time")),
+        extra_control=stacked.function(
+            "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
+        ),
+        by_parts=by_parts,
+    )
+
+
+def _conditions(problem: Problem, stacked: Stacked, at: Place) -> Conditions:
+    """The inequalities of one place as one function."""
+    chosen: list[Constraint] = [c for c in problem.constraints if c.at == at]
+    values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
+    names = [c.name if c.lower.size == 1 else f"{c.name}[{i}]" for c in chosen for i in range(c.lower.size)]
+    return Conditions(
+        function=stacked.function(f"{at}_conditions", [values]),
+        names=tuple(names),
+        lower=np.concatenate([np.zeros(0), *(c.lower for c in chosen)]),
+        upper=np.concatenate([np.zeros(0), *(c.upper for c in chosen)]),
+        uses_matrices=bool(chosen and problem.matrices and ca.depends_on(values, stacked.inputs[2])),
+    )
+
+
+def _bounds(entries: Any) -> tuple[Any, Any]:
+    """Stacked lower and upper bounds."""
+    lower = np.concatenate([np.zeros(0), *(entry.lower for entry in entries)])
+    upper = np.concatenate([np.zeros(0), *(entry.upper for entry in entries)])
+    return lower, upper
+
+
+def _diagonal_bounds(entry: Matrix) -> Any:
+    """Lower bounds of a half-vector: the given one on the diagonal, none elsewhere."""
+    bounds = np.full((entry.size, entry.size), -np.inf)
+    if entry.lower is not None:
+        np.fill_diagonal(bounds, entry.lower)
+    rows, columns = np.triu_indices(entry.size)
+    return bounds[columns, rows]
+
+
+def _expression_builder(problem: Problem, stacked: Stacked) -> Callable[[Any], ca.Function]:
+    """What turns a user's expression into a function of the six stacked inputs."""
+
+    def build(expression: Any) -> ca.Function:
+        return stacked.function("expression", stacked.substitute(expression))
+
+    return build

@@ -1,0 +1,273 @@
+"""The systems of a simulation: the one that filter and feedback were designed for, and the one that really flies.
+
+Both are the same unless a truth is given. The augmented state is that of the estimation covariance: the states, then
+the unknown constants, which are the last entries of the parameters. One run of the actual system is had by putting its
+own unknowns there.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array, unpack
+from covocp.problem.builder import Problem
+from covocp.solution.solution import Solution
+from covocp.statement.names import name_of, stacked_parameters
+from covocp.statement.statement import Block, Statement
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class System:
+    """A system with its statistics. n: rows of the augmented state, of which `states` move; m: controls fed back.
+
+    start: mean of the augmented state at time zero, (n,).
+    variance: covariance of its deviation there, (n, n).
+    linear: (state, control, time, duration, parameters) -> rate of the augmented state (n,), F (n, n), G (n, m),
+        process noise Q (n, n), measured values h (r,), M (r, n), their slope by the control (r, m), noise U (r, r).
+    """
+
+    statement: Statement
+    parameters: Array
+    start: Array
+    variance: Array
+    states: int
+    fed_back: int
+    linear: ca.Function
+
+    @property
+    def size(self) -> int:
+        """Rows of the augmented state."""
+        return self.start.size
+
+    @property
+    def measured(self) -> int:
+        """Number of measured values."""
+        return int(self.linear.size1_out(4))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknown constants."""
+        return self.size - self.states
+
+    @property
+    def covariance(self) -> slice:
+        """Where the estimation covariance lies among the half-vectors of the statement."""
+        return next(b.span for b in self.statement.matrices if b.estimation)
+
+
+def design_system(solution: Solution) -> System:
+    """The system that a solution's filter and feedback assume.
+
+    Raises:
+        ProblemError: read from a file without its problem, no estimation covariance, or dynamics that depend on a
+            matrix.
+    """
+    statement = solution.statement
+    if statement is None:
+        raise ProblemError(
+            describe(
+                "This solution knows no problem, so there is nothing to simulate.",
+                expected="a solution with its problem",
+                received=f"'{solution.name}', read from a file",
+                remedy="load(path, problem=...) with the problem that was solved",
+            )
+        )
+    block = _estimation(statement)
+    if block is None:
+        raise ProblemError(
+            describe(
+                "Nothing is estimated in this problem, so there is neither noise nor a filter to simulate.",
+                expected="a problem with minimize_expected() or estimation_covariance()",
+                received=f"'{statement.name}' without either",
+                remedy="say what is uncertain (variance=, noise=) and call estimation_covariance()",
+            )
+        )
+    start = np.concatenate([solution.trajectory.x[0], solution.parameters])
+    return _system(
+        statement,
+        solution.parameters,
+        start=_augmented(statement, start[: statement.nx], solution.parameters),
+        variance=unpack(solution.trajectory.e[0, block.span], block.size),
+        fed_back=feedback_rows(statement),
+    )
+
+
+def actual_system(design: System, truth: Any) -> System:
+    """The system that is simulated.
+
+    Args:
+        design: of the solution.
+        truth: None: the same; a dict of parameter or unknown to the value that it really has in every run; or a problem
+            with the same states, unknowns, controls and measurements and any dynamics, noises and variances.
+
+    Raises:
+        ProblemError: where it is none of these, or names or sizes differ.
+    """
+    if truth is None:
+        return design
+    if isinstance(truth, Mapping):
+        return _with_values(design, truth)
+    if not isinstance(truth, Problem):
+        raise ProblemError(
+            describe(
+                "The truth is of an unknown kind.",
+                expected="a Problem with the same states, unknowns, controls and measurements, or a dict of name to "
+                "value",
+                received=repr(truth)[:100],
+                remedy="correct truth=",
+            )
+        )
+    _check_measured(design, truth)
+    statement = _statement_of(truth)
+    _check_symbols(design, statement)
+    return _from_statement(design, statement, statement.values)
+
+
+def feedback_rows(statement: Statement) -> int:
+    """Number of controls that are fed back: the first ones; none without an expected cost."""
+    return 0 if statement.loop is None else int(statement.loop.gain.size1_out(0))
+
+
+def _estimation(statement: Statement) -> Block | None:
+    return next((b for b in statement.matrices if b.estimation), None)
+
+
+def _augmented(statement: Statement, state: Array, parameters: Array) -> Array:
+    """Augmented state from the whole state and the parameters."""
+    unknowns = sum(b.size for b in statement.of_kind("unknown"))
+    states = len(statement.augmented) - unknowns
+    return np.concatenate([state[:states], parameters[parameters.size - unknowns :]])
+
+
+def _system(statement: Statement, parameters: Array, *, start: Array, variance: Array, fed_back: int) -> System:
+    unknowns = sum(b.size for b in statement.of_kind("unknown"))
+    return System(
+        statement=statement,
+        parameters=parameters,
+        start=start,
+        variance=variance,
+        states=start.size - unknowns,
+        fed_back=fed_back,
+        linear=_linear(statement, fed_back),
+    )
+
+
+def _linear(statement: Statement, fed_back: int) -> ca.Function:
+    """Rates and measurements with their slopes and noise densities, see `System.linear`."""
+    position = next(i for i, b in enumerate(statement.matrices) if b.estimation)
+    form = statement.riccati[position]
+    if statement.nominal is None or form is None:
+        raise ProblemError(
+            describe(
+                "The dynamics depend on a matrix, which the actual system does not have.",
+                expected="rates of the states that depend on states, controls, time and parameters",
+                received=f"'{statement.name}', a rate of which contains a matrix",
+                remedy="simulate a problem whose states move without the matrices",
+            )
+        )
+    symbolic: Any = statement.symbolic
+    sizes = (statement.nx, statement.nu, 1, 1, statement.np)
+    a = [symbolic.sym(name, k) for name, k in zip(("x", "u", "t", "T", "p"), sizes, strict=True)]
+    n = len(statement.augmented)
+    states = n - sum(b.size for b in statement.of_kind("unknown"))
+    rate = ca.vertcat(*ca.vertsplit(statement.nominal(*a)[0])[:states], symbolic.zeros(n - states, 1))
+    F, Q, _ = form(*a)
+    measured: tuple[Any, ...] = (symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0))
+    if statement.measurement is not None:
+        measured = statement.measurement(*a)
+    h, M, U = measured
+    slopes = [ca.jacobian(value, a[1])[:, :fed_back] for value in (rate, h)]
+    outputs = [rate, F, slopes[0], Q, h, M, slopes[1], U]
+    names = ["rate", "F", "G", "Q", "h", "M", "Hu", "U"]
+    inputs = ["state", "control", "time", "duration", "parameters"]
+    return ca.Function("linear", a, outputs, inputs, names)
+
+
+def _with_values(design: System, truth: Mapping[Any, Any]) -> System:
+    """The design with other values of parameters; an unknown that is given has this value in every run."""
+    statement = design.statement
+    names = tuple(b.name for b in statement.blocks if b.kind in ("parameter", "unknown"))
+    given = {name_of(key, statement.symbols, names, missing_ok=True) or str(key): v for key, v in truth.items()}
+    values = stacked_parameters(statement, given, design.parameters)
+    system = _from_statement(design, statement, values)
+    variance = system.variance.copy()
+    first = statement.np - design.unknowns
+    for block in statement.of_kind("unknown"):
+        if block.name in given:
+            rows = slice(design.states + block.offset - first, design.states + block.offset - first + block.size)
+            variance[rows, :] = 0.0
+            variance[:, rows] = 0.0
+    return _system(statement, values, start=system.start, variance=variance, fed_back=design.fed_back)
+
+
+def _from_statement(design: System, statement: Statement, values: Array) -> System:
+    """Start and covariance as a statement has them for these values; free ones as the design has them."""
+    state, _, matrices, _ = statement.boundary_values(values)
+    start = _augmented(statement, state, values)
+    start = np.where(np.isnan(start), design.start, start)
+    block = _estimation(statement)
+    assert block is not None
+    half = matrices[block.span]
+    variance = design.variance if np.isnan(half).any() else unpack(half, block.size)
+    return _system(statement, values, start=start, variance=variance, fed_back=design.fed_back)
+
+
+def _statement_of(truth: Problem) -> Statement:
+    """The truth as a statement with an estimation covariance; its cost and its constraints do not matter."""
+    plain = copy.copy(truth)
+    plain.matrices = [matrix for matrix in truth.matrices if matrix.estimation]
+    moving = {state.name for state in truth.states}
+    plain.rates = {name: entry for name, entry in truth.rates.items() if name in moving}
+    plain.measurements = list(truth.measurements)
+    plain.constraints = []
+    plain.expected, plain.expansion, plain._frozen = None, None, None
+    if not plain.matrices:
+        plain.estimation_covariance()
+    plain.cost = (ca.MX(0), ca.sumsqr(ca.vertcat(*(state.symbol for state in truth.states))))
+    return plain.statement()
+
+
+def _check_symbols(design: System, truth: Statement) -> None:
+    """Filter and feedback of the design must fit the truth."""
+    # Gains that were optimised are states or controls of the design, after those of the actual system.
+    rows = {"state": design.states, "control": design.fed_back or design.statement.nu}
+    for kind, what in (("state", "states"), ("unknown", "unknowns"), ("control", "controls")):
+        blocks = [b for b in design.statement.blocks if b.kind == kind]
+        own = [(b.name, b.size) for b in blocks if b.offset < rows.get(kind, b.offset + 1)]
+        other = [(b.name, b.size) for b in truth.blocks if b.kind == kind]
+        if own != other:
+            raise ProblemError(
+                describe(
+                    f"The truth has other {what} than the design.",
+                    expected=_listed(own),
+                    received=_listed(other),
+                    remedy=f"declare the same {what} in the same order and size; dynamics, noises and variances may "
+                    "differ",
+                )
+            )
+
+
+def _check_measured(design: System, truth: Problem) -> None:
+    """The filter of the design must be fed with what it expects."""
+    names = design.statement.measurement_names
+    rows = sum(m.expression.shape[0] for m in truth.measurements)
+    if names != tuple(m.name for m in truth.measurements) or rows != design.measured:
+        raise ProblemError(
+            describe(
+                "The truth has other measurements than the design.",
+                expected=f"{', '.join(names) or 'none'}: {design.measured} values",
+                received=f"{', '.join(m.name for m in truth.measurements) or 'none'}: {rows} values",
+                remedy="declare the same measurements in the same order and size; expressions and noises may differ",
+            )
+        )
+
+
+def _listed(entries: list[tuple[str, int]]) -> str:
+    return ", ".join(f"{name} ({size})" if size > 1 else name for name, size in entries) or "none"

@@ -1,0 +1,181 @@
+"""The constraints of the problem in the runs: which are looked at, who violates them, and what covariances promise.
+
+A run is looked at with its own state, unknowns and control, and the matrices that the solution has. An equality is met
+by no noisy run exactly, and what no run changes (a covariance, an open-loop control) is the same in all: neither is
+counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from scipy import special
+
+from covocp.base.matrices import Array
+from covocp.simulation.actual import System
+from covocp.simulation.prediction import Prediction
+from covocp.simulation.run_parts import Run, part
+from covocp.simulation.schedule import Nominal
+from covocp.solution.solution import Solution
+from covocp.statement.statement import Conditions, Statement, entry_names
+
+Place = Literal["path", "initial", "final"]
+# Limits count as kept within this share of their size.
+MARGIN = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Row:
+    """One inequality lower <= value <= upper that runs can violate.
+
+    bound: whether it is the bound of a state or of a control, whose name it has.
+    """
+
+    name: str
+    place: Place
+    lower: float
+    upper: float
+    bound: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rows:
+    """The inequalities that runs can violate, in their order: those of the path, of the start, of the end.
+
+    function: (state, control, matrices, time, duration, parameters) -> their values.
+    left_out: names of the constraints that are not counted, and why.
+    """
+
+    rows: tuple[Row, ...]
+    function: ca.Function
+    left_out: Mapping[str, str]
+
+    def at(self, *places: Place) -> list[int]:
+        """Positions of the rows of some places."""
+        return [i for i, row in enumerate(self.rows) if row.place in places]
+
+
+def counted_rows(design: System) -> Rows:
+    """The inequalities of a design's problem that its runs can violate."""
+    return _counted(design.statement, design.states, design.fed_back)
+
+
+@lru_cache(maxsize=8)
+def _counted(st: Statement, states: int, fed_back: int) -> Rows:
+    symbolic: Any = st.symbolic
+    sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
+    a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    unknowns = [k for b in st.of_kind("unknown") for k in range(b.span.start, b.span.stop)]
+    own = ca.vertcat(a[0][:states], a[1][:fed_back], a[5][unknowns])
+    rows, values, left_out = [], [], {}
+    for name, value, low, high in _bounds(st, a, (states, fed_back)):
+        rows.append(Row(name=name, place="path", lower=low, upper=high, bound=True))
+        values.append(value)
+    places: tuple[tuple[Place, Conditions], ...] = (("path", st.path), ("initial", st.start), ("final", st.end))
+    for place, conditions in places:
+        column = conditions.function(*a)
+        for i, name in enumerate(conditions.names):
+            low, high = float(conditions.lower[i]), float(conditions.upper[i])
+            if low == high:
+                left_out[name] = "an equality, which no noisy run meets exactly"
+            elif not ca.depends_on(column[i], own):
+                left_out[name] = "the same in all runs"
+            else:
+                rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False))
+                values.append(column[i])
+    function = ca.Function("conditions", a, [ca.densify(ca.vertcat(symbolic(0, 1), *values))])
+    return Rows(rows=tuple(rows), function=function, left_out=left_out)
+
+
+def _bounds(st: Statement, a: list[Any], sizes: tuple[int, int]) -> list[tuple[str, Any, float, float]]:
+    """Names, values and limits of the states and fed-back controls that have bounds."""
+    found = []
+    pairs = ((st.states, a[0], st.state_bounds), (st.controls, a[1], st.control_bounds))
+    for (blocks, column, (lower, upper)), size in zip(pairs, sizes, strict=True):
+        names = entry_names(blocks)
+        for i in range(size):
+            if np.isfinite(lower[i]) or np.isfinite(upper[i]):
+                found.append((names[i], column[i], float(lower[i]), float(upper[i])))
+    return found
+
+
+def violations(run: Run, z: Any, fed: Any, c: dict[str, Any]) -> Any:
+    """One for each inequality that a run violates, (rows,); what is no number violates it.
+
+    Args:
+        run: its symbols.
+        z: its state.
+        fed: the controls that it applies.
+        c: coefficients at this time.
+    """
+    design, solution = run.setting.design, run.setting.solution
+    chosen = counted_rows(design)
+    if not chosen.rows:
+        return run.symbolic(0, 1)
+    state = ca.vertcat(z[run.spans["x"]], part(c["x"], design.states))
+    u = ca.vertcat(fed, part(c["u"], design.fed_back))
+    known = ca.DM(solution.parameters[: solution.parameters.size - design.unknowns])
+    matrices = c["e"] if c["e"].shape[0] else run.symbolic.zeros(design.statement.ne)  # no constraint uses them
+    values = chosen.function(state, u, matrices, c["t"], solution.duration, ca.vertcat(known, run.own))
+    return ca.vertcat(*(beyond(values[i], row.lower, row.upper) for i, row in enumerate(chosen.rows)))
+
+
+def beyond(value: Any, low: float, high: float) -> Any:
+    """One unless a value is inside its limits, but for rounding."""
+    inside: Any = 1.0
+    if np.isfinite(low):
+        inside = value >= low - MARGIN * max(1.0, abs(low))
+    if np.isfinite(high):
+        inside = ca.logic_and(inside, value <= high + MARGIN * max(1.0, abs(high)))
+    return ca.logic_not(inside)
+
+
+def promised(solution: Solution, design: System, nominal: Nominal, prediction: Prediction) -> Array:
+    """Probability that each inequality is violated at some times, for normal deviations and to first order, (K, rows).
+
+    Args:
+        solution: whose feedback is used.
+        design: its system.
+        nominal: at these times.
+        prediction: of deviation and estimate there, of what is simulated.
+    """
+    chosen, count, st = counted_rows(design), nominal.t.size, design.statement
+    if not chosen.rows:
+        return np.zeros((count, 0))
+    columns = nominal.columns(solution.duration, solution.parameters)
+    values, slopes = (np.asarray(v.full()) for v in _linearised(st, design).map(count)(*columns))
+    rows = len(chosen.rows)
+    slopes = slopes.reshape(rows, count, 2 * design.size).transpose(1, 0, 2)
+    centre = values.T + np.einsum("kri,ki->kr", slopes, prediction.mean)
+    spread = np.sqrt(np.einsum("kri,kij,krj->kr", slopes, prediction.covariance, slopes).clip(0.0))
+    result = np.zeros((count, rows))
+    for i, row in enumerate(chosen.rows):
+        for limit, sign in ((row.lower, -1.0), (row.upper, 1.0)):
+            if np.isfinite(limit):
+                over = sign * (centre[:, i] - limit)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    share = special.ndtr(over / spread[:, i])
+                known = spread[:, i] == 0.0
+                share[known] = over[known] > MARGIN * max(1.0, abs(limit))
+                result[:, i] += share
+    return result
+
+
+def _linearised(st: Statement, design: System) -> ca.Function:
+    """(all six) -> values of the inequalities, and their slopes by deviation and estimate, (rows, 2n)."""
+    symbolic: Any = st.symbolic
+    sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
+    a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    values = counted_rows(design).function(*a)
+    unknowns = [k for b in st.of_kind("unknown") for k in range(b.span.start, b.span.stop)]
+    of_state, of_control, of_parameters = (ca.jacobian(values, a[i]) for i in (0, 1, 5))
+    slopes = ca.horzcat(of_state[:, : design.states], of_parameters[:, unknowns])
+    fed = symbolic(values.shape[0], design.size)
+    if st.loop is not None:
+        fed = -of_control[:, : design.fed_back] @ st.loop.gain(*a)
+    return ca.Function("linearised", a, [values, ca.densify(ca.horzcat(slopes, fed))])

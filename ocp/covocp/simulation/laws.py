@@ -1,0 +1,428 @@
+"""A plant, a filter and a feedback law in one loop, simulated: accurately without noise, many runs at once with it.
+
+For laws that are functions of an estimate and of time, as the blocks make them; the filters measure y = H x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from covocp.base.arguments import a, a_function, checked, optional, positive, whole
+from covocp.base.errors import CovocpError, ProblemError, describe, shown
+from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
+from covocp.base.threads import one_at_a_time
+from covocp.blocks import kalman, values
+from covocp.blocks.algebraic import root
+from covocp.simulation.vectorised import Columns, padded, vectorise
+
+Array = NDArray[np.float64]
+# A casadi.Function, or a Python function of arrays that returns an array.
+Law = Callable[..., Any]
+
+# Error of a step without noise, relative and, for entries near zero, absolute.
+TOLERANCE = 1e-9
+# A run with an entry beyond this has diverged.
+LARGEST = 1e9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filter:
+    """What makes the estimate that the law is given.
+
+    Attributes:
+        rate: (state of the filter, t, u, y) -> its rate; a Python function where the gain is one.
+        initial: its state at the start, (ns,).
+        size: number of entries that the law is given, the first ones: the estimate and its integrals.
+        H: measurement matrix, (p, n).
+    """
+
+    rate: Law
+    initial: Array
+    size: int
+    H: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawSimulation:
+    """Histories at K times; with runs every array but `t` has a first axis of runs.
+
+    Attributes:
+        t: (K,) [s].
+        x: state of the plant, (K, n); NaN, as everything else, after a run has diverged.
+        u: what the law asked for, (K, m).
+        filter_state: state of the filter, (K, ns), the estimate first; x where there is no filter.
+        cost: integral of the running cost up to each time, (K,); zero where none is given.
+        diverged: whether a run left the range of numbers before the end; shape () or (runs,).
+    """
+
+    t: Array
+    x: Array
+    u: Array
+    filter_state: Array
+    cost: Array
+    diverged: NDArray[np.bool_]
+
+
+def _of_state_and_control(value: Any) -> str:
+    """A function of state and control."""
+    fits = isinstance(value, ca.Function) and (value.n_in(), value.n_out()) == (2, 1)
+    return "" if fits else "a casadi.Function of (x, u)"
+
+
+@one_at_a_time
+@checked(
+    plant=_of_state_and_control,
+    law=a_function,
+    observer=optional(a(Filter)),
+    running=optional(_of_state_and_control),
+    samples=whole(2, 10**7),
+    runs=optional(whole(1, 10**7)),
+    duration=positive,
+    step=positive,
+    seed=whole(0, None),
+)
+def simulate_law(
+    plant: ca.Function,
+    law: Law,
+    *,
+    initial: ArrayLike,
+    duration: float,
+    observer: Filter | None = None,
+    running: ca.Function | None = None,
+    samples: int = 401,
+    breaks: Sequence[float] = (),
+    runs: int | None = None,
+    step: float = 0.01,
+    process_noise: ArrayLike = 0.0,
+    measurement_noise: ArrayLike = 0.0,
+    seed: int = 0,
+) -> LawSimulation:
+    """Plant, filter and law in one loop.
+
+    Without `runs` there is no noise, and scipy integrates with an error of 1e-9 a step. With `runs` all the functions
+    must be casadi.Functions: white noise is held over steps of classical Runge-Kutta, all runs at once.
+
+    Args:
+        plant: (x, u) -> dx/dt, shape (n,).
+        law: (estimate, t) -> u, shape (m,); a casadi.Function or a Python function of arrays.
+        initial: state at the start, (n,).
+        duration: [s].
+        observer: the filter; None: the law is given x.
+        running: (x, u) -> cost a second.
+        samples: K, number of times, from 0 to the duration.
+        breaks: times at which the law or its derivatives jump [s].
+        runs: number of runs; None: one without noise.
+        step: of the runs with noise, at most [s].
+        process_noise: power spectral density, (n, n), or a number times the identity.
+        measurement_noise: power spectral density, (p, p), or a number times the identity.
+        seed: of the noise.
+
+    Returns:
+        The histories.
+
+    Raises:
+        ProblemError: an argument does not fit, or a Python function in runs with noise.
+    """
+    start = _numbers("initial", initial)
+    if plant.size1_out(0) != plant.size1_in(0):
+        raise values.wrong_argument("plant", "rates of all its states, (n,)", f"{plant}"[:100])
+    if start.size != plant.size1_in(0):
+        raise values.wrong_argument("initial", f"{plant.size1_in(0)} numbers, the state of the plant", f"{start.size}")
+    pauses = _numbers("breaks", breaks)
+    times = np.linspace(0.0, float(duration), int(samples))
+    loop = _Loop(plant=plant, law=law, observer=observer, running=running, size=start.size)
+    if runs is None:
+        return _accurate(loop, start, times, sorted(b for b in pauses.tolist() if 0.0 < b < duration))
+    noises = (
+        _root("process_noise", process_noise, start.size),
+        _root("measurement_noise", measurement_noise, loop.measured),
+    )
+    return _noisy(loop, np.tile(loop.start(start)[:, None], int(runs)), times, float(step), noises, seed)
+
+
+@checked(dynamics=_of_state_and_control, gain=a_function)
+def gain_filter(
+    dynamics: ca.Function, gain: Law, H: ArrayLike, initial: ArrayLike, *, integrate: ArrayLike | None = None
+) -> Filter:
+    """Filter d(e)/dt = dynamics(e, u) + gain(e, t) (y - H e) of the estimate e.
+
+    Args:
+        dynamics: (x, u) -> dx/dt, shape (n,).
+        gain: (x, t) -> gain, (n, p); a casadi.Function or a Python function of arrays.
+        H: measurement matrix, (p, n).
+        initial: estimate at the start, (n,).
+        integrate: rows, (r, n): their products with the estimate are integrated from zero, and the law is given the
+            integrals after the estimate.
+
+    Returns:
+        The filter.
+    """
+    start = _numbers("initial", initial)
+    size = start.size
+    rows, sums = _rows("H", H, size), _rows("integrate", [] if integrate is None else integrate, size)
+
+    def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
+        estimate = state[:size]
+        gained = _value(gain, estimate, t)
+        innovation = y - _times(rows, estimate)
+        correction = gained @ innovation if isinstance(gained, ca.SX) else gained.reshape(size, -1) @ innovation
+        return _stack(_value(dynamics, estimate, u) + correction, _times(sums, estimate))
+
+    made: Law = rate
+    if isinstance(gain, ca.Function):
+        made = _function(rate, [size + len(sums), 1, dynamics.size1_in(1), len(rows)])
+    return Filter(rate=made, initial=np.append(start, np.zeros(len(sums))), size=size + len(sums), H=rows)
+
+
+@checked(dynamics=_of_state_and_control)
+def extended_filter(
+    dynamics: ca.Function,
+    H: ArrayLike,
+    W: ArrayLike,
+    V: ArrayLike,
+    initial: ArrayLike,
+    covariance: ArrayLike,
+    *,
+    integrate: ArrayLike | None = None,
+) -> Filter:
+    """Extended Kalman-Bucy filter; its state is the estimate, the integrals and the half-vector of the covariance.
+
+    Args:
+        dynamics: (x, u) -> dx/dt, shape (n,).
+        H: measurement matrix, (p, n).
+        W: power spectral density of the process noise, (n, n).
+        V: power spectral density of the measurement noise, positive definite, (p, p).
+        initial: estimate at the start, (n,).
+        covariance: at the start, (n, n).
+        integrate: as for `gain_filter`.
+
+    Returns:
+        The filter.
+    """
+    start = _numbers("initial", initial)
+    size = start.size
+    rows, sums = _rows("H", H, size), _rows("integrate", [] if integrate is None else integrate, size)
+    half = pack(values.numeric("covariance", values.weight("covariance", covariance, size)))
+    process = values.numeric("W", values.weight("W", W, size))
+    noise = values.numeric("V", values.weight("V", V, len(rows), definite=True))
+    weighted = np.linalg.solve(noise, rows).T
+
+    def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
+        estimate = ca.SX.sym("estimate", size)
+        slope = dynamics(estimate, u)
+        tangent = ca.substitute(ca.jacobian(slope, estimate), estimate, state[:size])
+        slope = ca.substitute(slope, estimate, state[:size])
+        P = unpack_symbolic(state[size + len(sums) :], size)
+        correction = P @ ca.DM(weighted) @ (y - ca.DM(rows) @ state[:size])
+        growth = pack_symbolic(kalman.rate(P, tangent, rows, process, noise))
+        return ca.vertcat(slope + correction, ca.DM(sums) @ state[:size], growth)
+
+    made = _function(rate, [size + len(sums) + half.size, 1, dynamics.size1_in(1), len(rows)])
+    whole = np.concatenate([start, np.zeros(len(sums)), half])
+    return Filter(rate=made, initial=whole, size=size + len(sums), H=rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Loop:
+    """The closed loop; its state is that of the plant, that of the filter and the cost."""
+
+    plant: ca.Function
+    law: Law
+    observer: Filter | None
+    running: ca.Function | None
+    size: int
+
+    @property
+    def measured(self) -> int:
+        return 0 if self.observer is None else len(self.observer.H)
+
+    def start(self, initial: Array) -> Array:
+        own = np.zeros(0) if self.observer is None else self.observer.initial
+        return np.concatenate([initial, own, [0.0]])
+
+    def control(self, state: Any, t: Any) -> Any:
+        if self.observer is None:
+            return _value(self.law, state[: self.size], t)
+        return _value(self.law, state[self.size : self.size + self.observer.size], t)
+
+    def rate(self, state: Any, t: Any, process: Any = 0.0, measurement: Any = 0.0) -> Any:
+        x, u = state[: self.size], self.control(state, t)
+        parts = [_value(self.plant, x, u) + process]
+        if self.observer is not None:
+            y = _times(self.observer.H, x) + measurement
+            parts.append(_value(self.observer.rate, state[self.size : -1], t, u, y))
+        parts.append(_stack(0.0) if self.running is None else _value(self.running, x, u))
+        return _stack(*parts)
+
+    def functions(self) -> tuple[Law, Law]:
+        """Rate and control; casadi.Functions where all the parts are."""
+        parts = [self.law] if self.observer is None else [self.law, self.observer.rate]
+        if not all(isinstance(part, ca.Function) for part in parts):
+            return self.rate, self.control
+        total = self.start(np.zeros(self.size)).size
+        return _function(self.rate, [total, 1, self.size, self.measured]), _function(self.control, [total, 1])
+
+    def simulation(self, times: Array, states: Array, controls: Array) -> LawSimulation:
+        """Histories from the states of the loop, (..., K, total)."""
+        diverged = ~np.isfinite(states).all(axis=(-2, -1))
+        own = slice(0, self.size) if self.observer is None else slice(self.size, -1)
+        return LawSimulation(
+            t=times,
+            x=states[..., : self.size],
+            u=controls,
+            filter_state=states[..., own],
+            cost=states[..., -1],
+            diverged=np.asarray(diverged),
+        )
+
+
+def _accurate(loop: _Loop, initial: Array, times: Array, breaks: list[float]) -> LawSimulation:
+    """One run without noise, piece by piece between the breaks."""
+    from scipy.integrate import solve_ivp
+
+    rate, control = loop.functions()
+    none = (np.zeros(loop.size), np.zeros(loop.measured))
+
+    def slope(t: float, state: Array) -> Array:
+        return np.asarray(_value(rate, state, t, *none))
+
+    def room(t: float, state: Array) -> float:
+        return LARGEST - float(np.abs(state).max())
+
+    room.terminal = True  # type: ignore[attr-defined]
+    state = loop.start(initial)
+    states = np.full((times.size, state.size), np.nan)
+    states[0] = state
+    for begin, end in pairwise([0.0, *breaks, float(times[-1])]):
+        inside = np.flatnonzero((times > begin) & (times <= end))
+        grid = np.unique(np.append(times[inside], end))
+        found = solve_ivp(slope, (begin, end), state, "LSODA", grid, events=room, rtol=TOLERANCE, atol=TOLERANCE)
+        reached = min(found.t.size, inside.size)
+        states[inside[:reached]] = found.y.T[:reached]
+        if found.status != 0:
+            break
+        state = found.y[:, -1]
+    known = np.isfinite(states).all(axis=1)
+    first = np.ravel(_value(control, states[0], 0.0))
+    controls = np.full((times.size, first.size), np.nan)
+    controls[known] = [np.ravel(_value(control, z, t)) for t, z in zip(times[known], states[known], strict=True)]
+    return loop.simulation(times, states, controls)
+
+
+def _noisy(
+    loop: _Loop, state: Array, times: Array, step: float, noises: tuple[Array, Array], seed: int
+) -> LawSimulation:
+    """Runs with noise that is held over each step, all at once; `state` has a column for each run."""
+    rate, control = loop.functions()
+    if not isinstance(rate, ca.Function) or not isinstance(control, ca.Function):
+        raise values.wrong_argument(
+            "law", "casadi.Functions, also in the filter, for runs with noise", "a Python function"
+        )
+    runs = state.shape[1]
+    steps = int(np.ceil(times[1] / step))
+    h = float(times[1]) / steps
+    sizes = [rate.size1_in(i) for i in range(4)]
+    advance = vectorise(_function(_runge_kutta(rate, h), sizes), padded(runs), (1,))
+    controls = vectorise(control, padded(runs), (1,))
+    generator = np.random.default_rng(seed)
+    states, given = [state], [_columns(controls, state, times[0])]
+    for start in times[:-1]:
+        for i in range(steps):
+            shocks = [root @ generator.standard_normal((len(root), runs)) / np.sqrt(h) for root in noises]
+            state = _columns(advance, state, start + i * h, *shocks)
+        state[:, ~(np.abs(state).max(axis=0) < LARGEST)] = np.nan
+        states.append(state)
+        given.append(_columns(controls, state, start + steps * h))
+    return loop.simulation(times, np.array(states).transpose(2, 0, 1), np.array(given).transpose(2, 0, 1))
+
+
+def _columns(function: Columns, state: Array, t: float, *shocks: Array) -> Array:
+    """Values of a vectorised function of columns, with the time in common."""
+    count = state.shape[1]
+    function.inputs[1][:] = t
+    for memory, given in zip((function.inputs[0], *function.inputs[2:]), (state, *shocks), strict=True):
+        memory[:, :count] = given
+    with np.errstate(all="ignore"):  # runs that diverge
+        function.evaluate()
+    return np.array(function.outputs[0][:, :count])
+
+
+def _runge_kutta(rate: ca.Function, h: float) -> Law:
+    """One classical step with the noise held."""
+
+    def advance(state: Any, t: Any, process: Any, measurement: Any) -> Any:
+        one = rate(state, t, process, measurement)
+        two = rate(state + 0.5 * h * one, t + 0.5 * h, process, measurement)
+        three = rate(state + 0.5 * h * two, t + 0.5 * h, process, measurement)
+        four = rate(state + h * three, t + h, process, measurement)
+        return state + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
+
+    return advance
+
+
+def _function(expression: Law, sizes: Sequence[int]) -> ca.Function:
+    """A function of columns of the sizes, expanded to SX."""
+    symbols: Any = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(sizes)]
+    return ca.Function("part", symbols, [ca.densify(expression(*symbols))])
+
+
+def _value(function: Law, *arguments: Any) -> Any:
+    """The value of a function, as an array where the arguments are numbers; columns are flat."""
+    try:
+        value = function(*arguments)
+        if isinstance(value, ca.SX):
+            return value
+        numbers = real_numbers(value)
+    except CovocpError:
+        raise
+    except Exception as error:  # whatever a function of the user raises
+        raise ProblemError(
+            describe(
+                "A function of the loop fails.",
+                expected="functions as simulate_law() says: plant (x, u), law (estimate, t), running (x, u)",
+                received=f"{type(error).__name__} in {shown(function, 60)}: {error}"[:300],
+                remedy="call it by itself with a state and a control of these sizes",
+            )
+        ) from error
+    return numbers.ravel() if numbers.ndim < 2 or numbers.shape[1] == 1 else numbers
+
+
+def _times(matrix: Array, vector: Any) -> Any:
+    return ca.DM(matrix) @ vector if isinstance(vector, ca.SX) else matrix @ vector
+
+
+def _stack(*parts: Any) -> Any:
+    if any(isinstance(part, ca.SX) for part in parts):
+        return ca.vertcat(*parts)
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+def _numbers(name: str, given: Any) -> Array:
+    """Finite numbers in a row."""
+    return values.numeric(name, values.matrix(name, given)).ravel()
+
+
+def _rows(name: str, given: Any, size: int) -> Array:
+    """Rows of finite numbers, (r, size); a row may be given by itself."""
+    numbers = values.numeric(name, values.matrix(name, given))
+    if numbers.shape[1] == 1 and numbers.shape[0] == size:
+        numbers = numbers.T
+    return (
+        numbers.reshape(-1, size)
+        if not numbers.size
+        else values.numeric(name, values.matrix(name, numbers, (None, size)))
+    )
+
+
+def _root(name: str, density: ArrayLike, size: int) -> Array:
+    """A square root of a power spectral density, (size, size)."""
+    given = values.numeric(name, values.matrix(name, density))
+    full = values.numeric(name, values.weight(name, given * np.eye(size) if given.size == 1 else given, size))
+    return root(full)

@@ -1,0 +1,126 @@
+"""What simulating some runs takes, ready to be sent to another process: CasADi functions and tables of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.simulation.constraints import Place, counted_rows
+from covocp.simulation.flown import Flown, sample_indices
+from covocp.simulation.run_parts import Setting, factor, run_symbols
+from covocp.simulation.run_step import finish_function, observe_function, start_of, step_function
+from covocp.simulation.schedule import Grid, coefficients, table
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """All that a worker needs for any range of runs; the functions are those of `run_step`.
+
+    step: (state of a run, noise, own unknowns, coefficients of the step) -> state after it, deviation and estimate.
+    observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
+    finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
+    steps: coefficients, a row for each step; times: at which they start [s].
+    stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
+    start: state of a run that starts at its mean; unknowns: their mean.
+    spread: factor of the covariance of the start, (n, n).
+    domain: largest deviations and estimates that count as inside, (2n,).
+    spans: where the parts of a run's state lie.
+    noises: normal numbers that a step takes; states: rows of x; fed_back: controls m.
+    seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
+    pairing: of which two noises of its halves each noise of a step is the sum, (noises, 2); None: it is none.
+    paths: number of runs whose histories are kept.
+    flown: the law of the user; samples: indices of the times at which it is stepped.
+    watched: the place of each inequality.
+    """
+
+    step: ca.Function
+    observe: ca.Function
+    finish: ca.Function | None
+    steps: Array
+    times: Array
+    stored: Any
+    stored_coefficients: Array
+    start: Array
+    unknowns: Array
+    spread: Array
+    domain: Array
+    spans: Mapping[str, slice]
+    noises: int
+    states: int
+    fed_back: int
+    seed: int
+    pilot: bool
+    pairing: Any
+    paths: int
+    flown: Flown | None
+    samples: Any
+    watched: tuple[Place, ...]
+
+    @property
+    def estimates(self) -> bool:
+        """Whether there are estimates."""
+        return self.flown is None or self.flown.estimates
+
+    @property
+    def size(self) -> int:
+        """Rows n of the augmented state."""
+        return int(self.spread.shape[0])
+
+
+def make_plan(
+    setting: Setting,
+    grid: Grid,
+    stored: Array,
+    *,
+    seed: int,
+    paths: int = 0,
+    pilot: bool = False,
+    pairs: bool = False,
+) -> Plan:
+    """The plan of a simulation.
+
+    Args:
+        setting: what is simulated.
+        grid: the steps.
+        stored: times of theirs at which moments are kept [s].
+        seed: of the random numbers.
+        paths: number of runs whose histories are kept.
+        pilot: whether the runs are for choosing the step.
+        pairs: whether noises are sums of those of two half steps.
+    """
+    design = setting.design
+    chosen = coefficients(design, setting.filter)
+    before, after = table(setting.solution, grid, chosen)
+    varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
+    watched = counted_rows(design)
+    run = run_symbols(setting, chosen, len(watched.at("path")))
+    return Plan(
+        step=step_function(run, before[0], varying),
+        observe=observe_function(run),
+        finish=finish_function(run),
+        steps=np.hstack([before[:, varying], after[:, varying], grid.h[:, None]]),
+        times=grid.t[:-1],
+        stored=np.searchsorted(grid.t, stored),
+        stored_coefficients=np.vstack([before, after[-1:]])[np.searchsorted(grid.t, stored)],
+        start=start_of(run),
+        unknowns=setting.actual.start[design.states :],
+        spread=np.asarray(factor(ca.DM(setting.actual.variance)).full()),
+        # An unknown is what it is: only its estimate can run away.
+        domain=np.concatenate([setting.domain[: design.states], np.full(design.unknowns, np.inf), setting.domain]),
+        spans=run.spans,
+        noises=run.noises,
+        states=design.states,
+        fed_back=design.fed_back,
+        seed=seed,
+        pilot=pilot,
+        pairing=run.pairing if pairs else None,
+        paths=paths,
+        flown=setting.flown,
+        samples=sample_indices(setting.flown, grid),
+        watched=tuple(row.place for row in watched.rows),
+    )

@@ -1,0 +1,183 @@
+"""What linear theory predicts for a simulation: covariances of the deviations and of their estimates, and their means.
+
+With d the deviation of the actual system from the nominal and y its estimate, both over the augmented state, slopes of
+the actual system marked by a and those of the design without a mark, and u - C y as control (Schmidt 1971, appendix A
+and 6.11, for any truth):
+
+    dd = (Fa d - Ga C y + fa - f) dt + dn,
+    dy = ((F - K M) y - (G - K hu) C y + K (Ma d - hau C y + ha - h)) dt + K dv.
+
+All of the actual system is taken at the nominal state and at the true means of the unknowns: fa - f and ha - h then
+contain what another mean does, so its part of d, which stands in the mean of d too, is taken off again.
+
+Where the truth is the design, the covariance of d is E + Xhat of (A-31 .. 33) and that of y - d is E.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array
+from covocp.simulation.actual import System
+from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
+from covocp.solution.solution import Solution
+
+# Length of a step times the fastest rate: classical Runge-Kutta then errs by less than 1e-6.
+STEP_PER_RATE = 0.1
+# Steps of the prediction within one interval of the base grid, at most.
+MOST_PARTS = 2000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """Mean (K, 2n) and covariance (K, 2n, 2n) of deviation and estimate, stacked, at some times.
+
+    rates: fastest rate of filter, loop and plant in each interval between these times [1/s], (K - 1,).
+    step_rates: what a step must resolve: the fastest rate of plant and loop, and that of the filter at its slower end
+        of the interval, because a transient of the filter is stepped as a whole.
+    """
+
+    mean: Array
+    covariance: Array
+    rates: Array
+    step_rates: Array
+
+    @property
+    def size(self) -> int:
+        """Rows n of the augmented state."""
+        return int(self.mean.shape[1]) // 2
+
+    @property
+    def deviation(self) -> Array:
+        """Mean square of the deviation about the nominal, X + mean mean', (K, n, n)."""
+        return self._about_nominal(np.hstack([np.eye(self.size), np.zeros((self.size, self.size))]))
+
+    @property
+    def error(self) -> Array:
+        """Mean square of the error of the estimate, E where the truth is the design, (K, n, n)."""
+        return self._about_nominal(np.hstack([-np.eye(self.size), np.eye(self.size)]))
+
+    @property
+    def estimate(self) -> Array:
+        """Mean square of the estimate of the deviation, (K, n, n)."""
+        return self._about_nominal(np.hstack([np.zeros((self.size, self.size)), np.eye(self.size)]))
+
+    def at(self, rows: Any) -> Prediction:
+        """The prediction at some of its times; the fastest rates stay those of all intervals."""
+        return replace(self, mean=self.mean[rows], covariance=self.covariance[rows])
+
+    def _about_nominal(self, chosen: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = self.mean @ chosen.T
+            return np.asarray(chosen @ self.covariance @ chosen.T + mean[:, :, None] * mean[:, None, :])
+
+
+def predict(solution: Solution, design: System, actual: System, grid: Grid) -> Prediction:
+    """Integrate mean and covariance along the nominal by classical Runge-Kutta steps.
+
+    Args:
+        solution: whose nominal, filter and feedback are used.
+        design: what they assume.
+        actual: what is simulated.
+        grid: times of the result; the steps of the integration divide its steps.
+    """
+    n = design.size
+    joint = _joint(design, actual)
+    rates, step_rates = _fastest_rates(solution, joint, grid, actual, n)
+    fine = grid.divided(np.minimum(grid.parts(STEP_PER_RATE / np.maximum(rates, 1e-300)), MOST_PARTS))
+    kept = set(np.flatnonzero(np.isin(fine.t, grid.t)).tolist())
+    sides = [_evaluate(solution, joint, fine.t[:-1] + c * fine.h, fine.interval, actual, n) for c in (0.0, 0.5, 1.0)]
+    mean = np.concatenate([actual.start - design.start, np.zeros(n)])
+    covariance = np.zeros((2 * n, 2 * n))
+    covariance[:n, :n] = actual.variance
+    means, covariances = [mean], [covariance]
+    with np.errstate(over="ignore", invalid="ignore"):  # gains that the mesh does not resolve: the verdict says it
+        for k, h in enumerate(fine.h.tolist()):
+            mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
+            if k + 1 in kept:
+                means.append(mean)
+                covariances.append(covariance)
+    return Prediction(mean=np.array(means), covariance=np.array(covariances), rates=rates, step_rates=step_rates)
+
+
+def control_spread(solution: Solution, design: System, prediction: Prediction, nominal: Nominal) -> Array:
+    """Mean square of the deviation of the controls fed back, C <y y'> C', (K, m, m), at the times of the prediction."""
+    loop, count = design.statement.loop, nominal.t.size
+    if loop is None:
+        return np.zeros((count, 0, 0))
+    gains = np.asarray(loop.gain.map(count)(*nominal.columns(solution.duration, solution.parameters)).full())
+    C = gains.reshape(design.fed_back, count, design.size).transpose(1, 0, 2)
+    return np.asarray(C @ prediction.estimate @ C.transpose(0, 2, 1))
+
+
+def _joint(design: System, actual: System) -> ca.Function:
+    """(design's six arguments, parameters of the truth) -> drift (2n, 2n), noise (2n, 2n), offset (2n,)."""
+    st, other = design.statement, actual.statement
+    symbolic: Any = ca.SX if st.symbolic is ca.SX and other.symbolic is ca.SX else ca.MX
+    sizes = (st.nx, st.nu, st.ne, 1, 1, st.np, other.np)
+    x, u, e, t, T, p, q = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    chosen = coefficients(design, "perturbation")
+    c = chosen.split(chosen.function(x, u, e, t, T, p, 0))
+    f, F, G, Q, h, M, Hu, U = actual.linear(x[: other.nx], u[: other.nu], t, T, q)
+    C, K = c["C"], c["K"]
+    rate = design.linear(x, u, t, T, p)[0]
+    own = c["F"] - K @ c["M"] - (c["G"] - K @ c["Hu"]) @ C
+    drift = ca.blockcat([[F, -G @ C], [K @ M, own - K @ Hu @ C]])
+    noise = ca.diagcat(Q, K @ U @ K.T)
+    known = ca.DM(np.concatenate([np.zeros(design.states), (actual.start - design.start)[design.states :]]))
+    offset = ca.vertcat(f - rate - F @ known, K @ (h - c["h"] - M @ known))
+    return ca.Function("joint", a, [ca.densify(value) for value in (drift, noise, offset)])
+
+
+def _evaluate(
+    solution: Solution, joint: ca.Function, t: Array, interval: Any, actual: System, n: int
+) -> tuple[Array, Array, Array]:
+    """Drift (K, 2n, 2n), noise (K, 2n, 2n) and offset (K, 2n) at some times."""
+    columns = nominal_at(solution, t, interval).columns(solution.duration, solution.parameters)
+    own = np.tile(actual.parameters[:, None], (1, t.size))
+    drift, noise, offset = (np.asarray(v.full()) for v in joint.map(t.size)(*columns, own))
+    shaped = [v.reshape(2 * n, t.size, 2 * n).transpose(1, 0, 2) for v in (drift, noise)]
+    return shaped[0], shaped[1], offset.T
+
+
+def _step(mean: Array, covariance: Array, h: float, sides: list[tuple[Array, ...]]) -> tuple[Array, Array]:
+    """One Runge-Kutta step of mean' = A mean + b and P' = A P + P A' + Q."""
+
+    def rates(mean: Array, covariance: Array, side: tuple[Array, ...]) -> tuple[Array, Array]:
+        drift, noise, offset = side
+        moved = drift @ covariance
+        return drift @ mean + offset, moved + moved.T + noise
+
+    m1, p1 = rates(mean, covariance, sides[0])
+    m2, p2 = rates(mean + h / 2 * m1, covariance + h / 2 * p1, sides[1])
+    m3, p3 = rates(mean + h / 2 * m2, covariance + h / 2 * p2, sides[1])
+    m4, p4 = rates(mean + h * m3, covariance + h * p3, sides[2])
+    return mean + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4), covariance + h / 6 * (p1 + 2 * p2 + 2 * p3 + p4)
+
+
+def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: System, n: int) -> tuple[Array, Array]:
+    """`Prediction.rates` and `Prediction.step_rates` of each step of a grid, (N,)."""
+    sides = [_evaluate(solution, joint, t, grid.interval, actual, n)[0] for t in (grid.t[:-1], grid.t[1:])]
+    if not all(np.isfinite(side).all() for side in sides):
+        raise ProblemError(
+            describe(
+                "The loop of this solution becomes NaN or inf along its nominal.",
+                expected="finite dynamics, gains and noise densities",
+                received=f"'{solution.name}': {solution.status}",
+                remedy="simulate a solution that converged, or mend the truth",
+            )
+        )
+    whole = [_fastest(side) for side in sides]
+    # With an estimate that is right the deviation goes by F - G C.
+    plant = [_fastest(matrix) for side in sides for matrix in (side[:, :n, :n], side[:, :n, :n] + side[:, :n, n:])]
+    return np.maximum(*whole), np.max([*plant, np.minimum(*whole)], axis=0)
+
+
+def _fastest(matrices: Array) -> Array:
+    """Largest absolute eigenvalue of each of some matrices, (N,)."""
+    return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=1))

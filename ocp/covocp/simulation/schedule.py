@@ -1,0 +1,229 @@
+"""The times of a simulation, and what filter and feedback use at each of them: the same for all runs.
+
+The steps divide the intervals of the mesh, so that no step contains a kink or a jump of the nominal control. The
+nominal and its covariances between the nodes are those of `Solution.at`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe
+from covocp.base.matrices import Array, pack, unpack_symbolic
+from covocp.base.riccati_rates import inverse
+from covocp.blocks.arithmetic import apply, definite_solve, symmetric
+from covocp.simulation.actual import System
+from covocp.solution.solution import Solution
+
+Filter = Literal["perturbation", "extended"]
+Estimator = Filter | Literal["law"]
+
+# A division is rounded up unless it is whole to this accuracy: 5 s into steps of 0.25 s are 20, not 21.
+WHOLE = 1e-9
+MOST_STEPS = 10**7  # of a run; their times alone fill a memory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grid:
+    """Steps within the intervals of a mesh.
+
+    t: times, (N + 1,); interval: of the mesh, for each step, (N,).
+    """
+
+    t: Array
+    interval: Any
+
+    @property
+    def steps(self) -> int:
+        """Number of steps N."""
+        return self.t.size - 1
+
+    @property
+    def h(self) -> Array:
+        """Lengths of the steps [s], (N,)."""
+        return np.asarray(np.diff(self.t))
+
+    def divided(self, parts: Any) -> Grid:
+        """Each step divided into equal parts, a number or one for each step."""
+        counts = np.broadcast_to(np.asarray(parts, dtype=int), (self.steps,))
+        step = np.repeat(np.arange(self.steps), counts)
+        inside = np.arange(step.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        starts = self.t[step] + self.h[step] * (inside / counts[step])
+        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step])
+
+    def parts(self, length: Any) -> Any:
+        """Into how many parts each step must be divided so that none is longer than `length`."""
+        needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
+        if not float(np.sum(needed)) <= MOST_STEPS:
+            raise ProblemError(
+                describe(
+                    "The simulation would need too many steps.",
+                    expected=f"at most {MOST_STEPS:.0e} steps a run",
+                    received=f"{float(np.sum(needed)):.1e} steps of {float(np.min(length)):.2g} s",
+                    remedy="correct the truth if it moves too fast, or give a longer step=",
+                )
+            )
+        return needed.astype(int)
+
+
+def base_grid(solution: Solution, points: int, step: float | None = None, samples: Array | None = None) -> Grid:
+    """The intervals of the mesh, divided so that some points are about equally spread; no finer than a given step.
+
+    No interval contains one of the samples.
+    """
+    nodes = t = solution.t
+    if samples is not None:
+        new = np.abs(samples[:, None] - nodes).min(axis=1) > WHOLE * solution.duration
+        t = np.sort(np.concatenate([nodes, samples[new]]))
+    mesh = Grid(t=t, interval=np.searchsorted(nodes, t[:-1], side="right") - 1)
+    parts = mesh.parts(solution.duration / max(1, points - 1))
+    return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
+
+
+def stored_times(grid: Grid, points: int, samples: Any) -> tuple[Array, Any]:
+    """The grid's nearest times to `points` equally spread ones, and the intervals of the mesh that begin there.
+
+    The first and the last are among them; where there are samples (indices of the grid), only these else.
+    """
+    among = np.arange(grid.steps + 1) if not samples.size else np.union1d(samples, [0, grid.steps])
+    t = grid.t[among]
+    wanted = np.linspace(t[0], t[-1], points)
+    after = np.clip(np.searchsorted(t, wanted), 1, t.size - 1)
+    nearer = wanted - t[after - 1] < t[after] - wanted
+    at = among[np.unique(after - nearer)]
+    return grid.t[at], grid.interval[np.minimum(at, grid.steps - 1)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nominal:
+    """What the functions of a statement need at some times: x (K, nx), u (K, nu), e (K, ne), t (K,)."""
+
+    x: Array
+    u: Array
+    e: Array
+    t: Array
+
+    def columns(self, duration: float, parameters: Array) -> tuple[Any, ...]:
+        """Arguments (state, control, matrices, time, duration, parameters), a column for each time."""
+        count = self.t.size
+        fixed = np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
+        return (self.x.T, self.u.T, self.e.T, self.t[None, :], *fixed)
+
+
+def nominal_at(solution: Solution, t: Array, interval: Any) -> Nominal:
+    """The nominal at some times, its control that of the given interval, which matters where it jumps."""
+    x, e = _states_at(solution, t)
+    return Nominal(x=x, u=_controls_at(solution, t, interval), e=e, t=t)
+
+
+def _states_at(solution: Solution, t: Array) -> tuple[Array, Array]:
+    """States (K, nx) and half-vectors (K, ne)."""
+    sample = solution.at(t)
+    blocks = {kind: [b for b in solution.blocks if b.kind == kind] for kind in ("state", "matrix")}
+    x = np.hstack([sample[b.name].reshape(t.size, b.size) for b in blocks["state"]])
+    return x, np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+
+
+def _controls_at(solution: Solution, t: Array, interval: Any) -> Array:
+    """Controls (K, nu) of the given intervals."""
+    nodes, u = solution.t, solution.controls
+    if solution.mesh.control == "constant":
+        return np.asarray(u[interval])
+    c = ((t - nodes[interval]) / np.diff(nodes)[interval])[:, None]
+    return np.asarray(u[interval] + c * (u[interval + 1] - u[interval]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Coefficients:
+    """What filter and feedback use at one time, stacked in a column of `rows` entries.
+
+    function: (state, control, matrices, time, duration, parameters, length h of the step) -> the column.
+    shapes: of the parts by name, in their order: "t", the nominal "x", "u" and, where a constraint uses them, the
+        matrices "e", the gain "C", "extra", the weights B - L_uu of the feedback; for the perturbation filter its gain
+        "K", its model "F", "G", "M", "Hu", "h", the measurement that is expected along the nominal, and "early",
+        E M'(M E M' + 2 U/h)^-1, its gain for what is measured during the first half of a step.
+    """
+
+    function: ca.Function
+    shapes: dict[str, tuple[int, int]]
+
+    @property
+    def rows(self) -> int:
+        """Entries of the column."""
+        return int(self.function.size1_out(0))
+
+    def split(self, column: Any) -> dict[str, Any]:
+        """The parts of a symbolic column by name."""
+        sizes = [rows * columns for rows, columns in self.shapes.values()]
+        pieces = ca.vertsplit(column, np.cumsum([0, *sizes]).tolist())
+        return {
+            name: ca.reshape(piece, *shape) for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)
+        }
+
+
+def coefficients(design: System, kind: Estimator) -> Coefficients:
+    """What filter and feedback of a design use, for a kind of filter; a law of its own uses nothing of them."""
+    st, n, m = design.statement, design.size, design.fed_back
+    symbolic: Any = st.symbolic
+    sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
+    x, u, e, t, T, p = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    loop = st.loop
+    parts = {
+        "t": t,
+        "x": x,
+        "u": u,
+        "e": e if any(c.uses_matrices for c in (st.path, st.start, st.end)) else symbolic.zeros(0, 1),
+        "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
+        "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
+    }
+    step = symbolic.sym("step")
+    if kind == "perturbation":
+        _, F, G, _, h, M, Hu, U = design.linear(x, u, t, T, p)
+        half = estimation_half(st, e)
+        parts |= {"K": filter_gain(half, n, M, U), "F": F, "G": G, "M": M, "Hu": Hu, "h": h}
+        parts["early"] = early_gain(unpack_symbolic(half, n), M, U, step)
+    shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
+    assert shapes["C"] == (m, n)
+    return Coefficients(
+        function=ca.Function("coefficients", [*a, step], [ca.veccat(*map(ca.densify, parts.values()))]), shapes=shapes
+    )
+
+
+def estimation_half(statement: Any, e: Any) -> Any:
+    """Half-vector of the estimation covariance out of all of them."""
+    return e[next(b for b in statement.matrices if b.estimation).span]
+
+
+def filter_gain(half: Any, size: int, M: Any, U: Any) -> Any:
+    """Kalman gain K = E M' U^-1, (n, r), of the half-vector of E [Schmidt 2.5-3]; no columns without measurements."""
+    E = unpack_symbolic(half, size)
+    return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)
+
+
+def early_gain(E: Any, M: Any, U: Any, h: Any) -> Any:
+    """Gain E M'(M E M' + 2 U/h)^-1, (n, r), of what half a step measures, E known before it; bounded at any h."""
+    if not M.shape[0]:
+        return type(E).zeros(E.shape[0], 0)
+
+    def law(E: Any, M: Any, U: Any, h: Any) -> tuple[Any]:
+        seen = h * (M @ E)
+        return (definite_solve(symmetric(seen @ M.T) + 2 * U, seen, "noise of the innovation").T,)
+
+    return apply(law, E, M, ca.densify(U), h)[0]
+
+
+def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:
+    """The columns at the starts and at the ends of all steps, (N, rows) each."""
+    x, e = _states_at(solution, grid.t)
+    sides = []
+    for part in (slice(0, -1), slice(1, None)):
+        t = grid.t[part]
+        at = Nominal(x=x[part], u=_controls_at(solution, t, grid.interval), e=e[part], t=t)
+        columns = at.columns(solution.duration, solution.parameters)
+        values = chosen.function.map(grid.steps)(*columns, grid.h[None, :])
+        sides.append(np.ascontiguousarray(values.full().T))
+    return sides[0], sides[1]

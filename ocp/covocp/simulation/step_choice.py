@@ -1,0 +1,160 @@
+"""The step of a simulation: halved on a pilot batch until the statistics settle.
+
+The coarse and the fine run of a pair go along the same Brownian paths, the increments of the coarse one being sums of
+those of the fine one, so that their difference is the error of the step and not of the sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.simulation.batches import Batch, run_batch
+from covocp.simulation.plan import make_plan
+from covocp.simulation.run_parts import Setting
+from covocp.simulation.schedule import WHOLE, Grid
+
+# First step times the fastest rate of filter, loop and plant: Heun's method then errs by 1 % of a variance.
+STEP_PER_RATE = 0.2
+# The change by halving a step that is allowed, as a share of the sampling error of the whole simulation.
+SHARE = 0.2
+PILOT_RUNS = 512
+# A given step times the fastest rate, at most: Heun's method is stable up to 2.
+STABLE = 1.0
+# Runs by which a given step is examined where the prediction fails; the change from which on the step is to blame:
+# three standard deviations, as the bands have them.
+EXAMINED_RUNS, MATTERS = 256, 3.0
+PAIRS = 5
+# Steps of a first grid, at most: a filter that is still faster is not resolved, and the halving says so.
+MOST_STEPS = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepChoice:
+    """The step of a simulation and why.
+
+    grid: its steps. longest, shortest: of them [s]. change: largest change of a second moment at the end by halving the
+    step, in sampling errors of the whole simulation; NaN where that was not looked at. settled: whether it is small
+    enough. given: whether the user gave the step; shortened: whether some are shorter, for what moves faster.
+    """
+
+    grid: Grid
+    change: float
+    settled: bool
+    given: bool = False
+    shortened: bool = False
+
+    @property
+    def longest(self) -> float:
+        """Longest step [s]."""
+        return float(self.grid.h.max())
+
+    @property
+    def shortest(self) -> float:
+        """Shortest step [s]."""
+        return float(self.grid.h.min())
+
+    @property
+    def reason(self) -> str:
+        """Why this step, a sentence."""
+        if np.isinf(self.change):
+            return "NOT SETTLED: runs leave the domain, and what is fastest takes shorter steps"
+        words = f"halving it changes the terminal second moments by {self.change:.2g} of their sampling error"
+        if self.given:
+            own = "as given" + (", shorter where loop or filter are faster" if self.shortened else "")
+            return own if np.isnan(self.change) else f"{own}; {words}"
+        return words if self.settled else f"NOT SETTLED: {words}"
+
+
+def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
+    """Steps of at most the given length, shorter where one would be longer than a time constant.
+
+    Args:
+        base: intervals that the steps divide.
+        step: [s].
+        rates: fastest rate in each of them [1/s].
+    """
+    parts, needed = base.parts(step), np.ceil(base.h * rates / STABLE - WHOLE).astype(int)
+    shortened = bool((needed > parts).any())
+    parts = np.minimum(np.maximum(parts, needed), np.maximum(parts, MOST_STEPS // base.steps))
+    return StepChoice(grid=base.divided(parts), change=np.nan, settled=True, given=True, shortened=shortened)
+
+
+def examined(choice: StepChoice, setting: Setting, *, runs: int, seed: int, stop: Callable[[], bool]) -> StepChoice:
+    """A given step with the change that halving it makes, on a pilot batch; see `choose_step`."""
+    t = choice.grid.t[[0, -1]]
+    plans = [
+        make_plan(setting, grid, t, seed=seed, pilot=True, pairs=grid is choice.grid)
+        for grid in (choice.grid, choice.grid.divided(2))
+    ]
+    coarse, fine = (run_batch(plan, 0, min(runs, EXAMINED_RUNS), stop) for plan in plans)
+    change = _largest_change(coarse, fine, runs)
+    return replace(choice, change=change, settled=change <= MATTERS)
+
+
+def choose_step(
+    setting: Setting, base: Grid, rates: Array, *, runs: int, seed: int, stop: Callable[[], bool]
+) -> StepChoice:
+    """Halve the step until the second moments at the end do not change any more.
+
+    Args:
+        setting: what is simulated.
+        base: intervals that the steps divide.
+        rates: fastest rate in each of them [1/s].
+        runs: number of runs of the simulation, for its sampling error.
+        seed: of the simulation; the pilot runs have random numbers of their own.
+        stop: asked now and then; true to give up.
+
+    Returns:
+        The coarser step of the first pair that agrees to `SHARE` of the sampling error; the finest one otherwise.
+
+    Raises:
+        StoppedError: when `stop` said so.
+    """
+    parts = base.parts(STEP_PER_RATE / np.maximum(rates, np.finfo(float).tiny))
+    most = max(1, MOST_STEPS // base.steps)
+    unresolved = bool((parts > most).any())
+    parts = np.minimum(parts, most)
+    count = min(runs, PILOT_RUNS)
+    change = np.inf
+    for _ in range(PAIRS):
+        coarse, fine = (
+            run_batch(
+                make_plan(setting, base.divided(p), base.t[[0, -1]], seed=seed, pilot=True, pairs=p is parts),
+                0,
+                count,
+                stop,
+            )
+            for p in (parts, 2 * parts)
+        )
+        change = _largest_change(coarse, fine, runs)
+        if unresolved and np.isfinite(fine.left).any():
+            change = np.inf  # they may leave it because of the step, in both
+            break
+        if change <= SHARE:
+            return StepChoice(grid=base.divided(parts), change=change, settled=True)
+        # An error of second order falls by four with each halving; one or two may be left out.
+        needed = np.ceil(np.log(min(change, 1e9) / SHARE) / np.log(4.0))
+        parts = parts * 2 ** int(np.clip(needed, 1, 3))
+    return StepChoice(grid=base.divided(parts), change=change, settled=False)
+
+
+def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:
+    """Largest change of a second moment of deviation and estimate, in its sampling error for the number of runs.
+
+    Runs that leave the domain count through their share.
+    """
+    stayed = np.isinf(coarse.left) & np.isinf(fine.left)
+    changes = [0.0]
+    if np.count_nonzero(stayed) > 1:
+        one, two = (np.hstack([b.deviation, b.estimate])[stayed] ** 2 for b in (coarse, fine))
+        error = two.std(axis=0, ddof=1) / np.sqrt(runs)
+        scattered = error > 0
+        changes += (np.abs((one - two).mean(axis=0))[scattered] / error[scattered]).tolist()
+    gone = [np.isfinite(b.left).mean() for b in (coarse, fine)]
+    error = np.sqrt(max(gone[1] * (1 - gone[1]), 1 / fine.runs) / runs)
+    changes.append(abs(gone[0] - gone[1]) / error)
+    return float(max(changes))

@@ -1,0 +1,185 @@
+"""A CasADi function evaluated for many columns at once, by one numpy operation for each of its scalar operations.
+
+CasADi's own `map` works through the whole function for one column after the other; here every operation runs over all
+columns, which is three to five times faster for the small functions of a simulation step. No operation mixes columns,
+and the number of columns is a multiple of `LANES`, so that each is treated by the same vector instructions: a column
+has the same bits whatever its neighbours are. Functions that are not scalar graphs (interpolation tables, linear
+solvers) go through `map`, with the same property.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy import special
+
+from covocp.base.matrices import Array
+
+# Widths are multiples of this, so that no column falls into the remainder of a vector loop.
+LANES = 64
+
+
+def _choose(condition: Array, value: Array, out: Array) -> None:
+    """CasADi's if_else_zero: the value where the condition holds, else zero (also where the value is NaN)."""
+    absent = condition == 0  # first: the result may be written over either operand
+    np.copyto(out, value)
+    np.copyto(out, 0.0, where=absent)
+
+
+def _twice(value: Array, out: Array) -> None:
+    np.add(value, value, out)
+
+
+def _not(value: Array, out: Array) -> None:
+    np.equal(value, 0.0, out)
+
+
+OPERATIONS: dict[int, Callable[..., Any]] = {
+    ca.OP_ASSIGN: np.positive,
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_TWICE: _twice,
+    ca.OP_SQ: np.square,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_INV: np.reciprocal,
+    ca.OP_POW: np.power,
+    ca.OP_CONSTPOW: np.power,
+    ca.OP_EXP: np.exp,
+    ca.OP_EXPM1: np.expm1,
+    ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_ATAN2: np.arctan2,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
+    ca.OP_TANH: np.tanh,
+    ca.OP_ASINH: np.arcsinh,
+    ca.OP_ACOSH: np.arccosh,
+    ca.OP_ATANH: np.arctanh,
+    ca.OP_ERF: special.erf,
+    ca.OP_ERFINV: special.erfinv,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_FABS: np.fabs,
+    ca.OP_SIGN: np.sign,
+    ca.OP_COPYSIGN: np.copysign,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_FMOD: np.fmod,
+    ca.OP_FMIN: np.fmin,
+    ca.OP_FMAX: np.fmax,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_EQ: np.equal,
+    ca.OP_NE: np.not_equal,
+    ca.OP_AND: np.logical_and,
+    ca.OP_OR: np.logical_or,
+    ca.OP_NOT: _not,
+    ca.OP_IF_ELSE_ZERO: _choose,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Columns:
+    """A function made ready for a fixed number of columns: fill `inputs`, call `evaluate`, read `outputs`.
+
+    inputs: arrays (rows, width), (rows,) where all columns share them.
+    outputs: arrays (rows, width); they share no memory with the inputs.
+    """
+
+    inputs: tuple[Array, ...]
+    outputs: tuple[Array, ...]
+    evaluate: Callable[[], None]
+
+
+def padded(count: int) -> int:
+    """The smallest admissible width for some columns."""
+    return max(1, -(-count // LANES)) * LANES
+
+
+def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Columns:
+    """Make a function ready for many columns.
+
+    Args:
+        function: of dense columns, to dense columns.
+        width: number of columns, a multiple of `LANES`.
+        shared: positions of the inputs that are the same for all columns.
+
+    Returns:
+        Buffers and what evaluates them; every call overwrites the outputs.
+    """
+    if function.is_a("SXFunction"):
+        known = {*OPERATIONS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+        if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
+            return _elementwise(function, width, shared)
+    return _mapped(function, width, shared)
+
+
+def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Columns:
+    """The scalar graph as a list of numpy operations on fixed buffers."""
+    inputs = tuple(
+        np.zeros(function.size1_in(i)) if i in shared else np.zeros((function.size1_in(i), width))
+        for i in range(function.n_in())
+    )
+    outputs = tuple(np.zeros((function.size1_out(i), width)) for i in range(function.n_out()))
+    wide = [np.zeros(width) for _ in range(function.sz_w())]
+    # What depends on shared inputs and constants only is one number, kept without a dimension.
+    narrow = [np.zeros(()) for _ in range(function.sz_w())]
+    bound: list[Array] = list(wide)
+    program: list[tuple[Callable[..., Any], tuple[Array, ...]]] = []
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        source, target = function.instruction_input(k), function.instruction_output(k)
+        if code == ca.OP_CONST:
+            bound[target[0]] = np.array(function.instruction_constant(k))
+        elif code == ca.OP_INPUT:
+            bound[target[0]] = inputs[source[0]][source[1], ...]
+        elif code == ca.OP_OUTPUT:
+            program.append((np.copyto, (outputs[target[0]][target[1]], bound[source[0]])))
+        else:
+            operands = [bound[i] for i in source]
+            out = (wide if any(value.ndim for value in operands) else narrow)[target[0]]
+            program.append((OPERATIONS[code], (*operands, out)))
+            bound[target[0]] = out
+
+    def evaluate() -> None:
+        for operation, arguments in program:
+            operation(*arguments)
+
+    return Columns(inputs=inputs, outputs=outputs, evaluate=evaluate)
+
+
+def _mapped(function: ca.Function, width: int, shared: tuple[int, ...]) -> Columns:
+    """CasADi's own map over the columns, on fixed buffers."""
+    mapped = function.map("columns", "serial", width, list(shared), [])
+    memory = [
+        np.zeros(function.size1_in(i)) if i in shared else np.zeros((width, function.size1_in(i)))
+        for i in range(function.n_in())
+    ]
+    results = [np.zeros((width, function.size1_out(i))) for i in range(function.n_out())]
+    buffer: Any
+    buffer, evaluate = mapped.buffer()
+    for i, array in enumerate(memory):
+        buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
+    for i, array in enumerate(results):
+        buffer.set_res(i, memoryview(array))  # type: ignore[arg-type]
+
+    def run(_keep: Any = (buffer, mapped)) -> None:
+        evaluate()
+
+    return Columns(
+        inputs=tuple(array if i in shared else array.T for i, array in enumerate(memory)),
+        outputs=tuple(array.T for array in results),
+        evaluate=run,
+    )

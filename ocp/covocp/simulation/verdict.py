@@ -1,0 +1,227 @@
+"""Whether the linear prediction holds for a simulation, and if not, why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation
+
+if TYPE_CHECKING:
+    from covocp.simulation.monte_carlo import MonteCarlo
+
+# A run that ends this many predicted deviations away counts as unstable: no normal one does.
+UNSTABLE = 10.0
+# And the domain ends this many of them away.
+LEFT = 100.0
+# A share of runs below this explains nothing.
+NOTICEABLE = 0.01
+# Share by which deviations as flown may differ from those that the solution promises: of quadratures, not of gains.
+AS_PROMISED = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One component at the end: predicted standard deviation, that of the sample with its band, the bias."""
+
+    name: str
+    predicted: float
+    sample: float
+    low: float
+    high: float
+    bias: float
+    robust: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the prediction is inside the band of the sample."""
+        if self.sample == 0.0:
+            return self.predicted == 0.0
+        return self.low <= self.predicted <= self.high
+
+    @property
+    def ratio(self) -> float:
+        """Sample over prediction; NaN where nothing is predicted."""
+        return self.sample / self.predicted if self.predicted > 0 else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether the linear prediction holds at the end.
+
+    deviations: of the states of the actual system from the nominal. errors: of the estimates of states and unknowns.
+    left: share of the runs that left the domain. unstable: share that did, or ended more than `UNSTABLE` predicted
+    deviations away. asked: share that asked for more control than there is. holds: whether the prediction is inside the
+    band for every component, of the deviations where there is a feedback, else of the errors; no run left the domain,
+    and the prediction is what the solution promises. law: whether a law of the user's flew. unanswered: share of the
+    runs in which it once gave no finite control; they do not count as unstable.
+    too_long: what halving the given step changes, in words; "" where it is short enough. unpredicted: components of
+    which the prediction is no number. broken: (name, promised, predicted) standard deviations at the end where the
+    gains between the nodes do something else than the solution promises.
+    """
+
+    deviations: tuple[Entry, ...]
+    errors: tuple[Entry, ...]
+    left: float
+    unstable: float
+    asked: float
+    most_asking: float
+    fed_back: bool
+    limited: bool
+    law: bool = False
+    unanswered: float = 0.0
+    too_long: str = ""
+    unpredicted: tuple[str, ...] = ()
+    broken: tuple[tuple[str, float, float], ...] = ()
+
+    @property
+    def decisive(self) -> tuple[Entry, ...]:
+        """The components that decide."""
+        return self.deviations if self.fed_back else self.errors
+
+    @property
+    def holds(self) -> bool:
+        """Whether the linear prediction holds."""
+        as_promised = not self.unpredicted and not self.broken
+        return self.left == 0.0 and as_promised and all(entry.inside for entry in self.decisive)
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Names of the components whose prediction lies outside the band."""
+        return tuple(entry.name for entry in self.decisive if not entry.inside)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it does not hold, () where it holds.
+
+        Of "step", "unpredicted", "gains", "unanswered", "unstable", "saturated"; else "law" or "nonlinear".
+
+        Control that a law was given, because there were no limits, explains nothing.
+        """
+        if self.holds:
+            return ()
+        causes = {"step": self.too_long, "unpredicted": self.unpredicted and not self.broken, "gains": self.broken}
+        found = [name for name, cause in {**causes, "unanswered": self.unanswered}.items() if cause]
+        if self.unstable >= NOTICEABLE or self.left > self.unanswered:
+            found.append("unstable")
+        if self.asked >= NOTICEABLE and (self.limited or not self.law):
+            found.append("saturated")
+        return tuple(found) or ("law" if self.law else "nonlinear",)
+
+    @property
+    def headline(self) -> str:
+        """Whether it holds, and for what it does not."""
+        what = "spread" if self.fed_back else "errors of the filter"
+        if self.holds:
+            return f"The linear prediction of the {what} holds"
+        listed = ", ".join(self.outside)
+        return f"The linear prediction of the {what} FAILS" + (f" for {listed}" if listed else "")
+
+    def __str__(self) -> str:
+        """The verdict in words."""
+        if self.holds:
+            text = f"{self.headline}: it is inside the confidence band of every component."
+        else:
+            text = f"{self.headline}: " + "; ".join(self._because(reason) for reason in self.reasons) + "."
+        missed = [entry for entry in self.errors if not entry.inside]
+        if self.fed_back and missed:
+            ratios = ", ".join(f"{entry.name} {entry.ratio:.3g}" for entry in missed)
+            text += f" The errors of the filter are not the predicted ones (sample over prediction: {ratios})."
+        return text
+
+    def _because(self, reason: str) -> str:
+        if reason == "step":
+            return f"the given step is too long: {self.too_long}"
+        if reason == "unpredicted":
+            return f"the linear prediction is no number for {', '.join(self.unpredicted)}, so nothing can be compared"
+        if reason == "gains":
+            listed = ", ".join(f"{name} {one:.3g} promised, {_number(two)} as flown" for name, one, two in self.broken)
+            return (
+                f"the gains between the nodes do not do what the solution promises ({listed}): the mesh does not "
+                "resolve them, give more nodes where they are steep (grid=)"
+            )
+        if reason == "unanswered":
+            return f"in {_percent(self.unanswered)} of the runs the law once gave no finite control"
+        if reason == "unstable":
+            words = f"{_percent(self.unstable)} of the runs are unstable"
+            gone = f" ({_percent(self.left)} left the domain)" if self.left else ""
+            return words + gone + (", the law does" if self.law else ", linear gains do") + " not hold them"
+        if reason == "saturated":
+            most = f", {_percent(self.most_asking)} at one instant" if self.most_asking else ""
+            cut = "" if self.limited else " (which they were given)"
+            return f"{_percent(self.asked)} of the runs ask for more control than there is{most}{cut}"
+        if reason == "law":
+            return (
+                "no run is unstable or short of control, so this law is not the filter and feedback of the design, is "
+                "stepped too rarely, or the system is too nonlinear for this spread"
+            ) + (f" ({_percent(self.asked)} asked for more control than the nominal has)" if self.asked else "")
+        return "no run is unstable or short of control, so the system is too nonlinear for this spread"
+
+
+def judge(sample: MonteCarlo) -> Verdict:
+    """The verdict on a simulation."""
+    stayed, states = sample.stayed, sum(b.size for b in sample.blocks if b.kind == "state")
+    names, n = sample.augmented, sample.size
+    states = min(states, n - sum(b.size for b in sample.blocks if b.kind == "unknown"))
+    predicted, errors = (np.sqrt(np.diagonal(v[-1]).clip(0.0)) for v in (sample.predicted, sample.predicted_error))
+    flown, intended = (np.sqrt(v.clip(0.0))[:states] for v in (np.diagonal(sample.design[-1]), sample.intended))
+    broken = ~(np.abs(flown - intended) <= AS_PROMISED * intended) & (intended > 0)
+    # Deviations are measured by what is promised; a prediction that is no number, or far too large, excuses none.
+    reference = np.where(broken, np.fmin(predicted[:states], intended), predicted[:states])
+    reference = np.where(np.isfinite(reference), reference, sample.domain[:states] / LEFT)
+    distance = ~(np.abs(sample.deviations[:, :states]) <= UNSTABLE * reference)
+    answered = np.isinf(sample.unanswered)
+    unstable = ((distance & (reference > 0)).any(axis=1) | ~stayed) & answered
+    numbers = predicted if sample.fed_back else errors
+    return Verdict(
+        deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
+        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level)
+        if sample.estimated
+        else (),
+        left=sample.left_share,
+        unstable=float(unstable.mean()),
+        asked=sample.asked_share,
+        most_asking=float(sample.asking.max(initial=0.0)),
+        fed_back=sample.fed_back,
+        limited=sample.limited,
+        law=sample.filter == "law",
+        unanswered=float(1.0 - answered.mean()),
+        too_long="" if sample.step.settled or not sample.step.given else sample.step.reason,
+        unpredicted=tuple(name for name, value in zip(names, numbers, strict=True) if not np.isfinite(value)),
+        broken=tuple((names[i], float(intended[i]), float(flown[i])) for i in np.flatnonzero(broken).tolist()),
+    )
+
+
+def _entries(names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float) -> tuple[Entry, ...]:
+    """The components of some terminal values, (R, rows)."""
+    inside = values[stayed]
+    result = []
+    for i, name in enumerate(names):
+        column = inside[:, i]
+        square = float(np.mean(column**2)) if column.size else np.nan
+        fourth = float(np.mean(column**4)) if column.size else np.nan
+        low, high = mean_square_band(square, degrees_of_freedom(column.size, square, fourth), level)
+        result.append(
+            Entry(
+                name=name,
+                predicted=float(predicted[i]),
+                sample=float(np.sqrt(square)),
+                low=float(np.sqrt(low)),
+                high=float(np.sqrt(high)),
+                bias=float(column.mean()) if column.size else np.nan,
+                robust=float(robust_deviation(values[:, i : i + 1])[0]),
+            )
+        )
+    return tuple(result)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "beyond all numbers"
+
+
+def _percent(share: float) -> str:
+    """A share in words."""
+    return f"{100 * share:.3g} %"

@@ -1,0 +1,141 @@
+"""A solution that was read from a file, and the problem that it is said to be of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe, warn_user
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.given_controls import missed
+from covocp.extremal.nodes import rates_along
+from covocp.solution.fingerprint import Difference, differences, only_switches, unlike_text
+from covocp.solution.solution import Solution
+from covocp.statement.statement import Statement
+
+# Relative difference of the stored rates to those of a problem above which it is another problem; well above what
+# another version or compiler changes, well below what another number in the dynamics does.
+SAME_RATES = 1e-6
+LISTED = 4  # differences that an error lists
+PLURAL = ("the symbols", "the places", "the limits", "the bounds", "the values", "the weights", "the constraints")
+# Violation relative to the size of an inequality that a solver's own scales may leave in what it calls solved.
+ROUGHLY = 1e-5
+MOVED = 1e-6  # relative, for that size
+
+
+def attached(solution: Solution, statement: Statement) -> Solution:
+    """The solution with its statement, and what it violates of it.
+
+    Raises:
+        ProblemError: it is the solution of another problem (says what differs).
+    """
+    found = _differences(solution, statement)
+    written_elsewhere = solution.stored_problem is not None and only_switches(found)
+    if found and not (written_elsewhere and _other_casadi(solution)):
+        raise _of_another(solution, statement, found)
+    if found or (solution.stored_problem is not None and unlike_text(solution.stored_problem, statement)):
+        warn_user(
+            f"Whether '{statement.name}' is the problem of the stored solution is known at the points kept in the file "
+            "only: there all equations agree, but pieces or tables in them are written otherwise."
+        )
+    whole = replace(solution, statement=statement)
+    return _with_violations(whole)
+
+
+def _other_casadi(solution: Solution) -> bool:
+    return solution.stored_problem is not None and solution.stored_problem.casadi != ca.CasadiMeta.version()
+
+
+def _of_another(solution: Solution, statement: Statement, found: list[Difference]) -> ProblemError:
+    """The error that names what differs."""
+    shown = found[:LISTED]
+    more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
+    names = ", ".join(entry.what for entry in shown)
+    plural = len(found) > 1 or names.startswith(PLURAL)
+    called = f" (stored: '{solution.name}', given: '{statement.name}')" if solution.name != statement.name else ""
+    return ProblemError(
+        describe(
+            f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
+            expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
+            received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
+            remedy="give the problem that was solved, or load without one; evaluate(problem, nominal=load(path)) tells "
+            "what the stored nominal means for another problem",
+        )
+    )
+
+
+def _differences(solution: Solution, statement: Statement) -> list[Difference]:
+    """What differs; values of functions at the points of the fingerprint."""
+    if (solution.blocks, solution.augmented) != (statement.blocks, statement.augmented):
+        stored, given = (
+            ", ".join(f"{b.kind} {b.name} ({b.size})" for b in blocks) for blocks in (solution.blocks, statement.blocks)
+        )
+        return [Difference(what="the symbols", stored=stored, given=given)]
+    if solution.stored_problem is not None:
+        found = differences(solution.stored_problem, statement, solution.parameters)
+        if found:
+            return found
+    return _contradictions(solution, statement)
+
+
+def _contradictions(solution: Solution, statement: Statement) -> list[Difference]:
+    """What the solution itself says otherwise than the problem; all that there is where no fingerprint was kept."""
+    names = {"path": statement.path.names, "start": statement.start.names, "end": statement.end.names}
+    for place, kept in solution.constraints.items():
+        if kept != names[place]:
+            what = f"the constraints ({place})"
+            return [Difference(what=what, stored=", ".join(kept) or "none", given=", ".join(names[place]) or "none")]
+    duration = statement.duration
+    if not duration.free and not math.isclose(duration.guess, solution.duration) and math.isfinite(solution.duration):
+        return [Difference(what="the duration", stored=f"{solution.duration:g} s", given=f"{duration.guess:g} s")]
+    targets = statement.boundary_values(solution.parameters)[1]
+    for name, old, new in zip(statement.state_names, solution.targets, targets, strict=True):
+        if not np.isclose(old, new, rtol=SAME_RATES, atol=0.0, equal_nan=True):
+            return [Difference(what=f"the final value of '{name}'", stored=f"{old:g}", given=f"{new:g}")]
+    along = replace(solution, statement=statement).extremal
+    rates, _ = rates_along(along)
+    scale = np.abs(solution.rates).max(axis=0, initial=0.0)
+    error = np.abs(rates - solution.rates) > SAME_RATES * np.maximum(scale, np.finfo(float).tiny)
+    if error.any():
+        node, entry = np.argwhere(error)[0]
+        name = (*statement.state_names, *statement.matrix_names)[entry]
+        what = f"the rate of '{name}' at t = {solution.t[node]:g} s"
+        return [Difference(what=what, stored=f"{solution.rates[node, entry]:g}", given=f"{rates[node, entry]:g}")]
+    return []
+
+
+def _with_violations(solution: Solution) -> Solution:
+    """The solution with the bounds, targets and inequalities among its violations that its own values do not meet."""
+    t = solution.trajectory
+    if not solution.converged or not all(np.isfinite(part).all() for part in (t.x, t.u, t.e)):
+        return solution  # the last iterate of a failed run says so itself
+    found = {name: value for name, value in missed(solution.extremal).items() if name not in solution.violations}
+    sizes = _sizes(solution.extremal) if found else {}
+    fresh = {name: value for name, value in found.items() if value > ROUGHLY * sizes.get(name, 0.0)}
+    if not fresh:
+        return solution
+    listed = ", ".join(f"{name} by {value:.3g}" for name, value in list(fresh.items())[:LISTED])
+    warn_user(f"The stored solution of '{solution.name}' violates {listed}, of which the file says nothing.")
+    return replace(solution, violations={**solution.violations, **fresh})
+
+
+def _sizes(extremal: Extremal) -> dict[str, float]:
+    """Size of each inequality along a trajectory: what a state or control of its own size makes of it, by name."""
+    st = extremal.statement
+    columns = [np.asarray(c, dtype=float) for c in extremal.columns()]
+    sizes: dict[str, float] = {}
+    for place in (st.path, st.start, st.end):
+        if not place.size:
+            continue
+        function = place.function.map(columns[0].shape[1])
+        total = np.zeros(place.size)
+        before = np.asarray(function(*columns).full())
+        for argument, row in ((a, r) for a in range(3) for r in range(columns[a].shape[0])):
+            moved = [c.copy() if i == argument else c for i, c in enumerate(columns)]
+            moved[argument][row] *= 1 + MOVED
+            total += np.abs(np.asarray(function(*moved).full()) - before).max(axis=1) / MOVED
+        sizes |= dict(zip(place.names, np.nan_to_num(total).tolist(), strict=True))
+    return sizes

@@ -1,0 +1,71 @@
+"""What a user must know about numbers that look right: a coarse mesh, covariances that none can be."""
+
+from __future__ import annotations
+
+from covocp.base.errors import warn_user
+from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
+from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
+from covocp.solution.solution import Solution
+from covocp.solution.spread import mention_spread
+
+# Relative difference of the cost and of that of the loop's own covariances above which these are not resolved.
+COARSE_LOOP = 1e-2
+# Share of a limit by which the path may pass it between the points where it is imposed.
+PASSED = 1e-2
+REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
+
+
+def mention_doubts(solution: Solution) -> None:
+    """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
+    error = solution.mesh_error
+    depends_on_time = solution.statement is not None and not solution.statement.autonomous
+    if not error <= COARSE_MESH:
+        warn_user(
+            f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
+            + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
+            + "Use more intervals or substeps."
+        )
+    elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
+        warn_user(
+            f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
+            "its range. Use more intervals or substeps."
+        )
+    else:
+        _mention_loop(solution)
+    mention_spread(solution)
+    if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
+        warn_user(
+            f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
+            "covariance_step='gauss' or more intervals."
+        )
+
+
+def mention_limits(solution: Solution) -> None:
+    """Warn of limits that the path passes between the points where they are imposed."""
+    passed = [entry for entry in solution.passed_limits() if entry.share > PASSED]
+    if not passed:
+        return
+    more = f", and {len(passed) - 1} more" if len(passed) > 1 else ""
+    warn_user(
+        f"Between the points where it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
+        f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. Impose it at more points of each "
+        f"interval (points={2 * solution.mesh.points}, method 'ipopt'), use more intervals, or keep a margin."
+    )
+
+
+def _mention_loop(solution: Solution) -> None:
+    """The covariances of a closed loop, and the deviations from them, may be worse than its cost."""
+    if solution.loop is None:
+        return
+    difference = solution.cost_identity
+    if difference is not None and not difference <= COARSE_LOOP:
+        warn_user(
+            f"The mesh does not resolve the gains: the covariances of the closed loop give a cost that differs by "
+            f"{difference:.1e} (relative) from the one that was integrated, so do the deviations. {REMEDY}"
+        )
+        return
+    if not gains_are_steep(solution):
+        return
+    flight = interpolated_flight(solution)
+    if flight.worst > 1.0 + NOTICED:
+        warn_user(f"The mesh does not resolve the gains: {flight.words}. {REMEDY}")

@@ -1,0 +1,477 @@
+"""What print(solution) shows."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from covocp.base.errors import CovocpError
+from covocp.base.matrices import Array, half_indices
+from covocp.extremal.path_limits import NOTED
+from covocp.statement.statement import Block, entry_names
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from covocp.solution.solution import Solution
+
+WIDTH = 100
+# Matrices up to this size are shown whole, larger ones by their diagonal.
+LARGEST_MATRIX = 6
+# Feedback gains of more entries than this are not shown.
+MOST_GAINS = 12
+# Share of the largest feedback, or of the largest gain, that counts as none.
+NO_FEEDBACK = 1e-6
+# Relative gains below this are none, whatever the mesh.
+NO_GAIN = 1e-7
+# Name of the gain of a constrained feedback, and of what the deviations add to an expected cost.
+GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
+# Multipliers below this share of the cost are not shown.
+NEGLIGIBLE = 1e-6
+# Relative difference of costs below which two starts count as having found the same optimum.
+SAME_OPTIMUM = 1e-5
+
+RESIDUALS = {
+    "stationarity": "largest slope of the Lagrangian by a control (relative)",
+    "complementarity": "multipliers times the distance from their bounds (relative to the cost)",
+    "control_slope": "H_u at the nodes, root mean square (relative)",
+    "costate_difference": "costates: multipliers against backward integration (relative)",
+    "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
+    "transversality": "condition of the free duration, k_T + H(T) (relative)",
+    "mesh_error": "cost: change by halving the integration steps (relative)",
+    "node_error": "nodes: change by halving the integration steps (of the range)",
+    "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
+    "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
+    "cost_identity": "expected cost: as optimised against from the covariances (relative)",
+    "cross_covariance": "correlation of the estimate and its error, zero in theory",
+    "conservation": "variances E + Xhat that no control changes: error (relative)",
+    "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
+}
+
+
+# Where to begin to worry about a residual, and what a large one means.
+WORRIES: dict[str, tuple[float, str]] = {
+    "stationarity": (1e-4, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
+    "costate_difference": (
+        1e-2,
+        "large: the costates change within an interval (a constraint takes hold, a stiff start or end); costs and "
+        "controls may be right all the same: worry if the mesh error is large, or if it stays on twice the intervals",
+    ),
+    "hamiltonian_variation": (
+        1e-2,
+        "large: the controls or costates change within an interval; worry if it stays on twice the intervals",
+    ),
+    "transversality": (1e-2, "LARGE: the duration is not the best one, or the mesh too coarse: more intervals"),
+    "control_slope": (
+        0.1,
+        "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
+    ),
+    "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
+    "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
+    "control_error": (1e-3, "large: a freer control would cost that much less: more intervals, or control='linear'"),
+    "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
+    "cross_covariance": (
+        1e-2,
+        "large: the gains change faster than the steps that check them; worry if the expected costs differ as well",
+    ),
+    "conservation": (1e-3, "LARGE: the covariances are known to no more than this: more intervals"),
+}
+
+
+def summary(solution: Solution) -> str:
+    """A solution in words and tables of plain text, at most 100 columns wide.
+
+    Args:
+        solution: converged or not; the first line says which.
+
+    Returns:
+        The text: status, violations, cost by term, values at the end, what the closed loop does, residuals of
+        optimality, mesh and effort.
+    """
+    closed = solution.loop is not None
+
+    def shown(block: Block) -> bool:  # the covariances of a closed loop are in its tables
+        return not closed or not (block.estimation or block.backward)
+
+    parts = [
+        _head(solution),
+        _violations(solution.violations),
+        _costs(solution),
+        _states(solution),
+        _unknowns(solution),
+        _deviations(solution),
+        _feedback(solution),
+        _gains(solution),
+        *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix" and shown(block)),
+        _optimality(solution),
+        _between_nodes(solution),
+        _effort(solution),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def render_table(columns: list[str], rows: list[list[str]], *, words: tuple[int, ...] = (0,)) -> str:
+    """A table as plain text.
+
+    Args:
+        columns: headings.
+        rows: entries, one list a row.
+        words: columns that are set left; the others hold numbers and are set right.
+
+    Returns:
+        Lines without trailing blanks, at most 100 columns wide; long words are folded.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for i, column in enumerate(columns):
+        table.add_column(
+            Text(column), justify="left" if i in words else "right", overflow="fold", no_wrap=i not in words
+        )
+    for row in rows:
+        table.add_row(*(Text(entry) for entry in row))
+    stream = io.StringIO()
+    Console(file=stream, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False).print(table)
+    return "\n".join(line.rstrip() for line in stream.getvalue().rstrip("\n").splitlines())
+
+
+def number(value: float | None, digits: int = 8) -> str:
+    """A number for a table; "-" where there is none."""
+    return "-" if value is None or np.isnan(value) else f"{value:.{digits}g}"
+
+
+def wrapped(text: str, indent: str = "  ") -> str:
+    """A paragraph of at most 100 columns, later lines indented."""
+    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_long_words=True)
+
+
+def _head(solution: Solution) -> str:
+    name = solution.name or "problem without a name"
+    if solution.converged:
+        return wrapped(f"{name}: {solution.message} ({solution.method})")
+    return wrapped(f"NOT CONVERGED: {name}: {solution.message} ({solution.method})")
+
+
+def _violations(violations: Mapping[str, float]) -> str:
+    if not violations:
+        return ""
+    ordered = sorted(violations.items(), key=lambda item: -item[1])
+    return render_table(["violated constraint", "by"], [[name, number(value, 4)] for name, value in ordered])
+
+
+def _costs(solution: Solution) -> str:
+    terms = [[name, number(value)] for name, value in solution.cost_terms.items()]
+    text = render_table(["cost", ""], [*terms, ["total", number(solution.cost)]])
+    words = []
+    if solution.loop is not None and DEVIATIONS in solution.cost_terms:
+        ended, on_the_way = (number(solution.loop.cost[f"{DEVIATIONS} {where}"], 6) for where in PLACES)
+        words.append(f"deviations: {ended} at the end, {on_the_way} on the way")
+        words += _left_out(solution)
+    if solution.optimised:
+        words += _gained(solution)
+    missing = solution.stats.get("classical_missing")
+    if missing:
+        words.append(wrapped(f"There is no classical design to compare with: {missing}", ""))
+    return "\n".join([text, *words])
+
+
+def _left_out(solution: Solution) -> list[str]:
+    """What the curvature of rates and measurements adds, which the linear covariance equations do not have."""
+    effect = solution.mean_effect
+    if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
+        return []
+    share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
+    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in entry_names((b,))]
+    spread = _roots(np.asarray(solution.loop.X))[-1] if solution.loop is not None else np.zeros(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
+    worst = int(np.argmax(moved))
+    return [
+        wrapped(
+            f"not in the cost: rates and measurements bend, which adds {effect.cost:+.2g}{share} through the mean "
+            f"of the deviations; at the end that of {names[worst]} is {effect.mean[-1, worst]:+.2g}, "
+            f"{moved[worst]:.2g} of its root mean square"
+        )
+    ]
+
+
+def _gained(solution: Solution) -> list[str]:
+    """What the combined design gains over the classical one, and whether the mesh can tell."""
+    classical = solution.stats.get("classical_cost")
+    if not classical:
+        return []
+    text = f"classical design: {number(classical)}"
+    if solution.stats.get("classical_same"):
+        return [f"{text}, the same to roundoff"]
+    gain = 1.0 - solution.cost / classical
+    text += f", of which {100 * gain:.3g} % are gained"
+    if NO_GAIN < abs(gain) < solution.mesh_error:
+        text += f": less than the error of the mesh, {100 * solution.mesh_error:.2g} %; more intervals can tell"
+    return [wrapped(text)]
+
+
+def _states(solution: Solution) -> str:
+    """Terminal values with targets, multipliers and, where nothing is fed back, standard deviations."""
+    blocks = tuple(b for b in solution.blocks if b.kind == "state")
+    if not blocks:
+        return ""
+    target = solution.targets
+    bound = ~np.isnan(target) if solution.optimised else np.zeros(target.size, dtype=bool)
+    columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
+    rows = [
+        [name, number(x), number(goal), number(multiplier if fixed else None)]
+        for name, x, goal, multiplier, fixed in zip(
+            entry_names(blocks), solution.trajectory.x[-1], target, solution.multipliers.final, bound, strict=True
+        )
+    ]
+    if solution.loop is not None:  # a gain that is constant is a state, which has its own table
+        own = [b.name != GAIN for b in blocks for _ in range(b.size)]
+        rows = [row for row, kept in zip(rows, own, strict=True) if kept]
+    elif _estimated(solution):
+        columns.append("standard deviation")
+        deviations = np.concatenate([np.atleast_1d(solution.deviation(b.name)[-1]) for b in blocks])
+        rows = [[*row, number(value)] for row, value in zip(rows, deviations, strict=True)]
+    return render_table(columns, rows)
+
+
+def _unknowns(solution: Solution) -> str:
+    """Unknown constants: mean, standard deviation of their estimate at the start and at the end."""
+    rows = []
+    for b in solution.blocks:
+        if b.kind != "unknown":
+            continue
+        means = np.atleast_1d(solution.values[b.name][0])
+        deviations = np.full((2, b.size), np.nan)
+        if solution.loop is not None:
+            deviations = _roots(solution.loop.E)[:, _rows(solution, b.name)]
+        elif _estimated(solution):
+            deviations = solution.deviation(b.name).reshape(-1, b.size)
+        entries = zip(entry_names((b,)), means, deviations[0], deviations[-1], strict=True)
+        rows += [[name, number(mean), number(first), number(last)] for name, mean, first, last in entries]
+    return render_table(["unknown", "mean", "deviation at 0", "deviation at T"], rows) if rows else ""
+
+
+def _rows(solution: Solution, name: str) -> list[int]:
+    """Rows of the augmented state that belong to a symbol."""
+    return [i for i, label in enumerate(solution.augmented) if label.split("[")[0] == name]
+
+
+def _roots(covariance: Array) -> Array:
+    """Standard deviations over time, (K, n)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)))
+
+
+def _deviations(solution: Solution) -> str:
+    """What the actual states of a closed loop do at the end, and how much of it the filter does not know."""
+    loop = solution.loop
+    if loop is None:
+        return ""
+    total, error = _roots(loop.X), _roots(loop.E)
+    states = [i for b in solution.blocks if b.kind == "state" for i in _rows(solution, b.name)]
+    rows = [
+        [
+            solution.augmented[i],
+            number(total[0, i], 6),
+            number(total[-1, i]),
+            number(error[-1, i]),
+            f"{100 * (error[-1, i] / total[-1, i]) ** 2:.3g} %" if total[-1, i] > 0 else "-",
+        ]
+        for i in states
+    ]
+    columns = ["closed loop, root mean squares", "at 0", "at T", "error of the estimate", "of the variance"]
+    return render_table(columns, rows) if rows else ""
+
+
+def _feedback(solution: Solution) -> str:
+    """What the feedback asks of the controls, and how far the nominal stays from their bounds in units of it."""
+    loop = solution.loop
+    if loop is None or not loop.gain.shape[1]:
+        return ""
+    if not loop.Xhat.any():
+        reason = (
+            "nothing is measured" if solution.filter_gain is None else "what is measured tells nothing of the state"
+        )
+        return wrapped(f"{reason}, so nothing is fed back: the actual control is the nominal one", "")
+    spread = np.sqrt(np.maximum(np.einsum("kui,kij,kuj->ku", loop.gain, loop.Xhat, loop.gain), 0.0))
+    names = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
+    room = _room(solution, spread)
+    rows = []
+    for i, name in enumerate(names):
+        k = int(np.argmax(spread[:, i]))
+        rows.append([name, number(spread[k, i], 6), number(solution.t[k], 4), number(spread[-1, i], 6)])
+        rows[-1] += [] if room is None else [number(room[i], 3)]
+    columns = ["feedback, root mean squares", "largest", "at t [s]", "at T"]
+    return render_table(columns + ([] if room is None else ["nearest bound, in rms"]), rows)
+
+
+def _room(solution: Solution, spread: Array) -> Array | None:
+    """Least distance of each control from its bounds, in root mean squares of its feedback; None without bounds."""
+    if solution.statement is None:
+        return None
+    count = spread.shape[1]
+    lower, upper = (bound[:count] for bound in solution.statement.control_bounds)
+    if not np.isfinite([lower, upper]).any():
+        return None
+    u = solution.controls[:, :count]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.minimum(u - lower, upper - u) / spread
+    ratio[spread <= NO_FEEDBACK * spread.max(axis=0)] = np.inf
+    least = ratio.min(axis=0)
+    return np.where(np.isfinite(least), np.maximum(least, 0.0), np.nan)
+
+
+def _gains(solution: Solution) -> str:
+    """A few numbers of each entry of the feedback gain; nothing where there are many."""
+    if solution.loop is None or not solution.loop.Xhat.any():  # the estimate stays zero, whatever the gain
+        return ""
+    gain = solution.loop.gain
+    controls = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
+    entries = [(u, i) for u in range(gain.shape[1]) for i in range(gain.shape[2])]
+    if not entries or len(entries) > MOST_GAINS:
+        return ""
+    middle = int(np.argmin(np.abs(solution.mesh.nodes - 0.5)))
+    rows = []
+    for u, i in entries:
+        history = gain[:, u, i]
+        k = int(np.argmax(np.abs(history)))
+        chosen = [number(history[j], 5) for j in (0, middle, -1, k)]
+        rows.append([f"{controls[u]}, {solution.augmented[i]}", *chosen, number(solution.t[k], 4)])
+    if np.ptp(gain, axis=0).max() <= NO_FEEDBACK * np.abs(gain).max():
+        return render_table(["gain C, constant", ""], [row[:2] for row in rows])
+    return render_table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)
+
+
+def _estimated(solution: Solution) -> bool:
+    """Whether there is an estimation covariance."""
+    return any(b.estimation for b in solution.blocks)
+
+
+def _matrix(solution: Solution, block: Block) -> str:
+    """A matrix at the end: its lower triangle, or its diagonal where it is large; multipliers of fixed entries."""
+    final, labels = solution.values[block.name][-1], block.labels
+    kind = "covariance" if block.covariance else "matrix"
+    if block.size > LARGEST_MATRIX:
+        rows = [[label, number(final[i, i])] for i, label in enumerate(labels)]
+        text = render_table([f"{kind} {block.name} at T, diagonal", ""], rows)
+    elif block.size == 1:
+        text = render_table([f"{kind} {block.name} at T", number(final[0, 0])], [])
+    else:
+        rows = [[label, *(number(v, 6) for v in final[i, : i + 1])] for i, label in enumerate(labels)]
+        rows = [row + [""] * (block.size + 1 - len(row)) for row in rows]
+        text = render_table([f"{kind} {block.name} at T", *labels], rows)
+    multipliers = solution.multipliers.final_matrices[block.span]
+    pairs = zip(*half_indices(block.size), multipliers, strict=True)
+    fixed = [
+        [f"{block.name}[{labels[min(i, j)]}, {labels[max(i, j)]}]", number(value)]
+        for i, j, value in pairs
+        if abs(value) > NEGLIGIBLE * abs(solution.cost) and not block.backward  # bounds at the end leave tiny ones
+    ]
+    return text + ("\n" + render_table(["fixed at T", "multiplier"], fixed) if fixed else "")
+
+
+def _optimality(solution: Solution) -> str:
+    """The residuals of the necessary conditions in words."""
+    try:
+        values = solution.optimality.as_dict()
+    except (CovocpError, RuntimeError, ArithmeticError, ValueError) as error:
+        return wrapped(f"necessary conditions: not evaluated ({str(error).splitlines()[0][:100]})")
+    rows = []
+    for name, value in values.items():
+        if value is None or (name == "smallest_eigenvalue" and np.isinf(value)):
+            continue
+        rows.append(
+            [
+                RESIDUALS.get(name, name.replace("_", " ")),
+                "-" if np.isnan(value) else f"{value:.2e}",
+                _verdict(solution, name, value),
+            ]
+        )
+    return render_table(["necessary conditions", "", ""], rows, words=(0, 2))
+
+
+def _verdict(solution: Solution, name: str, value: float) -> str:
+    """What a sign means, and what a residual does that is larger than usual."""
+    if name == "smallest_eigenvalue":
+        return "semidefinite" if solution.semidefinite else "INDEFINITE"
+    if name == "curvature" and solution.converged:
+        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
+    level, words = WORRIES.get(name, (np.inf, ""))
+    return words if solution.converged and abs(value) > level else ""
+
+
+def _between_nodes(solution: Solution) -> str:
+    """What happens to limits where nobody asked: a sentence, empty where they hold."""
+    if solution.statement is None or not solution.converged:
+        return ""
+    found = [entry for entry in solution.passed_limits() if entry.share > NOTED]
+    if not found:
+        return ""
+    worst = found[0]
+    where = "the nodes" if solution.mesh.points == 1 else f"{solution.mesh.points} points of each interval"
+    text = (
+        f"limits are imposed at {where}; between them that of '{worst.name}' is passed by up to {worst.by:.2g}, "
+        f"{100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: points= or more intervals make it less, "
+        "check_path() lists all"
+    )
+    return wrapped(text)
+
+
+def _counted(number: int, what: str) -> str:
+    """A number of things in words."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _effort(solution: Solution) -> str:
+    """Mesh, iterations and time, a sentence."""
+    mesh, stats = solution.mesh, solution.stats
+    words = [
+        _intervals(mesh.intervals, stats),
+        f"controls piecewise {mesh.control}",
+        _counted(mesh.substeps, "integration step") + " an interval",
+        _counted(len(mesh.segments), "shooting segment"),
+    ]
+    if any(b.kind == "matrix" for b in solution.blocks):
+        words.append(f"matrices {'eliminated' if mesh.eliminated else 'as states'}, step '{mesh.step}'")
+    effort = [_counted(stats["iterations"], "iteration")] if stats.get("iterations", -1) >= 0 else []
+    if (seconds := solution_seconds(stats)) is not None:
+        effort.append(f"{seconds:.3g} s")
+    if stats.get("left_saddle"):
+        effort.append("started again from a saddle")
+    if "starts" in stats:
+        effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
+    lines = [wrapped("mesh: " + ", ".join(words))]
+    return "\n".join(lines + ([wrapped("effort: " + ", ".join(effort))] if effort else []))
+
+
+def _intervals(count: int, stats: Mapping[str, Any]) -> str:
+    """The number of intervals, and how the mesh that was asked for was graded."""
+    asked, added = stats.get("intervals_asked"), stats.get("nodes_added")
+    if asked is None or added is None:
+        return _counted(count, "interval")
+    places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
+    return f"{_counted(asked, 'interval')}, graded to {count} {places}"
+
+
+def _starts(costs: Any) -> str:
+    """What the starts of a multistart found."""
+    found = np.sort(costs[np.isfinite(costs)])
+    text = f"best of {costs.size} starts"
+    if found.size > 1:
+        gaps = np.diff(found) > SAME_OPTIMUM * np.maximum(np.abs(found[1:]), np.abs(found[:-1]))
+        optima = 1 + int(gaps.sum())
+        if optima > 1:
+            text += f", which found {optima} local optima with costs from {found[0]:.6g} to {found[-1]:.6g}"
+    if found.size < costs.size:
+        text += f"; {costs.size - found.size} did not converge"
+    return text
+
+
+def solution_seconds(stats: Mapping[str, Any]) -> float | None:
+    """Time that a method reports, all its parts together; None where it reports none."""
+    parts = [float(value) for name, value in stats.items() if name.endswith("seconds")]
+    return sum(parts) if parts else None

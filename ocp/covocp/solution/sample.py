@@ -1,0 +1,44 @@
+"""Values of a solution at some times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.statement.names import entry_values, name_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Values at some times, indexed like a solution (time first where several times were asked for)."""
+
+    t: Any
+    values: Mapping[str, Array] = field(repr=False)
+    symbols: Mapping[str, Any] = field(repr=False)
+
+    def __getitem__(self, key: Any) -> Array:
+        """The value of a symbol, a name, or an entry of a vector."""
+        given = np.ndim(self.t)
+        sizes = {n: v.shape[-1] if v.ndim > given else 1 for n, v in self.values.items() if v.ndim <= given + 1}
+        return entry_values(self.values, name_of(key, self.symbols, tuple(self.values), sizes=sizes))
+
+    def __repr__(self) -> str:
+        """The values by name, on one line."""
+        shown = {"t": self.t, **{name: v for name, v in self.values.items() if name not in ("time", "duration")}}
+        return f"Sample({', '.join(f'{name} = {_in_line(value)}' for name, value in shown.items())})"
+
+
+def _in_line(value: Any) -> str:
+    """Numbers on one line, six digits; of large arrays the corners."""
+    text = np.array2string(
+        np.asarray(value, dtype=float),
+        formatter={"float_kind": lambda number: f"{number:.6g}"},
+        threshold=20,
+        edgeitems=2,
+        separator=", ",
+    )
+    return " ".join(text.split())

@@ -1,0 +1,535 @@
+"""A solution: plain data at the nodes, indexed by the user's symbols and names."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import as_number, is_whole
+from covocp.base.errors import CovocpError, ProblemError, describe
+from covocp.base.matrices import (
+    Array,
+    is_semidefinite,
+    smallest_eigenvalue,
+    unpack,
+    unpack_costate,
+)
+from covocp.base.threads import cached, methods_one_at_a_time
+from covocp.extremal.closed_loop import ClosedLoop, close_loop
+from covocp.extremal.dense_output import Dense, dense_output
+from covocp.extremal.extremal import Extremal, Outcome
+from covocp.extremal.hamiltonian import Costates, discrete_costates
+from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
+from covocp.extremal.mesh_error import mesh_error
+from covocp.extremal.nodes import filter_gain, rates_along
+from covocp.extremal.optimality import Optimality, assess, identities
+from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.solution.fingerprint import Fingerprint
+from covocp.solution.sample import Sample
+from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
+from covocp.statement.statement import Block, Statement, entry_names
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Multipliers, Trajectory
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import matplotlib.figure
+
+
+@methods_one_at_a_time
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """An optimal control problem solved (or its last iterate: see `converged`).
+
+    `solution[key]`, with the symbol, its name, or any expression of the problem's symbols, gives the values at the
+    nodes, time first: (K,) for scalars, (K, n) for vectors, (K, n, n) for matrices.
+
+    Attributes:
+        name: of the problem.
+        method: that found it.
+        converged: whether the method's own test was met.
+        message: how the method ended.
+        cost_terms: terminal and running cost.
+        mesh: nodes, controls, covariance step.
+        trajectory: x, u, e at the nodes, terminal time [s].
+        parameters: stacked values of known parameters and means of unknowns.
+        multipliers: of the constraints.
+        rates: of x and e stacked, at the nodes, (K, nx + ne).
+        end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
+        filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
+        loop: covariances, gain and expected cost of the closed loop; None where nothing is fed back.
+        mesh_error: relative change of the cost by halving the integration steps (estimated to first order).
+        violations: of constraints, by name.
+        stats: iterations, times, what the method counts.
+        blocks: where each symbol lies.
+        augmented: names of the rows of the estimation covariance.
+        targets: final values of the states, NaN where they are free.
+        constraints: names of the rows of the inequalities, by place: "path", "start", "end".
+        statement: the problem solved; None for a solution read from a file.
+        stored_problem: of a solution read from a file, what its problem was, to tell it from others.
+    """
+
+    name: str
+    method: str
+    converged: bool
+    message: str
+    cost_terms: Mapping[str, float]
+    mesh: Mesh
+    trajectory: Trajectory
+    parameters: Array
+    multipliers: Multipliers
+    rates: Array
+    end_rates: Array
+    filter_gain: Array | None
+    mesh_error: float
+    violations: Mapping[str, float]
+    stats: Mapping[str, Any]
+    blocks: tuple[Block, ...]
+    augmented: tuple[str, ...]
+    targets: Array
+    constraints: Mapping[str, tuple[str, ...]]
+    loop: ClosedLoop | None = None
+    statement: Statement | None = None
+    stored_costates: Costates | None = None
+    stored_dense: Dense | None = None
+    stored_optimality: Optimality | None = None
+    stored_problem: Fingerprint | None = None
+
+    @staticmethod
+    def of(outcome: Outcome, method: str) -> Solution:
+        """The solution of an outcome, with the estimate of its mesh error."""
+        extremal = outcome.extremal
+        st, trajectory = extremal.statement, extremal.trajectory
+        rates, end_rates = rates_along(extremal)
+        loop = close_loop(extremal) if st.loop is not None and np.isfinite(rates).all() else None
+        for array in (trajectory.x, trajectory.u, trajectory.e, rates, end_rates):
+            array.setflags(write=False)
+        return Solution(
+            name=st.name,
+            method=method,
+            converged=outcome.converged,
+            message=outcome.message,
+            cost_terms=_split_cost(outcome.cost_terms, loop),
+            mesh=extremal.mesh,
+            trajectory=trajectory,
+            parameters=extremal.parameters,
+            multipliers=extremal.multipliers,
+            rates=rates,
+            end_rates=end_rates,
+            filter_gain=filter_gain(extremal),
+            mesh_error=mesh_error(extremal, outcome.cost_terms["running"]),
+            violations=dict(outcome.violations),
+            stats=dict(outcome.stats),
+            blocks=st.blocks,
+            augmented=st.augmented,
+            targets=st.boundary_values(extremal.parameters)[1],
+            constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
+            loop=loop,
+            statement=st,
+        )
+
+    @property
+    def cost(self) -> float:
+        """The cost, sum of its terms."""
+        return float(sum(self.cost_terms.values()))
+
+    @property
+    def optimised(self) -> bool:
+        """Whether the nominal was chosen for this cost, not given nor taken from the deterministic one."""
+        return self.method != "evaluate" and self.stats.get("nominal") != "deterministic"
+
+    @property
+    def status(self) -> str:
+        """How the run ended, in words."""
+        return self.message if self.converged else f"NOT CONVERGED: {self.message}"
+
+    @property
+    def duration(self) -> float:
+        """Terminal time [s]."""
+        return self.trajectory.duration
+
+    @property
+    def t(self) -> Array:
+        """Times of the nodes [s], shape (K,)."""
+        return np.asarray(self.mesh.nodes * self.duration)
+
+    @property
+    def gains(self) -> Mapping[str, Array]:
+        """Gains at the nodes over the augmented state: "K" of the filter (K, n, m), "C" of the feedback (K, nu, n)."""
+        gains = {} if self.filter_gain is None else {"K": self.filter_gain}
+        return gains if self.loop is None else {**gains, "C": self.loop.gain}
+
+    @property
+    def symbols(self) -> Mapping[str, Any]:
+        """The user's symbols by name; empty for a solution read from a file."""
+        return self.statement.symbols if self.statement is not None else {}
+
+    @property
+    def extremal(self) -> Extremal:
+        """Trajectory and multipliers with the statement, for the functions of `hamiltonian`.
+
+        Raises:
+            CovocpError: where the solution was read from a file without its problem.
+        """
+        if self.statement is None:
+            raise CovocpError(
+                "This solution was read from a file and knows no problem: use load(path, problem=...) for this."
+            )
+        return Extremal(
+            statement=self.statement,
+            mesh=self.mesh,
+            trajectory=self.trajectory,
+            parameters=self.parameters,
+            multipliers=self.multipliers,
+        )
+
+    @cached
+    def costates(self) -> Costates:
+        """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
+        if self.stored_costates is not None:
+            return self.stored_costates
+        costates, _, _ = discrete_costates(self.extremal)
+        for array in (costates.state, costates.matrices):
+            array.setflags(write=False)
+        return costates
+
+    @cached
+    def optimality(self) -> Optimality:
+        """Residuals of the necessary conditions, mesh error and smallest covariance eigenvalue."""
+        if self.stored_optimality is not None:
+            return self.stored_optimality
+        known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
+        if not self.optimised:
+            return identities(self.extremal, *known)
+        return assess(self.extremal, self.costates, *known)
+
+    @property
+    def cost_identity(self) -> float | None:
+        """Relative difference of the cost and of the expected cost from the loop's own covariances (E-1).
+
+        None without a closed loop, and where the cost is the latter one: under other statistics than the design's.
+        """
+        if self.loop is None or self.cost_terms.keys() == self.loop.cost.keys():
+            return None
+        own = self.loop.expected_cost
+        return abs(self.cost - own) / max(abs(own), float(np.finfo(float).tiny))
+
+    @cached
+    def mean_effect(self) -> MeanEffect | None:
+        """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
+        if self.loop is None or self.statement is None:
+            return remembered(self.stats)
+        return mean_effect(self.extremal, self.loop)
+
+    @cached
+    def smallest_eigenvalue(self) -> float:
+        """Smallest eigenvalue of the covariances at all nodes; inf without covariances."""
+        return min((smallest_eigenvalue(matrix) for matrix in self._all_covariances()), default=np.inf)
+
+    @cached
+    def semidefinite(self) -> bool:
+        """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
+        return all(is_semidefinite(matrix) for matrix in self._all_covariances())
+
+    def _all_covariances(self) -> list[Array]:
+        loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]
+        return [self._matrix(b) for b in self._covariances()] + loop
+
+    def _covariances(self) -> list[Block]:
+        return [b for b in self.blocks if b.kind == "matrix" and b.covariance]
+
+    def _matrix(self, block: Block) -> Array:
+        return unpack(self.trajectory.e[:, block.span], block.size)
+
+    def block(self, name: str) -> Block:
+        """Where a name, or that of an entry of a vector, lies."""
+        found = block_of(name, self.blocks) if isinstance(name, str) else None
+        if found is None:
+            raise unknown_name(name, tuple(b.name for b in self.blocks))
+        return found
+
+    def _name(self, key: Any, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
+        """Name of a symbol, a name or an entry among some blocks; None: among all values."""
+        names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
+        sizes = sizes_of(self.blocks if blocks is None else blocks)
+        return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes)
+
+    @cached
+    def values(self) -> Mapping[str, Array]:
+        """Values of all symbols at the nodes by name; read-only."""
+        values = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
+        for array in values.values():
+            array.setflags(write=False)
+        return values
+
+    @property
+    def controls(self) -> Array:
+        """Controls at all K nodes; a constant control holds its last value at the last node."""
+        u = self.trajectory.u
+        return u if u.shape[0] == self.mesh.nodes.size else np.vstack([u, u[-1:]])
+
+    def _assemble(self, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
+        """Values by name at some times; x (K, nx), u (K, nu), e (K, ne)."""
+        sources = {"state": x, "control": u}
+        result: dict[str, Array] = {"time": t, "duration": np.full(t.shape, self.duration)}
+        for b in self.blocks:
+            if b.kind == "matrix":
+                result[b.name] = unpack(e[:, b.span], b.size)
+                continue
+            values = sources[b.kind][:, b.span] if b.kind in sources else np.tile(self.parameters[b.span], (t.size, 1))
+            result[b.name] = values[:, 0] if b.size == 1 else values
+        return result
+
+    def __getitem__(self, key: Any) -> Array:
+        """Values at the nodes of a symbol, a name, an entry of one, or an expression of the problem's symbols.
+
+        Raises:
+            ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
+        """
+        found = self._name(key, missing_ok=isinstance(key, ca.MX))
+        if found:
+            return entry_values(self.values, found)
+        extremal = self.extremal
+        try:
+            function = extremal.statement.expression(key)
+        except RuntimeError as error:
+            raise unknown_name(key, tuple(self.values)) from error
+        count = self.mesh.nodes.size
+        value = np.asarray(function.map(count)(*extremal.columns()).full())
+        rows, columns = key.shape
+        shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
+        return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
+
+    def at(self, t: Any) -> Sample:
+        """Values at other times than the nodes.
+
+        States and matrices as the integrator computes them between the nodes (`dense`), controls as they were
+        transcribed.
+
+        Args:
+            t: a time or an array of times [s], within [0, duration].
+
+        Returns:
+            What `[symbol or name]` gives the values of.
+
+        Raises:
+            ProblemError: where a time lies outside, or is not a number.
+        """
+        times = np.atleast_1d(as_number("at", "times", t))
+        margin = 1e-9 * self.duration
+        if times.ndim != 1 or not ((times >= -margin) & (times <= self.duration + margin)).all():
+            raise ProblemError(
+                describe(
+                    "A solution has no values there.",
+                    expected=f"a time or a row of times within [0, {self.duration:g}] s",
+                    received=str(t)[:100],
+                    remedy="stay within the duration of the solution",
+                )
+            )
+        z, u = self.dense.at(np.clip(times / self.duration, 0.0, 1.0)), self.controls_at(times)
+        nx = self.trajectory.x.shape[1]
+        values = self._assemble(times, z[:, :nx], u, z[:, nx:])
+        if np.ndim(t) == 0:
+            values = {name: value[0] for name, value in values.items()}
+        return Sample(t=t, values=values, symbols=self.symbols)
+
+    def controls_at(self, times: Array) -> Array:
+        """Controls at some times [s], (K, nu); at a node where they jump those of the interval that starts there."""
+        nodes, u = self.t, self.controls
+        k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
+        if self.mesh.control == "constant":
+            return np.asarray(u[k])
+        c = (times - nodes[k]) / (nodes[k + 1] - nodes[k])
+        return np.asarray(u[k] + c[:, None] * (u[k + 1] - u[k]))
+
+    @cached
+    def dense(self) -> Dense:
+        """States and half-vectors between the nodes, read-only; computed when first asked for."""
+        if self.stored_dense is not None:
+            return self.stored_dense
+        dense = dense_output(self.extremal)
+        for array in (dense.knots, dense.values, dense.first, dense.last):
+            array.setflags(write=False)
+        return dense
+
+    @cached
+    def _dense_states(self) -> Dense:
+        """The same of the states alone, which costs less where there are matrices."""
+        return dense_output(self.extremal, matrices=False)
+
+    def costate(self, symbol: Any) -> Array:
+        """Costate of a state or its entry, (K,) or (K, n), or of a matrix, the symmetric P of (K, n, n).
+
+        Raises:
+            ProblemError: where the symbol is neither.
+        """
+        name = self._name(symbol)
+        b = block_of(name, self.blocks)
+        if b is None or b.kind not in ("state", "matrix"):
+            names = ", ".join(q.name for q in self.blocks if q.kind in ("state", "matrix"))
+            raise ProblemError(
+                describe(
+                    f"'{name}' has no costate.",
+                    expected=f"a state or a matrix: {names}",
+                    received=name,
+                    remedy="ask for one of them",
+                )
+            )
+        if b.kind == "matrix":
+            return unpack_costate(self.costates.matrices[:, b.span], b.size)
+        values = self.costates.state[:, b.span]
+        return np.asarray(values[:, 0] if b.size == 1 else values)
+
+    def multiplier(self, key: Any) -> Array:
+        """Multiplier of a constraint, by its name, or of the terminal values of a state or a matrix.
+
+        The multiplier of an inequality is positive at its upper bound: the cost falls by it for one unit more room. For
+        terminal values it is l of p(T) = k_x + l, zero where they are free; the cost rises by -l for one unit more.
+
+        Args:
+            key: the name of a constraint, or the symbol or name of a state or a matrix.
+
+        Returns:
+            Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes (what acts
+            between two nodes is shared between them); of terminal and initial ones () or (rows,); of a state () or
+            (n,); of a matrix (n, n).
+
+        Raises:
+            ProblemError: where there is no such constraint or symbol.
+        """
+        for place, names in self.constraints.items():
+            rows = [i for i, n in enumerate(names) if isinstance(key, str) and (n == key or n.startswith(f"{key}["))]
+            if rows:
+                values = getattr(self.multipliers, "path_at_nodes" if place == "path" else place)[..., rows]
+                return np.asarray(values[..., 0] if len(rows) == 1 else values)
+        b = self.block(self._name(key, tuple(b for b in self.blocks if b.kind in ("state", "matrix"))))
+        if b.kind == "matrix":
+            return unpack_costate(self.multipliers.final_matrices[b.span], b.size)
+        values = self.multipliers.final[b.span]
+        return np.asarray(values[0] if b.size == 1 else values)
+
+    def covariance(self, a: Any, b: Any = None) -> Array:
+        """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).
+
+        That of the errors of the estimate where nothing is fed back, E + Xhat (and Z, where the statistics are not
+        those of the design) in a closed loop.
+
+        Args:
+            a: a state or an unknown, or an entry of it, symbol or name: p, "p", p[0], "p[0]".
+            b: another one; None: a itself.
+
+        Raises:
+            ProblemError: where there is no estimation covariance, or the symbol is not in it.
+        """
+        block = next((q for q in self.blocks if q.kind == "matrix" and q.estimation), None)
+        if block is None:
+            raise ProblemError(
+                describe(
+                    "The problem has no estimation covariance.",
+                    expected="a problem with estimation_covariance()",
+                    received=self.name,
+                    remedy="index the matrices of the problem by their names",
+                )
+            )
+        full = self._matrix(block) if self.loop is None else self.loop.X
+        rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
+        return np.asarray(full[:, rows, columns])
+
+    def deviation(self, symbol: Any) -> Array:
+        """Standard deviation of a state, an unknown or an entry of one, (K,) or (K, n), in its unit."""
+        variances = np.diagonal(self.covariance(symbol), axis1=1, axis2=2)
+        values = np.sqrt(np.maximum(variances, 0.0))
+        return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
+
+    def _augmented_span(self, key: Any) -> slice:
+        offset = 0
+        both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
+        candidates = tuple(q for q in both if entry_names((q,))[0] in self.augmented)  # constants of a gain have no row
+        rows = []
+        for q in candidates:
+            rows.append(replace(q, kind="state", offset=offset))
+            offset += q.size
+        found = block_of(self._name(key, candidates), rows)
+        assert found is not None
+        return found.span
+
+    def check_path(self, points: int = 10) -> Mapping[str, float]:
+        """Largest violation of each path constraint and state bound along the true path.
+
+        They are imposed at a few points of each interval (`points=` of `solve`); this looks at the ends of `points`
+        equal parts of it, and wherever the path bends sharply. Memory does not grow with the points.
+
+        Args:
+            points: parts of each interval.
+
+        Returns:
+            Violation by name, in the unit of the constraint; only those that are violated by more than 1e-5 of their
+            limit, the accuracy of the path.
+
+        Raises:
+            ProblemError: where `points` is not a positive whole number.
+            CovocpError: where the solution was read from a file without its problem.
+        """
+        if not is_whole(points):
+            raise ProblemError(
+                describe(
+                    "check_path needs a number of parts of each interval.",
+                    expected="1, 2, 3, ...",
+                    received=repr(points),
+                    remedy="correct points",
+                )
+            )
+        return {entry.name: entry.by for entry in self.passed_limits(points)}
+
+    def passed_limits(self, points: int = 10) -> tuple[Passed, ...]:
+        """What `check_path` finds, with the share of the limit and the time, the worst first."""
+        extremal = self.extremal
+        if not limited(extremal):
+            return ()
+        whole = extremal.statement.path.uses_matrices or "dense" in self.__dict__ or self.stored_dense is not None
+        return passed_limits(extremal, self.dense if whole else self._dense_states, points)
+
+    def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
+        """Draw the solution; see `covocp.plot.figure.plot_solutions`."""
+        _later("plot").check_plot_options(options)
+        return _later("plot").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
+
+    def save(self, path: str | Path) -> Path:
+        """Write the solution to a .npz or .json file; see `covocp.solution.storage.save`."""
+        return _later("storage").save(self, path)  # type: ignore[no-any-return]
+
+    def to_xarray(self) -> Any:
+        """The solution as an xarray.Dataset; see `covocp.solution.storage.to_xarray`."""
+        return _later("storage").to_xarray(self)
+
+    def __repr__(self) -> str:
+        """One line: what a console shows of a solution that nobody prints is no page of numbers."""
+        return f"<{type(self).__name__} of '{self.name}' by {self.method}: {self.status}, cost {self.cost:.8g}>"
+
+    def __str__(self) -> str:
+        """The summary that print shows."""
+        return str(_later("report").summary(self))
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the entries of the state."""
+        return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
+
+
+def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str, float]:
+    """Cost by term; of an expected cost the nominal's terms and what the deviations add."""
+    if loop is None:
+        return dict(terms)
+    nominal = {name: loop.cost[name] for name in ("terminal", "running")}
+    return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
+
+
+def _later(module: str) -> Any:
+    """A module that is built on solutions; imported when it is used."""
+    return importlib.import_module(f"covocp.{module}")

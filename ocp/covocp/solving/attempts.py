@@ -1,0 +1,94 @@
+"""From starts to an outcome: one start after the other until the method finds its way, or the best of many."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+
+from covocp.base.errors import OutsideDomainError
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Guess, Outcome, Prepared
+
+# Starts that are tried where a method loses its way.
+TRIED = 4
+
+
+def from_starts(
+    prepared: Prepared, values: Array, guesses: Iterable[Guess], reporter: Progress
+) -> tuple[Outcome, Guess]:
+    """Solve from the first start from which the method finds its way.
+
+    A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
+    all of them, the first run counts: it is made again, and not stopped, where it was stopped.
+
+    Returns:
+        The outcome, and the start from which it came.
+
+    Raises:
+        OutsideDomainError: no start lies within the domain of the model (says what the first one lacks).
+    """
+    tried: list[tuple[Outcome, Guess]] = []
+    refused: list[OutsideDomainError] = []
+    for guess in islice(guesses, TRIED):
+        try:
+            outcome = prepared.solve(values, replace(guess, tentative=not guess.warm), reporter)
+        except OutsideDomainError as error:
+            refused.append(error)
+            continue
+        tried.append((outcome, guess))
+        if outcome.converged or not outcome.stats.get("wandered") or reporter.stop:
+            break
+    if not tried:
+        raise refused[0]
+    outcome, guess = tried[-1]
+    if not outcome.converged and outcome.stats.get("wandered") and not reporter.stop:
+        guess = tried[0][1]
+        outcome = prepared.solve(values, guess, reporter)
+    if len(tried) > 1:
+        outcome = replace(outcome, stats={**outcome.stats, "tried": len(tried)})
+    return outcome, guess
+
+
+def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: int, reporter: Progress) -> Outcome:
+    """The cheapest converged outcome of several starts, with the costs of all of them (NaN: did not converge).
+
+    A start outside the domain of the model counts as one that did not converge.
+
+    Raises:
+        OutsideDomainError: all of them lie outside it (says what the first one lacks).
+    """
+    best: Outcome | None = None
+    stopped: tuple[int, Guess] | None = None
+    refused: list[OutsideDomainError] = []
+    costs: list[float] = []
+    for guess in guesses:
+        try:
+            outcome = prepared.solve(values, replace(guess, tentative=True), reporter)
+        except OutsideDomainError as error:
+            refused.append(error)
+            costs.append(np.nan)
+            continue
+        cost = cost_of(outcome)
+        costs.append(cost if outcome.converged else np.nan)
+        if best is None or (outcome.converged, -cost) > (best.converged, -cost_of(best)):
+            best = outcome
+        if stopped is None and outcome.stats.get("wandered"):
+            stopped = len(costs) - 1, guess
+        if reporter.stop:
+            break
+    if best is None:
+        raise refused[0]
+    if not best.converged and stopped is not None and not reporter.stop:
+        place, guess = stopped
+        best = prepared.solve(values, guess, reporter)
+        costs[place] = cost_of(best) if best.converged else np.nan
+    return replace(best, stats={**best.stats, "starts": costs, "asked": count})
+
+
+def cost_of(outcome: Outcome) -> float:
+    """All terms together."""
+    return float(sum(outcome.cost_terms.values()))

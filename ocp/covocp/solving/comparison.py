@@ -1,0 +1,304 @@
+"""One problem by several methods or formulations, side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
+from covocp.base.errors import CovocpError, Interrupted, ProblemError, describe, spelling
+from covocp.base.threads import methods_one_at_a_time, one_at_a_time
+from covocp.extremal.mesh_error import NO_COST
+from covocp.solution.report import number, render_table, wrapped
+from covocp.solution.solution import Solution
+from covocp.solving.solver import METHODS, Solver, check_problem, method_options
+from covocp.transcription.mesh import Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from covocp.problem.builder import Problem
+
+DEFAULT = ("ipopt", "gradient")
+SOLVE_OPTIONS = ("starts", "seed", "guess", "parameters")
+INTERRUPTED = "interrupted by the user"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One run of a comparison.
+
+    Attributes:
+        label: of the run, unique.
+        method: its name.
+        solution: what came out, converged or not; None where nothing did.
+        reason: why there is no converged solution; "" where there is one.
+        seconds: building and solving, as a user waits for it.
+    """
+
+    label: str
+    method: str
+    solution: Solution | None = field(repr=False)
+    reason: str
+    seconds: float
+
+
+@methods_one_at_a_time
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Runs of one problem; prints as a table, indexed by label (the method's name by default) or number.
+
+    Attributes:
+        name: of the problem.
+        rows: the runs in the order asked for.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+
+    @property
+    def solutions(self) -> Mapping[str, Solution]:
+        """What came out, by label, converged or not."""
+        return {row.label: row.solution for row in self.rows if row.solution is not None}
+
+    @property
+    def converged(self) -> bool:
+        """Whether every run found a solution."""
+        return all(not row.reason for row in self.rows)
+
+    @property
+    def best(self) -> float:
+        """Least cost of the converged runs; NaN where none converged."""
+        costs = [row.solution.cost for row in self.rows if row.solution is not None and row.solution.converged]
+        return min(costs, default=float("nan"))
+
+    def __getitem__(self, key: str | int) -> Solution:
+        """The solution of a label or number.
+
+        Raises:
+            ProblemError: no such label, or nothing came out of that run.
+        """
+        labels = [row.label for row in self.rows]
+        row = None
+        if isinstance(key, int) and not isinstance(key, bool) and -len(labels) <= key < len(labels):
+            row = self.rows[key]
+        elif isinstance(key, str) and key in labels:
+            row = self.rows[labels.index(str(key))]
+        if row is None or row.solution is None:
+            raise ProblemError(
+                describe(
+                    f"The comparison has no solution '{key}'.",
+                    expected="one of " + (", ".join(self.solutions) or "none: no run came to an end"),
+                    received=repr(key) if row is None else f"{key}: {row.reason}",
+                    remedy="ask for one of them",
+                )
+            )
+        return row.solution
+
+    def __iter__(self) -> Iterator[Row]:
+        """The rows."""
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        """Number of runs."""
+        return len(self.rows)
+
+    def plot(self, *names: Any, path: str | Path | None = None, **options: Any) -> Figure:
+        """Draw all solutions in one figure; see `covocp.plot.figure.plot_solutions`."""
+        from covocp.plot.figure import check_plot_options, plot_solutions
+
+        check_plot_options(options)
+        labels = list(self.solutions)
+        title = options.pop("title", self.name or None)
+        return plot_solutions(
+            list(self.solutions.values()),
+            *names,
+            labels=options.pop("labels", labels),
+            title=title,
+            path=path,
+            **options,
+        )
+
+    def __str__(self) -> str:
+        """The table that print shows."""
+        columns = ["method", "cost", "gap", "slope", "costates", "end", "eigenvalue", "iterations", "seconds"]
+        rows = [[row.label, *_entries(row, self.best)] for row in self.rows]
+        notes = [wrapped(f"{row.label}: {row.reason}") for row in self.rows if row.reason]
+        legend = wrapped(
+            "gap: relative to the least cost of a converged run; slope: largest slope of the Lagrangian by a control; "
+            "costates: multipliers against backward integration; end: largest miss of a terminal condition; "
+            "eigenvalue: smallest one of the covariances",
+            indent="",
+        )
+        parts = [self.name, render_table(columns, rows), "\n".join(notes), legend]
+        return "\n\n".join(part for part in parts if part)
+
+
+@one_at_a_time
+@checked(methods=either(text, sequence), progress=truth, method_options=optional(mapping))
+def compare(
+    problem: Problem,
+    methods: Sequence[Any] = DEFAULT,
+    *,
+    intervals: int = 100,
+    guess: Any = None,
+    progress: bool = True,
+    method_options: Mapping[str, Mapping[str, Any]] | None = None,
+    **options: Any,
+) -> Comparison:
+    """Solve a problem by several methods, or in several formulations, and set the results side by side.
+
+    Args:
+        problem: what to solve.
+        methods: names of methods, or (label, method, options) for a formulation of its own, such as
+            ("states", "ipopt", {"covariances": "states"}).
+        intervals: number of control intervals.
+        guess: where all runs start; see `Solver.solve`.
+        progress: whether to show the iterations on a terminal.
+        method_options: options by method.
+        options: for all runs; every method must know them.
+
+    Returns:
+        The comparison. A run that fails is a row with its reason.
+
+    Raises:
+        ProblemError: the statement is wrong, a method or an option is unknown, or two runs have the same label.
+    """
+    check_problem(problem)
+    statement = problem.statement()
+    runs = _runs(methods, {"intervals": intervals, "guess": guess, **options}, dict(method_options or {}))
+    rows: list[Row] = []
+    for label, method, chosen in runs:
+        if rows and INTERRUPTED in rows[-1].reason:
+            rows.append(Row(label=label, method=method, solution=None, reason="not run: interrupted", seconds=0.0))
+        else:
+            rows.append(_run(problem, label, method, chosen, progress))
+    return Comparison(name=statement.name, rows=tuple(rows))
+
+
+def _run(problem: Problem, label: str, method: str, options: dict[str, Any], progress: bool) -> Row:
+    """One run, whatever comes of it."""
+    begin = time.perf_counter()
+    starting = {name: options.pop(name) for name in SOLVE_OPTIONS if name in options}
+    solution, reason = None, ""
+    try:
+        solution = Solver(problem, method, **options).solve(progress=progress, allow_failure=True, **starting)
+        reason = "" if solution.converged else f"did not converge: {solution.message}"
+    except Interrupted as error:
+        solution, reason = error.solution, f"{INTERRUPTED}: {error}"
+    except Exception as error:  # whatever a method raises: the other runs are wanted all the same
+        text = " ".join(str(error).split())
+        reason = text if isinstance(error, CovocpError) else f"{type(error).__name__}: {text}"
+    return Row(label=label, method=method, solution=solution, reason=reason, seconds=time.perf_counter() - begin)
+
+
+def _runs(
+    methods: Sequence[Any], shared: dict[str, Any], by_method: dict[str, Mapping[str, Any]]
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """Label, method and options of each run, all names known."""
+    runs: list[tuple[str, str, dict[str, Any]]] = []
+    for entry in [methods] if isinstance(methods, str) else methods:
+        label, method, own = (entry, entry, {}) if isinstance(entry, str) else _triple(entry)
+        if method not in METHODS:
+            raise _wrong("There is no such method.", "one of " + ", ".join(METHODS), repr(method), "correct methods=")
+        if label in [run[0] for run in runs]:
+            raise _wrong(
+                "Two runs have the same label.",
+                "different labels",
+                repr(label),
+                "give (label, method, options) with another label",
+            )
+        shared_by_method = by_method.get(method, {})
+        check_argument("compare()", "method_options", mapping, shared_by_method)
+        chosen = {**shared, **shared_by_method, **own}
+        known = _option_names(method)
+        for name in chosen:
+            if name not in known:
+                raise _wrong(
+                    f"The method '{method}' has no option '{name}'.",
+                    "one of " + ", ".join(sorted(known)),
+                    f"{name}={chosen[name]!r}",
+                    spelling(name, known, "give it to the methods that know it: method_options={method: {...}}"),
+                )
+        runs.append((label, method, chosen))
+    if unused := [name for name in by_method if name not in [run[1] for run in runs]]:
+        raise _wrong(
+            "There are options for a method that is not compared.",
+            "one of " + ", ".join(dict.fromkeys(run[1] for run in runs)),
+            ", ".join(map(str, unused)),
+            "correct method_options=",
+        )
+    if not runs:
+        raise _wrong("There is nothing to compare.", "at least one method", "none", "correct methods=")
+    return runs
+
+
+def _triple(entry: Any) -> tuple[str, str, dict[str, Any]]:
+    """(label, method, options) of an entry that is not a name."""
+    if isinstance(entry, tuple) and len(entry) == 3 and isinstance(entry[2], Mapping):
+        return str(entry[0]), str(entry[1]), dict(entry[2])
+    raise _wrong(
+        "A run of a comparison is not understood.",
+        "the name of a method, or (label, method, {option: value})",
+        repr(entry)[:100],
+        "correct methods=",
+    )
+
+
+def _option_names(method: str) -> set[str]:
+    """Options of a method, of every mesh, and of every start."""
+    return set(method_options(method)) | {f.name for f in fields(Options)} | set(SOLVE_OPTIONS)
+
+
+def _wrong(problem: str, expected: str, received: str, remedy: str) -> ProblemError:
+    return ProblemError(describe(problem, expected=expected, received=received, remedy=remedy))
+
+
+def _entries(row: Row, best: float) -> list[str]:
+    """Cost, gap, residuals, iterations and time of a row as words."""
+    seconds = number(row.seconds, 3)
+    solution = row.solution
+    if solution is None:
+        return ["-", "-", "-", "-", "-", "-", "-", seconds]
+    gap = (solution.cost - best) / max(abs(best), NO_COST)
+    slope, costates = None, None
+    with suppress(CovocpError, RuntimeError, ArithmeticError, ValueError):
+        slope, costates = solution.optimality.stationarity, solution.optimality.costate_difference
+    iterations = int(solution.stats.get("iterations", -1))
+    smallest = solution.smallest_eigenvalue
+    return [
+        number(solution.cost, 9),
+        "-" if not solution.converged or np.isnan(gap) else "0" if gap == 0 else f"{gap:.1e}",
+        _short(slope),
+        _short(costates),
+        _short(terminal_miss(solution)),
+        "-" if np.isinf(smallest) else f"{smallest:.2e}",
+        str(iterations) if iterations >= 0 else "-",
+        seconds,
+    ]
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None or np.isnan(value) else f"{value:.1e}"
+
+
+def terminal_miss(solution: Solution) -> float | None:
+    """Largest violation of a terminal condition, in its own unit; None where the problem is not known."""
+    st = solution.statement
+    if st is None:
+        return None
+    _, final, _, final_matrices = st.boundary_values(solution.parameters)
+    last = solution.extremal.columns()
+    misses = [np.abs(solution.trajectory.x[-1] - final), np.abs(solution.trajectory.e[-1] - final_matrices)]
+    if st.end.size:
+        at_end = [v[:, -1] if isinstance(v, np.ndarray) else v for v in last]
+        rows = np.asarray(st.end.function(*at_end).full()).ravel()
+        misses.append(np.maximum(0.0, np.maximum(st.end.lower - rows, rows - st.end.upper)))
+    values = np.concatenate(misses)
+    return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0

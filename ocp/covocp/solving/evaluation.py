@@ -1,0 +1,353 @@
+"""What a given nominal costs: costs, covariances and gains along a control history, without optimising.
+
+Quadratic synthesis [Schmidt 6.3] is this with the nominal of the deterministic cost; the effect of incorrect
+statistics [6.11] is this with the gains of the design and the covariances of the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from covocp.base.checks import as_number, check_density, check_kind
+from covocp.base.errors import ProblemError, describe, evaluating, no_option
+from covocp.base.matrices import Array, unpack
+from covocp.base.threads import one_at_a_time
+from covocp.extremal.closed_loop import Statistics, close_loop, densities
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.extremal.mesh_error import finer_steps
+from covocp.extremal.path_limits import NOTED
+from covocp.problem.builder import Problem
+from covocp.solution.doubts import mention_doubts
+from covocp.solution.solution import Solution
+from covocp.solving.unused import mention_forgotten
+from covocp.statement.names import name_of, stacked_parameters
+from covocp.statement.statement import Statement, entry_names
+from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
+from covocp.transcription.grading import graded
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.nlp import check_costs
+
+METHOD = "evaluate"
+# Relative difference of rates or slopes above which the truth is another system.
+SAME = 1e-9
+
+
+@one_at_a_time
+def evaluate(
+    problem: Problem | Solution,
+    *,
+    nominal: Any = None,
+    truth: Any = None,
+    intervals: int = 100,
+    parameters: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Solution:
+    """Evaluate costs, covariances and gains along a given nominal, or a solution under other statistics.
+
+    Args:
+        problem: the problem; or a solution, whose nominal and gains are kept.
+        nominal: the control: a solution (of any problem with controls of these names), or a dict of control to number,
+            array over the nodes, or function of s = t/T; None: the guesses of the controls. The states follow.
+        truth: what the statistics really are, for a solution with an expected cost: a problem of the same symbols
+            (its variances and noise densities count), or a dict of parameter name to value.
+        intervals: number of control intervals, where the nominal is not a solution.
+        parameters: values of parameters other than the declared ones, by name.
+        options: of the mesh, as in `solve`.
+
+    Returns:
+        A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`.
+
+    Raises:
+        ProblemError: a control is not given, a name is unknown, `truth` has other symbols.
+    """
+    if isinstance(problem, Solution):
+        if nominal is not None or options or parameters is not None:
+            raise ProblemError(
+                describe(
+                    "evaluate(solution) keeps its nominal, mesh and parameters.",
+                    expected="truth=... only",
+                    received="nominal=, parameters= or options of the mesh",
+                    remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
+                )
+            )
+        solution = problem
+    else:
+        with evaluating(str(getattr(problem, "name", ""))):
+            solution = _along(problem, nominal, intervals, {} if parameters is None else parameters, options)
+    return solution if truth is None else _under(solution, truth)
+
+
+def _along(
+    problem: Problem, nominal: Any, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
+) -> Solution:
+    """The problem along a nominal."""
+    check_kind(problem, Problem, "evaluate(problem, nominal=...), or evaluate(solution, truth=...)")
+    st = problem.statement()
+    mention_forgotten(problem)
+    values = stacked_parameters(st, parameters)
+    given = Options(intervals=intervals, **_known(options))
+    if isinstance(nominal, Solution) and not options:
+        own = nominal.mesh
+        given = replace(given, grid=own.nodes, control=own.control)  # type: ignore[arg-type]
+    given = graded(st, given, values)
+    mesh = evaluation_mesh(st, given, values)
+    u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
+    x0, e0 = starts(st, mesh, values)
+    if isinstance(nominal, Solution):
+        x0 = _started_like(st, nominal, x0, values)
+    check_model(st, x0, u[:1].ravel(), e0, duration, values)
+    outcome = evaluate_controls(st, mesh, u, duration, values, x0)
+    own_steps = given.substeps == "auto"
+    while own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, given)):
+        shorter = evaluate_controls(st, evaluation_mesh(st, finer, values), u, duration, values, x0)
+        if not shorter.converged:
+            break
+        outcome, given = shorter, finer
+    if outcome.converged:
+        check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
+    solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
+    if not solution.converged:
+        return solution
+    mention_doubts(solution)
+    return replace(solution, violations=_with_passed(solution))
+
+
+def _with_passed(solution: Solution) -> dict[str, float]:
+    """What a nominal misses, and the limits that it passes between the nodes."""
+    result = dict(solution.violations)
+    for entry in solution.passed_limits():
+        name = f"bounds of {entry.name}" if entry.name in solution.state_names else entry.name
+        if entry.share > NOTED:
+            result[name] = max(result.get(name, 0.0), entry.by)
+    return result
+
+
+def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters: Array) -> Array:
+    """The initial state, with what is free there as in a solution that has it: constant gains are such states."""
+    result, known = x0.copy(), statement.boundary_values(parameters)[0]
+    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
+    for block in statement.states:
+        if block.name in own and own[block.name].size == block.size:
+            first = nominal.trajectory.x[0, own[block.name].span]
+            result[block.span] = np.where(np.isnan(known[block.span]), first, x0[block.span])
+    return result
+
+
+def _known(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of the mesh; others mean nothing here."""
+    known = {field.name for field in fields(Options)} - {"intervals", "points"}  # nothing is imposed here
+    for name in options:
+        if name not in known:
+            raise no_option("evaluate()", name, options[name], known)
+    return options
+
+
+def _controls(statement: Statement, mesh: Mesh, nominal: Any, asked: int) -> tuple[Array, float]:
+    """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
+    nodes, duration = mesh.nodes, statement.duration.guess
+    at = nodes if mesh.control == "linear" else 0.5 * (nodes[1:] + nodes[:-1])
+    if nominal is None:
+        return controls_guess(statement, nodes, mesh.control, sign=0.0), duration
+    if isinstance(nominal, Solution):
+        duration = nominal.duration if statement.duration.free else duration
+        same = nominal.mesh.control == mesh.control and np.array_equal(nominal.mesh.nodes, nodes)
+        sample = nominal.at(at * nominal.duration)
+        columns = []
+        for block in statement.controls:
+            if block.name not in {b.name for b in nominal.blocks if b.kind == "control"}:
+                raise _not_given(block.name, f"a solution of '{nominal.name}' without it")
+            own = nominal.block(block.name)
+            columns.append(nominal.trajectory.u[:, own.span] if same else sample[block.name].reshape(-1, block.size))
+        return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
+    if not isinstance(nominal, Mapping):
+        raise ProblemError(
+            describe(
+                "The nominal is of an unknown kind.",
+                expected="a Solution, or a dict of control to number, array over the nodes or function of s = t/T",
+                received=repr(nominal)[:100],
+                remedy="correct nominal=",
+            )
+        )
+    names = tuple(block.name for block in statement.controls)
+    given = {name_of(key, statement.symbols, names): value for key, value in nominal.items()}
+    columns = []
+    for block in statement.controls:
+        if block.name not in given:
+            raise _not_given(block.name, ", ".join(given) or "nothing")
+        value = given[block.name]
+        value = value if callable(value) else as_number(block.name, "guess", value)
+        if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
+            value = value[(at * asked).astype(int)]  # one for each interval that was asked for
+        columns.append(evaluate_guess(block, value, at))
+    return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
+
+
+def _not_given(name: str, received: str) -> ProblemError:
+    return ProblemError(
+        describe(
+            f"The nominal does not give the control '{name}'.",
+            expected="a history of every control",
+            received=received,
+            remedy=f"add '{name}' to nominal=",
+        )
+    )
+
+
+def _under(solution: Solution, truth: Any) -> Solution:
+    """The solution with the covariances and the cost of other statistics, and the gains of its design."""
+    if solution.loop is None:
+        raise ProblemError(
+            describe(
+                "truth= needs a closed loop.",
+                expected="a solution of a problem with minimize_expected()",
+                received=f"'{solution.name}' with a deterministic cost",
+                remedy="for an estimator alone, simulate(solution, truth=...) shows the effect",
+            )
+        )
+    loop = close_loop(solution.extremal, true_statistics(solution.extremal, truth))
+    if loop is None:
+        raise ProblemError(
+            describe(
+                "The covariances under this truth are no numbers.",
+                expected="finite covariances with the gains of the design",
+                received="inf or NaN on the way",
+                remedy="check the variances and densities of truth=, and that the solution converged",
+            )
+        )
+    return replace(
+        solution,
+        method=METHOD,
+        message="evaluated under other statistics than the design's",
+        cost_terms=dict(loop.cost),
+        loop=loop,
+        stored_optimality=None,
+    )
+
+
+def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
+    """Initial covariance and noise densities of a truth.
+
+    Raises:
+        ProblemError: where it is neither a problem nor a dict, or has other symbols, initial means, rates, measurements
+            or another duration.
+    """
+    st = extremal.statement
+    if isinstance(truth, Mapping):
+        other, values = st, stacked_parameters(st, truth, extremal.parameters)
+    elif isinstance(truth, Problem):
+        other = truth.statement()
+        values = other.values
+        _check_same(st, other)
+    else:
+        raise ProblemError(
+            describe(
+                "The truth is of an unknown kind.",
+                expected="a Problem with the same symbols, or a dict of parameter name to value",
+                received=repr(truth)[:100],
+                remedy="correct truth=",
+            )
+        )
+    _check_system(extremal, other, values)
+    block = next((b for b in other.matrices if b.estimation), None)
+    if block is None or other.loop is None:
+        raise ProblemError(
+            describe(
+                "The truth has no expected cost, so its statistics are not known.",
+                expected="a problem built like the design's, with minimize_expected()",
+                received=f"'{other.name}'",
+                remedy="build it by the same function with other numbers",
+            )
+        )
+    statistics = Statistics(
+        initial=unpack(other.boundary_values(values)[2][block.span], block.size),
+        density=densities(other),
+        parameters=values,
+    )
+    _check_densities(extremal, statistics)
+    return statistics
+
+
+def _check_densities(extremal: Extremal, truth: Statistics) -> None:
+    """What is truly uncertain must be a covariance or a density, at every node; no noise at all is one too."""
+    x, u, _, t, duration, _ = extremal.columns()
+    count = extremal.mesh.intervals + 1
+    values = truth.density.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
+    check_density("truth", "initial covariance", truth.initial, definite=False)
+    for what, value in zip(("process noise density", "measurement noise density"), values, strict=True):
+        numbers = np.asarray(value.full())
+        matrices = numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
+        if matrices.size:
+            smallest = np.linalg.eigvalsh(np.nan_to_num(matrices))[:, 0]
+            worst = int(np.argmin(np.where(np.isfinite(matrices).all(axis=(1, 2)), smallest, -np.inf)))
+            check_density("truth", what, matrices[worst], definite=False)
+
+
+def _check_same(design: Statement, truth: Statement) -> None:
+    """The symbols of both must agree; the linear equations know one system only, so must the rates."""
+
+    def signature(statement: Statement) -> list[tuple[str, str, int]]:
+        kinds = ("state", "control", "unknown")
+        return [(b.kind, b.name, b.size) for b in statement.blocks if b.kind in kinds]
+
+    measured = (design.measurement_names, truth.measurement_names)
+    if signature(design) != signature(truth) or measured[0] != measured[1]:
+        raise ProblemError(
+            describe(
+                "The truth is another system than the design's.",
+                expected=", ".join(f"{k} {n} ({s})" for k, n, s in signature(design))
+                + "; measured "
+                + str(measured[0]),
+                received=", ".join(f"{k} {n} ({s})" for k, n, s in signature(truth)) + "; measured " + str(measured[1]),
+                remedy="declare the same states, controls, unknowns and measurements in the same order",
+            )
+        )
+
+
+def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None:
+    """The linear covariance equations know one nominal and one system along it: only its statistics may differ."""
+    st = design.statement
+    x, u, _, t, duration, own = (np.asarray(column) for column in design.columns())
+    count = design.mesh.intervals + 1
+    others = np.tile(parameters[:, None], (1, count))
+    start, known = truth.boundary_values(parameters)[0], truth.duration
+    first, lasts = x[:, :1], design.trajectory.duration if known.free else known.guess
+    measured = (", ".join(st.measurement_names),)
+    first_loop, other_loop = (None if s.loop is None else s.loop.expansion for s in (st, truth))
+    compared: list[tuple[str, tuple[str, ...], Any, Any]] = [
+        ("starts elsewhere: the initial mean", st.state_names, first, np.where(np.isnan(start), x[:, 0], start)),
+        ("takes another time: the value", ("duration",), duration[:, :1], np.array([lasts])),
+    ]
+    if unknowns := st.of_kind("unknown"):
+        rows = [k for b in unknowns for k in range(b.span.start, b.span.stop)]
+        one, two = (values[rows, None] for values in (design.parameters, parameters))
+        compared.append(("has another constant: the mean", entry_names(unknowns), one, two))
+    functions: tuple[tuple[str, tuple[str, ...], int, Any, Any], ...] = (
+        ("moves differently: the rate", st.state_names, 0, st.nominal, truth.nominal),
+        ("moves differently: the slope", st.augmented, 0, first_loop, other_loop),
+        ("is controlled differently: the slope", st.augmented, 1, first_loop, other_loop),
+        ("is measured differently: the slope", measured, 1, st.measurement, truth.measurement),
+    )
+    for what, names, output, one, two in functions:
+        if one is not None and two is not None:
+            values = [f.map(count)(x, u, t, duration, p)[output].full() for f, p in ((one, own), (two, others))]
+            compared.append((what, names, *values))
+    for what, names, one, two in compared:
+        two = two.reshape(two.shape[0], -1)
+        off = np.array([True])
+        if one.shape == two.shape:
+            off = np.abs(one - two).max(axis=1) > SAME * np.maximum(np.abs(one).max(axis=1), np.finfo(float).tiny)
+        if off.any():
+            name = names[min(int(np.flatnonzero(off)[0]), len(names) - 1)]
+            raise ProblemError(
+                describe(
+                    f"The truth {what} of '{name}' along the nominal is another one.",
+                    expected="the system of the design, with other variances and noise densities",
+                    received=f"'{truth.name}', which differs in more",
+                    remedy="use simulate(solution, truth=...), which takes any dynamics",
+                )
+            )

@@ -1,0 +1,141 @@
+"""Random starts: controls, free initial values and free durations are drawn from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from statistics import NormalDist
+
+import numpy as np
+
+from covocp.base.errors import ProblemError
+from covocp.base.matrices import Array
+from covocp.extremal.extremal import Guess
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import check_model, control_scale, controls_guess, is_plain, starts
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.starts import base_run, bend_size, completed, ranked, targets
+from covocp.transcription.steering import Run, steer
+
+RANDOM_AMPLITUDE = 1.0
+# Half waves of a random control; sizes of those to which the states do not answer in proportion, in units of the bend.
+WAVES = 4
+SIZES = (1.0, 2.0, 4.0)
+# A free duration is drawn between its guess divided by this and times this, within its bounds.
+STRETCH = 4.0
+# Bounds further apart than by this factor, both positive, are drawn between by their logarithms.
+DECADE = 5.0
+# A control along which the model leaves its domain at the start is halved at most so often.
+HALVINGS = 6
+
+
+def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: int, seed: int) -> Iterator[Guess]:
+    """The problem's own start, then random ones.
+
+    Free initial values and durations are drawn one from each of `count` equally likely ranges, in random order: few
+    starts then look everywhere.
+    """
+    free = [int(k) for k in np.flatnonzero(np.isnan(statement.boundary_values(parameters)[0]))]
+    drawn = _latin(len(free) + int(statement.duration.free), count, seed)
+    own: ProblemError | None = None
+    try:
+        first = next(ranked(statement, mesh, parameters))
+    except ProblemError as error:  # the others may lie within the domain of the model
+        own = error
+    else:
+        yield Guess(trajectory=first)
+    made = 0
+    for child, shares in zip(np.random.SeedSequence(seed).spawn(count), drawn, strict=True):
+        generator = np.random.default_rng(child)
+        guess = _random_guess(statement, mesh, parameters, free, shares, generator)
+        if guess is not None:
+            made += 1
+            yield guess
+    if own is not None and not made:
+        raise own
+
+
+def _latin(columns: int, count: int, seed: int) -> Array:
+    """Numbers in (0, 1), shape (count, columns): each column has one in each of `count` equal ranges."""
+    generator = np.random.default_rng((seed, columns, count))
+    order = [generator.permutation(count) for _ in range(columns)]
+    places = np.stack(order, axis=1) if columns else np.zeros((count, 0))
+    return np.asarray((places + generator.uniform(0.02, 0.98, places.shape)) / max(count, 1))
+
+
+def _random_guess(
+    statement: Statement, mesh: Mesh, parameters: Array, free: list[int], shares: Array, generator: np.random.Generator
+) -> Guess | None:
+    """One random start; None where it lies outside the domain of the model, however small its controls are."""
+    start, e0 = starts(statement, mesh, parameters)
+    for k, share in zip(free, shares, strict=False):
+        start[k] = _drawn_state(statement, k, float(start[k]), float(share))
+    duration = _drawn_duration(statement, float(shares[-1])) if statement.duration.free else statement.duration.guess
+    flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+    wave = _wave(statement, mesh, flat, generator)
+    lower, upper = statement.control_bounds
+    size = generator.choice(SIZES)
+    if statement.nu and not statement.coupled:
+        run = replace(base_run(statement, mesh, parameters, start, flat), duration=duration)
+        bend = bend_size(run, flat, wave)
+        wave = wave if bend >= 1.0 else np.asarray(size * bend * wave)
+    for _ in range(HALVINGS):
+        u = np.clip(flat + wave, lower, upper)
+        try:
+            check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
+        except ProblemError:
+            wave = 0.5 * wave
+            continue
+        if statement.nu and not statement.coupled and _guesses_say_little(statement):
+            u = _steered(run, u)
+        trajectory = completed(statement, mesh, parameters, u, start=start, duration=duration)
+        return Guess(trajectory=trajectory)
+    return None
+
+
+def _guesses_say_little(statement: Statement) -> bool:
+    """Whether all guesses are single numbers, so that the controls may be steered."""
+    return all(is_plain(statement.guesses[b.name]) for b in (*statement.controls, *statement.states))
+
+
+def _steered(run: Run, u: Array) -> Array:
+    """Controls changed by as little as brings the states to their final values."""
+    fixed, target = targets(run)
+    return steer(run, fixed, target, u)[0] if fixed else u
+
+
+def _wave(statement: Statement, mesh: Mesh, flat: Array, generator: np.random.Generator) -> Array:
+    """A smooth random function for each control: a few cosines with random coefficients."""
+    at = mesh.nodes if mesh.control == "linear" else 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
+    orders = np.arange(WAVES)
+    columns = [np.zeros((at.size, 0))]
+    for block in statement.controls:
+        scale = control_scale(statement, block, flat[:, block.span])
+        coefficients = generator.standard_normal((WAVES, block.size)) / (1.0 + orders[:, None])
+        columns.append(RANDOM_AMPLITUDE * scale * (np.cos(np.pi * np.outer(at, orders)) @ coefficients))
+    return np.concatenate(columns, axis=1)
+
+
+def _drawn_state(statement: Statement, index: int, guess: float, share: float) -> float:
+    """A free initial value: between its bounds where it has two, else around its guess."""
+    lower, upper = (float(bound[index]) for bound in statement.state_bounds)
+    if np.isfinite(lower) and np.isfinite(upper):
+        return _between(lower, upper, share)
+    block = next(b for b in statement.states if b.span.start <= index < b.span.stop)
+    given = statement.scales.get(block.name)
+    size = float(given[index - block.offset]) if given is not None else max(abs(guess), 1.0)
+    return float(np.clip(guess + size * NormalDist().inv_cdf(share), lower, upper))
+
+
+def _drawn_duration(statement: Statement, share: float) -> float:
+    """A free duration, within its bounds."""
+    duration = statement.duration
+    lower, upper = max(duration.lower, duration.guess / STRETCH), min(duration.upper, duration.guess * STRETCH)
+    return _between(lower, upper, share)
+
+
+def _between(lower: float, upper: float, share: float) -> float:
+    """The number at a share of the way between two others, by their logarithms where they are far apart."""
+    if lower > 0 and upper > DECADE * lower:
+        return float(np.exp(np.log(lower) + share * (np.log(upper) - np.log(lower))))
+    return lower + share * (upper - lower)

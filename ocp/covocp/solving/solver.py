@@ -1,0 +1,477 @@
+"""Solving: methods are looked up by name, and an outcome becomes a solution or an error."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any, cast
+
+import numpy as np
+
+from covocp.base.arguments import checked, text, truth
+from covocp.base.checks import check_kind, is_whole
+from covocp.base.errors import (
+    CovocpError,
+    Interrupted,
+    ProblemError,
+    SolveError,
+    describe,
+    evaluating,
+    no_option,
+    spelling,
+    warn_user,
+    without_warnings,
+)
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.base.threads import methods_one_at_a_time, one_at_a_time
+from covocp.extremal.densities import impossible_density
+from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.extremal.mesh_error import OPTIMISED, finer_steps
+from covocp.problem.builder import Problem
+from covocp.problem.expected_cost import deterministic
+from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.solution import Solution
+from covocp.solving.attempts import best_of, cost_of, from_starts
+from covocp.solving.random_starts import random_guesses
+from covocp.solving.unused import mention_forgotten, mention_lengths
+from covocp.solving.warm_start import make_guess, make_guesses
+from covocp.statement.names import stacked_parameters
+from covocp.statement.statement import Statement
+from covocp.transcription.grading import graded
+from covocp.transcription.mesh import Mesh, Options, with_substeps
+
+METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
+
+# A run that ends after so few iterations began at a stationary point, which need not be a minimum.
+SUSPICIOUS_ITERATIONS = 3
+# A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
+UNMOVED = 1e-6
+ESCAPES = (1.0, -1.0)
+STARTS, MOST_STARTS = 8, 10**6
+# Arguments of `solve` beside the options of mesh and method.
+ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
+NOMINALS = ("combined", "deterministic")
+# Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
+# so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
+ROUNDOFF = 1e-10
+# Relative decrease of the cost from which on it is asked whether both are zero.
+SUSPICIOUS_GAIN = 0.5
+# Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
+WORSE = 1e-6
+# Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
+CONTINUED = 1e-3
+TOLERANCE = 1e-7
+
+
+def methods() -> tuple[str, ...]:
+    """Names of the methods installed."""
+    return tuple(METHODS)
+
+
+def method_options(method: str) -> dict[str, Any]:
+    """Options of a method besides those of the mesh, with their defaults."""
+    parameters = inspect.signature(importlib.import_module(METHODS[method]).prepare).parameters
+    return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+
+
+def check_problem(problem: Any) -> None:
+    """What is solved or compared must be a problem.
+
+    Raises:
+        ProblemError: it is something else.
+    """
+    check_kind(problem, Problem, "pass the Problem itself (solutions go into guess=)")
+
+
+@methods_one_at_a_time
+class Solver:
+    """A problem made ready for one method: built once, solved again with new parameters and guesses.
+
+    Args:
+        problem: what to solve.
+        method: a name in `methods()`.
+        intervals: number of control intervals.
+        nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
+            the cost without noise (quadratic synthesis), filter and feedback around it.
+        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`) and
+            of the method.
+
+    Raises:
+        ProblemError: unknown method or option, or a statement that is wrong.
+    """
+
+    @checked(method=text, nominal=text)
+    def __init__(
+        self,
+        problem: Problem,
+        method: str = "ipopt",
+        *,
+        intervals: int = 100,
+        nominal: str = "combined",
+        **options: Any,
+    ) -> None:
+        """Build the statement and make the method ready."""
+        if method not in METHODS:
+            raise ProblemError(
+                describe(
+                    "There is no such method.",
+                    expected="one of " + ", ".join(repr(name) for name in METHODS),
+                    received=repr(method),
+                    remedy=spelling(method, METHODS, "correct method="),
+                )
+            )
+        check_problem(problem)
+        self._prepare = importlib.import_module(METHODS[method]).prepare
+        known, own = {field.name for field in fields(Options)}, method_options(method)
+        for name in options:
+            if name not in known and name not in own:
+                raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
+        if nominal not in NOMINALS:
+            raise ProblemError(
+                describe(
+                    "The option 'nominal' has an unknown value.",
+                    expected="'combined' or 'deterministic'",
+                    received=repr(nominal),
+                    remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
+                )
+            )
+        self.method = method
+        self.nominal = nominal
+        self.statement: Statement = problem.statement()
+        self._problem, self._classical = problem, cast("Solver | None", None)
+        asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        self._options = graded(self.statement, asked, self.statement.values)
+        self._own_steps = self._options.substeps == "auto"
+        if nominal == "deterministic":  # the steps of what runs around it
+            around = evaluation_mesh(self.statement, self._options, self.statement.values)
+            self._options = replace(self._options, substeps=around.substeps)
+        solved = self.statement if nominal == "combined" else deterministic(problem).statement()
+        self._solved = solved
+        self._own = {k: v for k, v in options.items() if k in own}
+        self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
+        mention_forgotten(problem)
+        mention_lengths(self.statement.guesses, self._options)
+
+    @checked(progress=truth, allow_failure=truth)
+    def solve(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        guess: Any = None,
+        progress: bool = True,
+        allow_failure: bool = False,
+        starts: int = STARTS,
+        seed: int = 0,
+    ) -> Solution:
+        """Solve for some values of the parameters.
+
+        Args:
+            parameters: new values of known parameters and of means of unknowns, by name; the others keep theirs.
+            guess: None: the problem's own; a `Solution` (also on another mesh, or of another problem with the same
+                names): warm start; "multistart": the best of several random starts; a dict of name to guess.
+            progress: whether to show the iterations on a terminal.
+            allow_failure: return the last iterate of a run that did not converge instead of raising.
+            starts: number of random starts of "multistart".
+            seed: of the random starts.
+
+        Returns:
+            The solution.
+
+        Raises:
+            ProblemError: a name or a guess is wrong.
+            SolveError: the method did not converge (carries the last iterate).
+            Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
+        """
+        values = stacked_parameters(self.statement, {} if parameters is None else parameters)
+        if isinstance(guess, Mapping):
+            mention_lengths({str(key): value for key, value in guess.items()}, self._options)
+        if isinstance(guess, Solution):
+            self._take_steps(guess.mesh)
+        with evaluating(self.statement.name):
+            with Progress(self.statement.name or "solving", progress) as reporter:
+                if isinstance(guess, str):
+                    outcome = self._multistart(guess, values, starts, seed, reporter)
+                else:
+                    guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
+                    outcome, start = from_starts(self._prepared, values, guesses, reporter)
+                    outcome = self._leave_saddle(outcome, values, reporter, start)
+                outcome = self._with_finer_steps(outcome, values, reporter)
+            if self.nominal == "deterministic":
+                outcome = self._closed(outcome)
+            if reporter.stop:
+                raise interrupted(Solution.of(outcome, self.method))
+            return self._beside_classical(self._finish(outcome, allow_failure), values)
+
+    def _closed(self, outcome: Outcome) -> Outcome:
+        """Filter and feedback around the nominal of the deterministic cost."""
+        found = outcome.extremal
+        mesh = evaluation_mesh(self.statement, self._options, found.parameters)
+        t = found.trajectory
+        closed = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+        options = self._options
+        while self._own_steps and closed.converged and (finer := finer_steps(closed.extremal, options)):
+            mesh = evaluation_mesh(self.statement, finer, found.parameters)
+            shorter = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+            if not shorter.converged:
+                break
+            closed, options = shorter, finer
+        return replace(
+            closed,
+            converged=outcome.converged and closed.converged,
+            message=f"{outcome.message}: nominal of the deterministic cost, filter and feedback around it",
+            violations=outcome.violations,
+            stats={**outcome.stats, "nominal": "deterministic"},
+        )
+
+    def _beside_classical(self, solution: Solution, values: Array) -> Solution:
+        """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
+        if self.nominal != "combined" or not self.statement.behind or not solution.converged:
+            return solution
+        try:
+            if self._classical is None:
+                mesh = {field.name: getattr(self._options, field.name) for field in fields(Options)}
+                self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+            with without_warnings():  # they concern another solution
+                given = values[: self.statement.np]
+                classical = self._classical._solve_values(given)
+        except KeyboardInterrupt:
+            message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
+            raise Interrupted(message, solution=solution) from None
+        except CovocpError as error:  # no deterministic cost: there is nothing to compare with
+            return _noted(solution, classical_missing=str(error).partition("\n")[0])
+        if classical is None:
+            return _noted(solution, classical_missing="The problem without noise was not solved.")
+        if _is_worse(solution, classical):  # stationary up to a tolerance only, or spurious: going on from there tells
+            solution = self._continued(solution, given)
+        excess, worse = solution.cost - classical, _is_worse(solution, classical)
+        suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
+        if suspicious and is_roundoff(excess, self.statement, self._options, given):
+            return _noted(solution, classical_cost=classical, classical_same=True)
+        if worse:
+            warn_user(
+                f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
+                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
+            )
+        return _noted(solution, classical_cost=classical)
+
+    def _continued(self, solution: Solution, values: Array) -> Solution:
+        """The solution after going on from it with a smaller tolerance, where that makes it better."""
+        tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
+        try:
+            prepared = self._prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
+        except ProblemError:  # a plugin that has no tolerance
+            return solution
+        with Progress("", show=False) as reporter:
+            start = make_guess(self._solved, prepared.mesh, values, solution)
+            outcome = prepared.solve(values, start, reporter)
+            if reporter.stop:
+                message = "Interrupted while the solution was made more exact. On this error (.solution): a solution."
+                raise Interrupted(message, solution=solution)
+        if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
+            return solution
+        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **_counted(solution, outcome)})
+
+    def _solve_values(self, values: Array) -> float | None:
+        """Cost of the classical design for stacked parameters; None where it was not found."""
+        with Progress("", show=False) as reporter:
+            guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
+            outcome = self._closed(from_starts(self._prepared, values, guesses, reporter)[0])
+            if reporter.stop:
+                raise KeyboardInterrupt
+        return float(sum(outcome.cost_terms.values())) if outcome.converged else None
+
+    def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
+        """The best of the problem's own start and several random ones."""
+        if guess != "multistart":
+            raise ProblemError(
+                describe(
+                    "The guess is an unknown word.",
+                    expected="None, 'multistart', a Solution, or a dict of name to guess",
+                    received=repr(guess),
+                    remedy="correct guess=",
+                )
+            )
+        for name, number, most in (("starts", starts, MOST_STARTS), ("seed", seed, None)):
+            if not is_whole(number, 0, most):
+                raise ProblemError(
+                    describe(
+                        f"The option '{name}' is not a whole number.",
+                        expected="0, 1, 2, ...",
+                        received=repr(number),
+                        remedy=f"correct {name}=",
+                    )
+                )
+        guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
+        return best_of(self._prepared, values, guesses, starts + 1, reporter)
+
+    def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
+        """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it."""
+        iterations = outcome.stats.get("iterations", -1)
+        exact = outcome.stats.get("hessian") == "exact"
+        few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
+        before, after = start.trajectory.u, outcome.extremal.trajectory.u
+        stayed = before.size > 0 and bool(np.abs(after - before).max() <= UNMOVED * np.abs(before).max() + UNMOVED)
+        if not outcome.converged or not (few or stayed):
+            return outcome
+        from covocp.extremal.curvature import smallest_curvature
+
+        curvature = smallest_curvature(outcome.extremal)
+        if curvature is None or curvature.verdict != "saddle":
+            return outcome
+        candidates = []
+        for sign in ESCAPES:
+            moved = curvature.displaced(outcome.extremal, sign)
+            displaced = make_guess(self._solved, self._prepared.mesh, values, moved)
+            candidates.append(self._prepared.solve(values, displaced, reporter))
+        better = [c for c in candidates if c.converged and cost_of(c) < cost_of(outcome)]
+        if not better:
+            return outcome
+        warn_user(
+            "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
+        )
+        return _with_stats(min(better, key=cost_of), left_saddle=True)
+
+    def _take_steps(self, mesh: Mesh) -> None:
+        """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
+        own = self._prepared.mesh
+        times, rest = divmod(mesh.substeps, own.substeps)
+        alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
+        if self._own_steps and alike and times > 1 and not rest:
+            options = with_substeps(self._options, own, mesh.substeps)
+            self._keep(options, cast(Prepared, self._prepare(self._solved, options, **self._own)))
+
+    def _keep(self, options: Options, prepared: Prepared) -> None:
+        """Other steps from now on; what the classical design costs is then another number."""
+        self._options, self._prepared, self._classical = options, prepared, None
+
+    def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
+        while self._own_steps and outcome.converged and not reporter.stop:
+            finer = finer_steps(outcome.extremal, self._options, OPTIMISED)
+            if finer is None:
+                break
+            try:
+                prepared = cast(Prepared, self._prepare(self._solved, finer, **self._own))
+                start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
+                again = prepared.solve(values, start, reporter)
+            except CovocpError:  # what the steps are off is told with the solution that there is
+                break
+            if not again.converged:
+                break
+            outcome = _with_stats(again, **{**outcome.stats, **again.stats, **_counted(outcome, again)})
+            self._keep(finer, prepared)
+        return outcome
+
+    def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
+        """An outcome as a solution, with what the user must know about it."""
+        impossible = impossible_density(outcome.extremal) if outcome.converged else ""
+        if impossible:
+            outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
+        solution = Solution.of(_with_stats(outcome, **self._options.grading), self.method)
+        if not outcome.converged:
+            if allow_failure:
+                return solution
+            lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
+            violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
+            raise SolveError(
+                f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
+                f"{violated}"
+                "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
+                solution=solution,
+                violations=outcome.violations,
+            )
+        mention_doubts(solution)
+        mention_limits(solution)
+        return solution
+
+
+def interrupted(solution: Solution) -> Interrupted:
+    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
+    starts = solution.stats.get("starts")
+    if starts is None:
+        found = "the last iterate" if not solution.converged else "a solution"
+    else:
+        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
+        found += "" if solution.converged else ", of which none converged"
+    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)
+
+
+def _is_worse(solution: Solution, classical: float) -> bool:
+    """Whether a combined design costs more than the classical one, by more than the mesh leaves open."""
+    return bool(solution.cost - classical > (WORSE + solution.mesh_error) * abs(classical))
+
+
+def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
+    """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess."""
+    mesh = evaluation_mesh(statement, options, parameters)
+    start = make_guess(statement, mesh, parameters, None).trajectory
+    outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
+    return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
+
+
+def _counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
+    """Iterations and times of two runs together."""
+    names = ("iterations", "build_seconds", "solve_seconds")
+    both = [name for name in names if name in first.stats and name in second.stats]
+    return {name: first.stats[name] + second.stats[name] for name in both}
+
+
+def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
+    return replace(outcome, stats={**outcome.stats, **stats})
+
+
+def _noted(solution: Solution, **stats: Any) -> Solution:
+    return replace(solution, stats={**solution.stats, **stats})
+
+
+@one_at_a_time
+@checked(progress=truth, allow_failure=truth)
+def solve(
+    problem: Problem,
+    method: str = "ipopt",
+    *,
+    intervals: int = 100,
+    guess: Any = None,
+    nominal: str = "combined",
+    progress: bool = True,
+    allow_failure: bool = False,
+    parameters: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Solution:
+    """Solve a problem; `Solver` behind it solves again without rebuilding.
+
+    Args:
+        problem: what to solve.
+        method: a name in `methods()`.
+        intervals: number of control intervals.
+        guess: where to start; see `Solver.solve`.
+        nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
+        progress: whether to show the iterations on a terminal.
+        allow_failure: return the last iterate of a run that did not converge instead of raising.
+        parameters: values of parameters other than the declared ones, by name.
+        options: of the mesh and of the method; see `Solver`.
+
+    Returns:
+        The solution.
+
+    Raises:
+        ProblemError: the statement or an option is wrong.
+        SolveError: the method did not converge (carries the last iterate).
+        Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
+    """
+    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
+    if extra and not isinstance(guess, str):
+        raise ProblemError(
+            describe(
+                "The options of multistart are given, but not multistart.",
+                expected="guess='multistart'",
+                received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
+                remedy="add guess='multistart', or remove them",
+            )
+        )
+    solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
+    return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

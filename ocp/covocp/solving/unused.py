@@ -1,0 +1,154 @@
+"""What a statement says and probably does not mean: nothing that could be learnt, readings that nothing reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import warn_user
+from covocp.base.matrices import half_indices, real_numbers
+from covocp.statement.names import chosen_entry
+from covocp.transcription.mesh import Options
+
+if TYPE_CHECKING:
+    from covocp.problem.builder import Problem
+
+# A guess with fewer rows than this share of the nodes is a row of waypoints.
+WAYPOINTS = 0.5
+
+
+def mention_forgotten(problem: Problem) -> None:
+    """Warn of what is probably forgotten in a problem that is to be solved or evaluated; once for each statement."""
+    if problem._mentioned:
+        return
+    problem._mentioned = True
+    _mention_nothing_learnt(problem)
+    _mention_unused_measurements(problem)
+    _mention_spread_noise(problem)
+
+
+def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
+    """Warn of guesses that look like values at the nodes and have another number of them.
+
+    Args:
+        guesses: by name.
+        options: of the mesh, graded or not.
+    """
+    known = {options.intervals, options.intervals + 1, options.nodes().size - 1, options.nodes().size}
+    for name, guess in guesses.items():
+        if guess is None or callable(guess):
+            continue
+        try:
+            shape = real_numbers(guess).shape
+        except (TypeError, ValueError, OverflowError):  # no array: refused where it is read
+            continue
+        if not shape:
+            continue
+        if known.isdisjoint(shape) and max(shape) >= WAYPOINTS * options.intervals:
+            warn_user(
+                f"The guess of '{name}' has {max(shape)} rows, and {options.intervals} intervals have "
+                f"{options.intervals + 1} nodes: its rows are taken as evenly spread over the duration. Give a row for "
+                "each node, a few waypoints, or a function of t/T."
+            )
+
+
+def _mention_nothing_learnt(problem: Problem) -> None:
+    """A cost or a condition of the variance of an unknown that no measurement depends on: it never changes."""
+    E = next((matrix for matrix in problem.matrices if matrix.estimation), None)
+    if E is None or not problem.unknowns:
+        return
+    seen = _seen(problem)
+    unseen = {
+        i
+        for i, label in enumerate(E.labels)
+        for q in problem.unknowns
+        if label.split("[")[0] == q.name and q.symbol.__hash__() not in seen
+    }
+    rows, columns = half_indices(E.size)
+    constant = [i in unseen and j in unseen for i, j in zip(rows, columns, strict=True)]
+    if not any(constant) or _correlated(E.initial, unseen, rows, columns):
+        return
+    running, terminal = problem.cost if problem.cost is not None else (ca.MX(0), ca.MX(0))
+    places = [("running cost", running), ("terminal cost", terminal)]
+    places += [(f"condition '{c.name}'", c.expression) for c in problem.constraints]
+    for what, expression in places:
+        if not ca.depends_on(expression, E.symbol):
+            continue
+        used = ca.which_depends(expression, E.symbol, 1, False)
+        names = sorted({E.labels[i] for i, u, c in zip(rows, used, constant, strict=True) if u and c})
+        if names:
+            listed = " and ".join(f"'{name}'" for name in names)
+            reason = "no measurement depends on it" if problem.measurements else "there is no measurement"
+            warn_user(
+                f"Nothing is learnt about {listed}: {reason}, and its variance in the {what} keeps its first value "
+                "whatever is done. Add measurement(name, expression, noise) of something that depends on it."
+            )
+            return
+
+
+def _seen(problem: Problem) -> set[int]:
+    """Hashes of the symbols that measurements depend on, at once or through the rates of states."""
+    rates = {s.symbol.__hash__(): problem.rates[s.name].rate for s in problem.states if s.name in problem.rates}
+    seen: set[int] = set()
+    waiting = [symbol for m in problem.measurements for symbol in ca.symvar(m.expression)]
+    while waiting:
+        key = waiting.pop().__hash__()
+        if key not in seen:
+            seen.add(key)
+            waiting += ca.symvar(rates[key]) if key in rates else []
+    return seen
+
+
+def _correlated(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+    """Whether the first covariance joins what is not measured with the rest, or may do so."""
+    if initial is None or ca.symvar(initial):
+        return initial is not None and initial.nnz() > 0 and not _block_diagonal(initial, unseen, rows, columns)
+    values = np.asarray(ca.evalf(ca.densify(initial)).full()).ravel()
+    return any(v != 0 and (i in unseen) != (j in unseen) for v, i, j in zip(values, rows, columns, strict=True))
+
+
+def _block_diagonal(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+    """Whether a symbolic first covariance has no entries between two groups of rows."""
+    sparsity = (initial if isinstance(initial, ca.MX) else ca.sparsify(initial)).sparsity()
+    present = set(sparsity.row())
+    return not any(
+        k in present and (i in unseen) != (j in unseen) for k, (i, j) in enumerate(zip(rows, columns, strict=True))
+    )
+
+
+def _mention_unused_measurements(problem: Problem) -> None:
+    """Measurements without a covariance of errors, an expected cost or a matrix of the user's own."""
+    if problem.measurements and problem.expected is None and not problem.matrices:
+        names = ", ".join(f"'{m.name}'" for m in problem.measurements)
+        warn_user(
+            f"Nothing uses the measurement{'s' if len(problem.measurements) > 1 else ''} {names}: no covariance is "
+            "asked for. Call estimation_covariance() and use it in the cost or a condition, or state the cost by "
+            "minimize_expected()."
+        )
+
+
+def _mention_spread_noise(problem: Problem) -> None:
+    """One noise density for all rows of a state of which some row is the rate of another: position and velocity."""
+    for state in problem.states:
+        entry = problem.rates.get(state.name)
+        if entry is None or state.size == 1 or not entry.one_density or entry.noise is None:
+            continue
+        if entry.noise.is_constant() and not np.any(ca.evalf(entry.noise).full()):
+            continue
+        row = next((i for i in range(state.size) if _is_another(entry.rate[i], state.symbol, i)), None)
+        if row is not None:
+            listed = ", ".join("q" if i != row else "0" for i in range(state.size))
+            warn_user(
+                f"The noise of '{state.name}' is one number for its {state.size} rows, so {state.name}[{row}], whose "
+                f"rate is another row of it, has white noise of its own. Give a density for each row: noise=[{listed}] "
+                f"where that is not meant, [{', '.join('q' * state.size)}] where it is."
+            )
+
+
+def _is_another(rate: Any, symbol: Any, row: int) -> bool:
+    """Whether a rate is just another entry of the same state."""
+    found = chosen_entry(rate, symbol)
+    return found >= 0 and found != row

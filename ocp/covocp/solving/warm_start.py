@@ -1,0 +1,167 @@
+"""Guesses for a solver: the problem's own, another solution on this mesh, given values, random starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from covocp.base.errors import ProblemError, describe, spelling
+from covocp.base.matrices import Array, pack
+from covocp.extremal.extremal import Guess
+from covocp.solution.solution import Solution
+from covocp.statement.names import name_of
+from covocp.statement.statement import Block, Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.starts import own_start, ranked
+from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.trajectory import Multipliers, Trajectory
+
+
+def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Guess:
+    """The first of `make_guesses`."""
+    return next(make_guesses(statement, mesh, parameters, guess))
+
+
+def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Iterator[Guess]:
+    """Guesses on a mesh from what the user gave, the best first; the others are made when they are asked for.
+
+    Raises:
+        ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess, or a solution
+            without any symbol of this problem.
+    """
+    if isinstance(guess, Trajectory):
+        yield Guess(trajectory=guess)
+    elif isinstance(guess, Solution):
+        yield _from_solution(statement, mesh, parameters, guess)
+    elif guess is None or isinstance(guess, Mapping):
+        for trajectory in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
+            yield Guess(trajectory=trajectory)
+    else:
+        raise ProblemError(
+            describe(
+                "The guess is of an unknown kind.",
+                expected="None, 'multistart', a Solution, or a dict of name to guess",
+                received=repr(guess)[:100],
+                remedy="correct guess=",
+            )
+        )
+
+
+def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
+    """The statement with some of its guesses replaced by name.
+
+    Raises:
+        ProblemError: a name that cannot be guessed.
+    """
+    guesses = dict(statement.guesses)
+    for key, value in given.items():
+        name = name_of(key, statement.symbols, tuple(guesses), missing_ok=True)
+        if not name:
+            raise ProblemError(
+                describe(
+                    f"The guess names '{key}', which cannot be guessed.",
+                    expected="states, controls or matrices: " + ", ".join(guesses),
+                    received=str(key),
+                    remedy=spelling(key, guesses, "correct the name"),
+                )
+            )
+        guesses[name] = value
+    return replace(statement, guesses=guesses) if given else statement
+
+
+def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
+    """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
+    _check_common(statement, solution)
+    duration = solution.duration if statement.duration.free else statement.duration.guess
+    own = solution.mesh
+    same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
+    sample = solution.at(mesh.nodes * solution.duration)
+    at_controls = sample
+    if mesh.control == "constant":
+        at_controls = solution.at(0.5 * (mesh.nodes[:-1] + mesh.nodes[1:]) * solution.duration)
+    plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
+    x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
+    t, m = solution.trajectory, solution.multipliers
+    matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
+    for block in (*statement.states, *statement.controls, *statement.matrices):
+        other = next(
+            (b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None
+        )
+        matched = matched and other is not None and other.offset == block.offset
+        if other is None:
+            continue
+        if block.kind == "state":
+            x[:, block.span] = sample[block.name].reshape(-1, block.size)
+        elif block.kind == "control":
+            u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+        else:
+            e[:, block.span] = pack(sample[block.name])
+    if same and matched and solution.trajectory.u.shape == u.shape:
+        u = solution.trajectory.u.copy()
+    trajectory = Trajectory(x=x, u=u, e=e, duration=duration)
+    constraints = (statement.path.size, statement.start.size, statement.end.size)
+    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+        return Guess(trajectory=trajectory, warm=True)
+    costates = _resample(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    return Guess(
+        trajectory=trajectory,
+        multipliers=_multipliers(m, own, mesh),
+        costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
+        warm=True,
+    )
+
+
+def _check_common(statement: Statement, solution: Solution) -> None:
+    """A solution that says nothing about this problem is a mistake, not a guess.
+
+    Raises:
+        ProblemError: no state, control or matrix of the same name and size.
+    """
+
+    def of(blocks: tuple[Block, ...]) -> set[tuple[str, str, int]]:
+        return {(b.kind, b.name, b.size) for b in blocks if b.kind in ("state", "control", "matrix")}
+
+    own, given = of(statement.blocks), of(solution.blocks)
+    if not own & given:
+        words = [", ".join(f"{kind} {name} ({size})" for kind, name, size in sorted(side)) for side in (own, given)]
+        raise ProblemError(
+            describe(
+                f"The solution of '{solution.name}' is no guess: it has nothing in common with this problem.",
+                expected=f"some of {words[0]}",
+                received=words[1],
+                remedy="give a solution of a problem with the same names and sizes, or a dict of name to guess",
+            )
+        )
+
+
+def _resample(values: Array, old: Array, new: Array) -> Array:
+    """Columns interpolated linearly from old nodes to new ones."""
+    if np.array_equal(old, new):
+        return values
+    columns = [np.interp(new, old, column) for column in values.T]
+    return np.array(columns).reshape(values.shape[1], new.size).T
+
+
+def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
+    """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
+    if np.array_equal(old.nodes, new.nodes) and (old.control, old.points) == (new.control, new.points):
+        return multipliers
+    before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
+
+    def at_nodes(values: Array) -> Array:
+        return _resample(values / before, old.nodes, new.nodes) * after
+
+    places = [m.nodes if m.control == "linear" else 0.5 * (m.nodes[1:] + m.nodes[:-1]) for m in (old, new)]
+    controls = _resample(multipliers.controls / quadrature_weights(old)[:, None], *places)
+    return replace(
+        multipliers,
+        path=at_nodes(multipliers.path_at_nodes),
+        states=at_nodes(multipliers.states_at_nodes),
+        inside_path=np.zeros((new.intervals, new.points - 1, multipliers.path.shape[1])),
+        inside_states=np.zeros((new.intervals, new.points - 1, multipliers.states.shape[1])),
+        matrices=at_nodes(multipliers.matrices),
+        controls=controls * quadrature_weights(new)[:, None],
+    )

@@ -1,0 +1,389 @@
+"""The mesh of a transcription: nodes, controls, substeps, shooting segments, and where the covariances are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from covocp.base.checks import as_number, is_whole
+from covocp.base.errors import ProblemError, describe, spelling
+from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import Array
+from covocp.statement.statement import Statement
+from covocp.transcription.steps import Step
+
+ELIMINATED_SEGMENTS = 10
+LARGEST_SUBSTEPS = 64
+# Entries of E and S up to which their step is written out in scalars where they are variables.
+SCALAR_ENTRIES = 12
+# Entries of covariances up to which a constraint on them along the path makes them variables. Chain of masses with a
+# bound on the variance of the stiffness, 50 intervals, seconds of the first solve as variables and eliminated:
+# 10 entries 0.42 and 0.71, 21 entries 0.92 and 1.26, 36 entries 5.4 and 1.5, 55 entries 9.7 and 2.3.
+PATH_ENTRIES = 21
+# h times the spectral radius above which classical Runge-Kutta gets more substeps; its stability limit is 2.78.
+STIFFNESS_PER_STEP = 1.0
+# h times the largest rate of a decaying nominal from which on classical Runge-Kutta diverges.
+STABILITY_LIMIT = 2.78
+# Steps an interval that a nominal may need by classical Runge-Kutta before it is stepped implicitly.
+EXPLICIT_SUBSTEPS = 8
+# Implicit steps an interval, at most: what happens faster than these has died out. DC motor with a time constant of
+# 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
+IMPLICIT_SUBSTEPS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Graded:
+    """The nodes of a default mesh that was graded at its ends, in place of a grid that is given (`grading`).
+
+    nodes: of t/T; asked: intervals that the user asked for; added: nodes added at the start and at the end; stiffness:
+        largest h times rate of the filter on its intervals.
+    """
+
+    nodes: Array
+    asked: int
+    added: tuple[int, int]
+    stiffness: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every shooting method, as the user gives them (`solve`); checked on construction."""
+
+    intervals: int = 100
+    control: Literal["linear", "constant"] = "linear"
+    substeps: int | Literal["auto"] = "auto"
+    grid: Any = None
+    segments: int | Literal["auto"] = "auto"
+    covariances: Literal["auto", "eliminated", "states"] = "auto"
+    covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
+    step: Literal["auto", "rk4", "rodas"] = "auto"
+    points: int | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuse options that mean nothing."""
+        _whole("intervals", self.intervals)
+        _choice("control", self.control, ("linear", "constant"))
+        _choice("covariances", self.covariances, ("auto", "eliminated", "states"))
+        _choice("covariance_step", self.covariance_step, ("auto", "gauss", "strang", "rk4"))
+        _choice("step", self.step, ("auto", "rk4", "rodas"))
+        for name, value in (("substeps", self.substeps), ("segments", self.segments), ("points", self.points)):
+            if not (isinstance(value, str) and value == "auto"):
+                _whole(name, value, "'auto' or 1, 2, 3, ...")
+
+    def nodes(self) -> Array:
+        """Nodes of the normalised time, from 0 to 1.
+
+        Raises:
+            ProblemError: where the given grid does not rise from 0 to 1.
+        """
+        if self.grid is None:
+            return np.linspace(0.0, 1.0, self.intervals + 1)
+        if isinstance(self.grid, Graded):
+            return self.grid.nodes
+        nodes = as_number("grid", "option", self.grid).ravel()
+        if nodes.size < 2 or nodes[0] != 0 or nodes[-1] != 1 or not (np.diff(nodes) > 0).all():
+            raise ProblemError(
+                describe(
+                    "The grid does not rise from 0 to 1.",
+                    expected="increasing nodes of t/T, the first 0, the last 1",
+                    received=np.array2string(nodes, threshold=8),
+                    remedy="divide the times by the duration",
+                )
+            )
+        return nodes
+
+    @property
+    def grading(self) -> dict[str, Any]:
+        """What is said of the mesh in the statistics of a solution: how its ends were graded, where they were."""
+        if not isinstance(self.grid, Graded) or not any(self.grid.added):
+            return {}
+        return {"intervals_asked": self.grid.asked, "nodes_added": self.grid.added}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mesh:
+    """A resolved mesh.
+
+    Args:
+        nodes: normalised time, shape (N + 1,), from 0 to 1.
+        control: piecewise linear or piecewise constant.
+        substeps: integration steps an interval.
+        segments: lengths of the shooting segments, in intervals; they add up to N.
+        eliminated: whether the matrices are propagated along the nominal instead of being variables.
+        step: covariance step; "rodas": implicit steps of the nominal, gauss steps of the covariances.
+        linear_solver: CasADi's linear solver of the covariance steps.
+        points: equally spread points of an interval, its start among them, where path inequalities and bounds of
+            states are imposed; they are ends of substeps. 1: at the nodes only.
+    """
+
+    nodes: Array
+    control: str
+    substeps: int
+    segments: tuple[int, ...]
+    eliminated: bool
+    step: Step
+    linear_solver: str = LINEAR_SOLVER
+    points: int = 1
+
+    @property
+    def intervals(self) -> int:
+        """Number of control intervals N."""
+        return self.nodes.size - 1
+
+    @property
+    def control_nodes(self) -> int:
+        """Number of control values: N + 1 (linear) or N (constant)."""
+        return self.intervals + (self.control == "linear")
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Node at which each segment starts, and the last node."""
+        return tuple(np.cumsum([0, *self.segments]).tolist())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stiffness:
+    """Largest h times rate of change for one step an interval.
+
+    Args:
+        nominal: of the nominal, the spectral radius of f_x.
+        oscillating: of what does not die out faster than it moves (real part above -1/2 of the modulus): implicit
+            steps must resolve it too, they would damp it.
+        decaying: of what does not grow: explicit steps that are too long for it end in nonsense.
+        matrices: of the covariances, where they are stepped by Runge-Kutta.
+    """
+
+    nominal: float
+    oscillating: float
+    decaying: float
+    matrices: float = 0.0
+
+
+def choose_mesh(statement: Statement, options: Options, step: Step, stiffness: Stiffness) -> Mesh:
+    """Resolve every "auto".
+
+    Args:
+        statement: the problem.
+        options: what the user asked for.
+        step: as chosen by `choose_step`.
+        stiffness: of the problem on this mesh (`guess.stiffness`).
+
+    Raises:
+        ProblemError: options that contradict the problem.
+    """
+    nodes = options.nodes()
+    intervals = nodes.size - 1
+    eliminated = _choose_eliminated(statement, options)
+    if options.segments == "auto":
+        count = min(ELIMINATED_SEGMENTS, intervals) if eliminated and statement.matrices else intervals
+    else:
+        count = min(options.segments, intervals)
+    if options.substeps == "auto":
+        if step == "rodas":
+            implicit = int(np.clip(np.ceil(np.sqrt(stiffness.nominal)), 1, IMPLICIT_SUBSTEPS))
+            substeps = max(implicit, explicit_substeps(stiffness.oscillating))
+        else:
+            substeps = explicit_substeps(max(stiffness.nominal, stiffness.matrices if step == "rk4" else 0.0))
+    else:
+        substeps = options.substeps
+    if step != "rodas" and stiffness.decaying > STABILITY_LIMIT * substeps:
+        raise _too_few_substeps(substeps, stiffness.decaying)
+    paired = statement.running_uses_matrices and (step != "rk4" or bool(statement.behind))
+    if paired and substeps % 2:
+        substeps += 1  # Simpson's rule for the running cost takes them in pairs
+    substeps, points = _choose_points(statement, options, substeps, 2 if paired else 1)
+    short, longer = divmod(intervals, count)
+    lengths = (short + 1,) * longer + (short,) * (count - longer)
+    return Mesh(
+        nodes=nodes,
+        control=options.control,
+        substeps=substeps,
+        segments=lengths,
+        eliminated=eliminated,
+        step=step,
+        points=points,
+    )
+
+
+def with_substeps(options: Options, mesh: Mesh, substeps: int) -> Options:
+    """Options of a mesh with other integration steps of its kind, and limits imposed where they are."""
+    step: Any = "rodas" if mesh.step == "rodas" else "rk4"
+    return replace(options, substeps=substeps, points=mesh.points, step=step)
+
+
+def _choose_points(statement: Statement, options: Options, substeps: int, group: int) -> tuple[int, int]:
+    """Substeps, and points of an interval where limits are imposed: ends of groups of so many substeps.
+
+    An interval that needs substeps holds changes that its ends do not show, which the optimiser would use.
+
+    Raises:
+        ProblemError: given substeps that do not end at the given points.
+    """
+    if not (statement.path.size or statement.bounded_states):
+        return substeps, 1
+    if options.points == "auto":
+        return substeps, max(1, substeps // group)
+    least = options.points * group if options.points > 1 else 1
+    if options.substeps != "auto" and substeps % least:
+        raise ProblemError(
+            describe(
+                f"The points at which limits are imposed are no ends of {'pairs of ' * (group > 1)}integration steps.",
+                expected=f"substeps={least}, {2 * least}, ... for points={options.points}",
+                received=f"substeps={options.substeps}",
+                remedy="leave substeps='auto', or take a divisor of them as points",
+            )
+        )
+    return -(-substeps // least) * least, options.points
+
+
+def _too_few_substeps(substeps: int, rate: float) -> ProblemError:
+    """Explicit steps that diverge."""
+    needed = int(np.ceil(rate / STIFFNESS_PER_STEP))
+    return ProblemError(
+        describe(
+            "The integration steps of the nominal are too long: classical Runge-Kutta diverges.",
+            expected=f"about {needed} steps an interval: the fastest rate of the system, at its start, times the "
+            f"longest interval is {rate:.3g}",
+            received=f"{substeps} steps an interval",
+            remedy=f"leave step= and substeps= 'auto' (implicit steps where they apply), or give substeps={needed} or "
+            "more intervals",
+        )
+    )
+
+
+def explicit_substeps(stiffness: float) -> int:
+    """Steps of classical Runge-Kutta that an interval of this stiffness takes."""
+    return int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
+
+
+def choose_step(statement: Statement, options: Options, stiffness: Stiffness) -> Step:
+    """The step of nominal and covariances.
+
+    Args:
+        statement: the problem.
+        options: what the user asked for.
+        stiffness: of the problem on this mesh.
+
+    Returns:
+        "rodas" where the nominal is too stiff for explicit steps, or asked for; else the covariance step.
+
+    Raises:
+        ProblemError: a step that does not apply.
+    """
+    covariance = _choose_covariance_step(statement, options)
+    riccati = not statement.coupled and all(form is not None for form in statement.riccati)
+    possible = riccati and options.covariance_step in ("auto", "gauss")
+    if options.step == "rodas" and not possible:
+        raise ProblemError(
+            describe(
+                "step='rodas' does not apply: it goes with gauss steps of the covariances.",
+                expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
+                received=f"covariance_step='{options.covariance_step}'"
+                if riccati
+                else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
+                remedy="leave step='auto', with more substeps= where the system is stiff",
+            )
+        )
+    needed = explicit_substeps(stiffness.nominal)
+    too_few = options.substeps == "auto" or options.substeps < needed
+    dies_out = explicit_substeps(stiffness.oscillating) <= EXPLICIT_SUBSTEPS
+    stiff = options.step == "auto" and needed > EXPLICIT_SUBSTEPS and too_few and dies_out
+    return "rodas" if possible and (options.step == "rodas" or stiff) else covariance
+
+
+def _choose_covariance_step(statement: Statement, options: Options) -> Step:
+    """The covariance step: gauss where every rate has the Riccati form, else rk4.
+
+    Where E and S of a closed loop are variables and small, rk4: written out in scalars, its exact derivatives cost a
+    third of those of gauss's linear systems (lag of section 6.12, 6 entries). For large ones these are cheaper (Mars
+    entry, 30 entries: 1.6 and 0.2 s for Hessian and Jacobian, with rk4 1.8 and 0.7 s and twice the memory).
+    """
+    riccati = all(form is not None for form in statement.riccati) and not statement.coupled
+    if options.covariance_step == "auto":
+        small = statement.ne <= SCALAR_ENTRIES
+        stated = bool(statement.behind) and small and not _choose_eliminated(statement, options)
+        return "gauss" if riccati and not stated else "rk4"
+    if options.covariance_step != "rk4" and not riccati:
+        names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
+        reason = "feeds back into the nominal" if statement.coupled else "is not of the form F E + E F' + Q - E W E"
+        raise ProblemError(
+            describe(
+                f"covariance_step='{options.covariance_step}' does not apply: the rate of "
+                f"{', '.join(names) or 'a matrix'} {reason}.",
+                expected="rates of Riccati or Lyapunov form that depend on the nominal only",
+                received=", ".join(names) or "a coupled problem",
+                remedy="use covariance_step='rk4' (or leave it 'auto')",
+            )
+        )
+    return options.covariance_step
+
+
+def _choose_eliminated(statement: Statement, options: Options) -> bool:
+    """Whether the matrices are eliminated: always where they can be and no path constraint on a few entries needs them.
+
+    Eliminated is faster for every problem of benchmarks/formulations.py, down to a single scalar variance.
+    """
+    if not statement.matrices:
+        return True
+    initial = statement.boundary_values(statement.values)[2][statement.entries(statement.ahead)]
+    obstacle = None
+    if statement.coupled:
+        obstacle = "the rate of a state depends on a matrix"
+    elif np.isnan(initial).any():
+        obstacle = "an initial value of a matrix is free"
+    elif bounded := _bounded_matrices(statement):
+        obstacle = f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
+    if options.covariances == "eliminated" and obstacle:
+        raise ProblemError(
+            describe(
+                "The matrices cannot be eliminated.",
+                expected="matrices that follow from the nominal",
+                received=obstacle,
+                remedy="use covariances='states' (or leave it 'auto')",
+            )
+        )
+    if options.covariances != "auto":
+        return options.covariances == "eliminated"
+    few = statement.loop is not None or statement.ne <= PATH_ENTRIES
+    return obstacle is None and not (statement.path.uses_matrices and few)
+
+
+def _bounded_matrices(statement: Statement) -> list[str]:
+    """Matrices with lower bounds on the diagonal that only a variable can keep.
+
+    An estimation covariance stays positive semidefinite by itself, and so does a state of Riccati or Lyapunov form
+    that is only asked not to be negative.
+    """
+    names = []
+    for block, form in zip(statement.matrices, statement.riccati, strict=True):
+        lower = statement.matrix_lower[block.span]
+        lower = lower[np.isfinite(lower)]
+        if lower.size and not block.estimation and (form is None or lower.max() > 0):
+            names.append(block.name)
+    return names
+
+
+def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
+    if not is_whole(value):
+        raise ProblemError(
+            describe(
+                f"The option '{name}' must be a positive whole number.",
+                expected=expected,
+                received=repr(value),
+                remedy=f"correct {name}=",
+            )
+        )
+
+
+def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        raise ProblemError(
+            describe(
+                f"The option '{name}' has an unknown value.",
+                expected="one of " + ", ".join(repr(choice) for choice in choices),
+                received=repr(value),
+                remedy=spelling(value, choices, f"correct {name}="),
+            )
+        )

@@ -1,0 +1,304 @@
+"""A transcribed problem: variables, bounds, constraint rows, and the way back to trajectory and multipliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import OutsideDomainError, describe
+from covocp.base.matrices import Array
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Multipliers, Trajectory
+
+# Scaled residual above which a constraint of a failed run is reported as violated.
+VIOLATION = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Typical magnitudes of the entries of x, u, e and T; the NLP works in units of them.
+
+    Those of the controls are the same at all nodes, shape (nu,), or one for each control value, (nodes, nu).
+    """
+
+    x: Array
+    u: Array
+    e: Array
+    duration: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A group of constraint rows: `names[i % len(names)]` is the user's name of row i; value = expression / scale."""
+
+    kind: str
+    expression: Any
+    lower: Array
+    upper: Array
+    names: tuple[str, ...]
+    scale: Array
+    dense: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NLP:
+    """A transcribed problem: minimise f(w, p) subject to bounds on w and g(w, p); everything scaled.
+
+    `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
+    nodes (columns), the terminal time, running cost, terminal cost and g.
+    """
+
+    statement: Statement
+    mesh: Mesh
+    scales: Scales
+    w: Any
+    p: Any
+    f: Any
+    g: Any
+    rows: tuple[Rows, ...]
+    jacobian: ca.Function | None
+    evaluate: ca.Function
+
+    def pack(self, trajectory: Trajectory) -> Array:
+        """The scaled variables of a trajectory."""
+        nodes = list(self.mesh.starts)
+        parts = [trajectory.x[nodes] / self.scales.x]
+        if not self.mesh.eliminated:
+            parts.append(trajectory.e[nodes] / self.scales.e)
+        parts.append(trajectory.u / self.scales.u)
+        stacked = [part.ravel() for part in parts]
+        if self.statement.duration.free:
+            stacked.append(np.array([trajectory.duration / self.scales.duration]))
+        return np.concatenate(stacked)
+
+    def unpack(self, w: Array, parameters: Array) -> tuple[Trajectory, dict[str, Any]]:
+        """The trajectory at all nodes, and the cost terms and constraint values, of some variables."""
+        x, e, u, duration, running, terminal, g = (
+            np.asarray(v.full()) for v in self.evaluate(w, np.append(parameters, 1.0))
+        )
+        trajectory = Trajectory(x=x.T, u=u.T, e=e.T, duration=float(duration.item()))
+        return trajectory, {"running": float(running.item()), "terminal": float(terminal.item()), "g": g.ravel()}
+
+    def bounds(self, parameters: Array) -> dict[str, Array]:
+        """Bounds of w and g (nlpsol's names) for these parameters."""
+        st = self.statement
+        x0, xf, e0, ef = st.boundary_values(parameters)
+        count = len(self.mesh.starts)
+        xl, xu = np.tile(st.state_bounds[0], (count, 1)), np.tile(st.state_bounds[1], (count, 1))
+        _fix(xl[0], xu[0], x0)
+        _fix(xl[-1], xu[-1], xf)
+        lows, highs = [xl / self.scales.x], [xu / self.scales.x]
+        if not self.mesh.eliminated:
+            el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
+            _fix(el[0], eu[0], e0)
+            _fix(el[-1], eu[-1], ef)
+            lows.append(el / self.scales.e)
+            highs.append(eu / self.scales.e)
+        nodes = self.mesh.control_nodes
+        lows.append(np.tile(st.control_bounds[0], (nodes, 1)) / self.scales.u)
+        highs.append(np.tile(st.control_bounds[1], (nodes, 1)) / self.scales.u)
+        if st.duration.free:
+            lows.append(np.array([st.duration.lower / self.scales.duration]))
+            highs.append(np.array([st.duration.upper / self.scales.duration]))
+        lbg = np.concatenate([np.zeros(0), *(rows.lower for rows in self.rows)])
+        ubg = np.concatenate([np.zeros(0), *(rows.upper for rows in self.rows)])
+        offset = 0
+        for rows in self.rows:
+            if rows.kind == "final_matrices":
+                target = ef[~np.isnan(ef)] / rows.scale
+                lbg[offset : offset + rows.lower.size] = ubg[offset : offset + rows.lower.size] = target
+            offset += rows.lower.size
+        return {
+            "lbx": np.concatenate([v.ravel() for v in lows]),
+            "ubx": np.concatenate([v.ravel() for v in highs]),
+            "lbg": lbg,
+            "ubg": ubg,
+        }
+
+    def violations(self, g: Array, parameters: Array) -> dict[str, float]:
+        """Largest violation of each violated constraint, in its own unit, by name."""
+        bounds = self.bounds(parameters)
+        excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
+        excess = np.where(np.isfinite(g), excess, np.inf)
+        result: dict[str, float] = {}
+        fixed = ~np.isnan(self.statement.boundary_values(parameters)[1])
+        offset = 0
+        for rows in self.rows:
+            size = rows.lower.size
+            for i in np.flatnonzero(excess[offset : offset + size] > VIOLATION):
+                name = rows.names[i % len(rows.names)]
+                if rows.kind == "gap_x" and i >= size - len(rows.names) and fixed[i % len(rows.names)]:
+                    name = f"final value of {self.statement.state_names[i % len(rows.names)]}"
+                result[name] = max(result.get(name, 0.0), float(excess[offset + i] * rows.scale[i]))
+            offset += size
+        return dict(sorted(result.items(), key=lambda entry: -entry[1]))
+
+    def unpack_multipliers(self, lam_x: Array, lam_g: Array, trajectory: Trajectory, parameters: Array) -> Multipliers:
+        """Multipliers of the statement's constraints from those of the NLP (for a cost scale of 1)."""
+        st, mesh = self.statement, self.mesh
+        by_kind, offset = {}, 0
+        for rows in self.rows:
+            by_kind[rows.kind] = lam_g[offset : offset + rows.lower.size] / rows.scale
+            offset += rows.lower.size
+        zero = Multipliers.zero(st, mesh)
+        parts = self._split(lam_x)
+        states, matrices = zero.states.copy(), zero.matrices.copy()
+        starts = list(mesh.starts)
+        states[starts[1:-1]] = (parts["x"] / self.scales.x)[1:-1]
+        if "state_bounds" in by_kind:
+            bounded = st.bounded_states
+            inside = sorted(set(range(mesh.intervals + 1)) - set(starts))
+            states[np.ix_(np.array(inside, dtype=np.intp), np.array(bounded, dtype=np.intp))] = by_kind[
+                "state_bounds"
+            ].reshape(len(inside), len(bounded))
+        inside_states = zero.inside_states.copy()
+        if "bounds_inside" in by_kind:
+            bounded = st.bounded_states
+            inside_states[..., bounded] = by_kind["bounds_inside"].reshape(*inside_states.shape[:2], len(bounded))
+        end = by_kind.get("end", zero.end)
+        path = by_kind.get("path", zero.path.ravel()).reshape(zero.path.shape)
+        costate = by_kind["gap_x"][-st.nx :]
+        slope_x, slope_e = terminal_slopes(st, trajectory, parameters, end, path[-1], mesh)
+        final_matrices = zero.final_matrices.copy()
+        gaps = [by_kind[kind].reshape(len(mesh.segments), -1) for kind in ("gap_x", "gap_e") if kind in by_kind]
+        if "e" in parts:
+            matrices[starts[1:-1]] = (parts["e"] / self.scales.e)[1:-1]
+            final_matrices = by_kind["gap_e"][-st.ne :] - slope_e
+        elif "final_matrices" in by_kind:
+            known = ~np.isnan(st.boundary_values(parameters)[3])
+            final_matrices[known] = by_kind["final_matrices"]
+        return Multipliers(
+            final=costate - slope_x,
+            final_matrices=final_matrices,
+            end=end,
+            start=by_kind.get("start", zero.start),
+            path=path,
+            states=states,
+            matrices=matrices,
+            controls=parts["u"] / self.scales.u,
+            gaps=np.hstack(gaps),
+            inside_path=by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape),
+            inside_states=inside_states,
+        )
+
+    def pack_multipliers(self, multipliers: Multipliers, costates: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Multipliers of the NLP (for a cost scale of 1) from those of the statement and the costates at the nodes."""
+        starts = list(self.mesh.starts)
+        inside = sorted(set(range(self.mesh.intervals + 1)) - set(starts))
+        st = self.statement
+        bounded = st.bounded_states
+        known = ~np.isnan(st.boundary_values(st.values)[3])
+        values = {
+            "gap_x": costates[0][starts[1:]],
+            "gap_e": costates[1][starts[1:]],
+            "state_bounds": multipliers.states[
+                np.ix_(np.array(inside, dtype=np.intp), np.array(bounded, dtype=np.intp))
+            ],
+            "bounds_inside": multipliers.inside_states[..., bounded],
+            "path": multipliers.path,
+            "path_inside": multipliers.inside_path,
+            "start": multipliers.start,
+            "end": multipliers.end,
+            "final_matrices": multipliers.final_matrices[known],
+            "backward_ends": multipliers.final_matrices[st.entries(st.behind)],
+        }
+        lam_g = [values[rows.kind].ravel() * rows.scale for rows in self.rows]
+        lam_x = [multipliers.states[starts] * self.scales.x]
+        if not self.mesh.eliminated:
+            lam_x.append(multipliers.matrices[starts] * self.scales.e)
+        lam_x.append(multipliers.controls * self.scales.u)
+        if st.duration.free:
+            lam_x.append(np.zeros(1))
+        return np.concatenate([v.ravel() for v in lam_x]), np.concatenate([np.zeros(0), *lam_g])
+
+    def units(self, scales: Scales) -> Array:
+        """Other magnitudes of the variables, in the units of this NLP, an entry for each variable."""
+        st, count, nodes = self.statement, len(self.mesh.starts), self.mesh.control_nodes
+        parts = [np.tile(scales.x / self.scales.x, count)]
+        if not self.mesh.eliminated:
+            parts.append(np.tile(scales.e / self.scales.e, count))
+        parts.append(np.broadcast_to(scales.u / self.scales.u, (nodes, st.nu)).ravel())
+        if st.duration.free:
+            parts.append(np.array([scales.duration / self.scales.duration]))
+        return np.concatenate(parts)
+
+    def row_units(self, scales: Scales) -> Array:
+        """Other magnitudes of what the rows of g compare, in units of these rows; 1 where rows have no magnitude."""
+        whole = {"gap_x": scales.x, "gap_e": scales.e}
+        parts = [
+            np.tile(whole[rows.kind], rows.lower.size // whole[rows.kind].size) / rows.scale
+            if rows.kind in whole
+            else np.ones(rows.lower.size)
+            for rows in self.rows
+        ]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def _split(self, w: Array) -> dict[str, Array]:
+        """Parts of a vector of the size of the variables, a row for each node."""
+        st, count, nodes = self.statement, len(self.mesh.starts), self.mesh.control_nodes
+        lengths = (
+            {"x": (count, st.nx)} | ({} if self.mesh.eliminated else {"e": (count, st.ne)}) | {"u": (nodes, st.nu)}
+        )
+        parts, offset = {}, 0
+        for name, shape in lengths.items():
+            parts[name] = w[offset : offset + shape[0] * shape[1]].reshape(shape)
+            offset += shape[0] * shape[1]
+        return parts
+
+
+def terminal_slopes(
+    statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array, mesh: Mesh
+) -> tuple[Array, Array]:
+    """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
+    x, e = ca.MX.sym("x", statement.nx), ca.MX.sym("e", statement.ne)
+    t, u = trajectory.duration, trajectory.u[-1]
+    value = statement.terminal(x, e, t, parameters)
+    for conditions, weights in ((statement.end, end), (statement.path, path)):
+        if conditions.size:
+            value += ca.dot(ca.DM(weights), conditions.function(x, u, e, t, t, parameters))
+    slopes = ca.Function("slopes", [x, e], [ca.gradient(value, x), ca.gradient(value, e)])
+    return tuple(np.asarray(v.full()).ravel() for v in slopes(trajectory.x[-1], trajectory.e[-1]))  # type: ignore[return-value]
+
+
+def _fix(lower: Array, upper: Array, values: Array) -> None:
+    """Fix the entries that have a value (in place)."""
+    known = ~np.isnan(values)
+    lower[known] = upper[known] = values[known]
+
+
+def check_finite(nlp: NLP, w: Array, parameters: Array) -> None:
+    """The cost must be finite where a solver starts: the running cost on the way, the terminal cost at the end.
+
+    Raises:
+        OutsideDomainError: names the part that is not.
+    """
+    trajectory, values = nlp.unpack(w, parameters)
+    check_costs(trajectory, values["running"], values["terminal"])
+
+
+def check_costs(trajectory: Trajectory, running: float, terminal: float) -> None:
+    """Costs of a first trajectory must be finite.
+
+    Raises:
+        OutsideDomainError: names the one that is not.
+    """
+    for name, value, where in (("running", running, "along"), ("terminal", terminal, "at the end of")):
+        if not np.isfinite(value):
+            last = np.array2string(trajectory.x[-1], precision=4, threshold=8)
+            remedy = "give another guess of controls or states, or bounds that keep the model in its domain"
+            if np.isfinite(trajectory.x).all() and not np.isfinite(trajectory.e).all():
+                remedy = (
+                    "the steps of the matrices are too long: use covariance_step='gauss', more substeps or intervals"
+                )
+            raise OutsideDomainError(
+                describe(
+                    f"The cost '{name}' is {value} {where} the initial guess.",
+                    expected="a finite cost where the solver starts",
+                    received=f"final state {last}, T = {trajectory.duration:g} s",
+                    remedy=remedy,
+                )
+            )

@@ -1,0 +1,302 @@
+"""Multiple shooting: states, matrices and costs of all intervals, the matrices along the nominal or with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.steps import (
+    early,
+    full_interval,
+    interval_symbols,
+    joint_interval,
+    nominal_interval,
+    propagate_step,
+    runge_kutta_step,
+    simpson_interval,
+    step_matrix,
+)
+
+# Steps that a sequence of numbers takes at a time.
+NUMERIC_RUN = 10
+
+
+def repeat(column: Any, count: int) -> Any:
+    """A column repeated; one without entries stays without."""
+    return ca.repmat(column, 1, count) if column.shape[0] else ca.DM(0, count)
+
+
+def control_ends(mesh: Mesh, u: Any) -> tuple[Any, Any]:
+    """Controls at the starts and the ends of the intervals, a column each."""
+    return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
+
+
+def common_columns(mesh: Mesh, u: Any, duration: Any, parameters: Any) -> tuple[Any, ...]:
+    """The common arguments of the interval functions, a column for each interval."""
+    n = mesh.intervals
+    start, end = control_ends(mesh, u)
+    s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
+    return start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n)
+
+
+def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
+    """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
+    common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
+    if not mesh.eliminated or statement.coupled:
+        start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
+        advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
+    else:
+        start, advance = variables.x, nominal_interval(statement, mesh.substeps, mesh.step)
+    ends, fine, cost = _segments(mesh, advance, start, common)
+    nodes = _node_values(mesh, start, ends)
+    last = [i - 1 for i in mesh.starts[1:]]
+    gaps = ends[:, last] - start[:, 1:]
+    nx = statement.nx
+    result = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
+    inside = _inside(mesh)
+    if inside:
+        result |= {"x_inside": fine[:nx, inside], "e_inside": fine[nx:, inside]}
+    if not statement.matrices:
+        return result | {"e": ca.DM(0, mesh.intervals + 1)}
+    if not mesh.eliminated or statement.coupled:
+        return result | {"e": nodes[nx:, :]}
+    e0 = None if variables.e is None else variables.e[:, 0]
+    passage = passages(statement, mesh, result["x"], fine, common, variables.parameters, e0)
+    if inside:
+        result["e_inside"] = passage[1][:, inside]
+    return result | {"e": passage[0], "cost": cost + passage[2]}
+
+
+def _inside(mesh: Mesh) -> list[int]:
+    """Substeps at whose ends, inside the intervals, limits are imposed."""
+    n, m, stride = mesh.intervals, mesh.substeps, mesh.substeps // mesh.points
+    return [k * m + j * stride - 1 for k in range(n) for j in range(1, mesh.points)]
+
+
+def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
+    ends: list[Any] = []
+    fine: list[Any] = []
+    costs: list[Any] = []
+    first_segment = first_interval = 0
+    for length in sorted(set(mesh.segments), reverse=True):
+        count = mesh.segments.count(length)
+        function = advance if length == 1 else advance.mapaccum("segment", length)
+        function = function.map(count) if count > 1 else function
+        span = slice(first_interval, first_interval + count * length)
+        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in common))
+        for collected, value in zip((ends, fine, costs), outputs, strict=True):
+            collected.append(value)
+        first_segment, first_interval = first_segment + count, span.stop
+    return ca.horzcat(*ends), ca.horzcat(*fine), ca.horzcat(*costs)
+
+
+def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
+    """Values at all nodes: variables where segments start and at the end, computed ones between."""
+    if len(mesh.segments) == mesh.intervals:
+        return start  # each node starts a segment
+    columns = []
+    for j, (i, k) in enumerate(zip(mesh.starts[:-1], mesh.starts[1:], strict=True)):
+        columns += [start[:, j], ends[:, i : k - 1]]
+    return ca.horzcat(*columns, start[:, -1])
+
+
+def matrices_along(
+    statement: Statement,
+    mesh: Mesh,
+    x: Any,
+    fine: Any,
+    common: tuple[Any, ...],
+    parameters: Any,
+    e0: Any = None,
+    kicks: Any = None,
+) -> tuple[Any, Any]:
+    """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
+
+    Args:
+        statement: an uncoupled problem with matrices.
+        mesh: nodes, substeps, covariance step.
+        x: states at the nodes, (nx, N + 1).
+        fine: states at the ends of all substeps, (nx, N substeps).
+        common: common arguments of the interval functions, a column for each interval.
+        parameters: of the statement.
+        e0: half-vectors at the start; None: the statement's.
+        kicks: added to the half-vectors as they pass the nodes, (ne, N + 1): slopes by them are costates. None:
+            nothing; only where some matrix runs backward.
+
+    Returns:
+        Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
+    """
+    e, _, cost = passages(statement, mesh, x, fine, common, parameters, e0, kicks)
+    return e, cost
+
+
+def passages(
+    statement: Statement,
+    mesh: Mesh,
+    x: Any,
+    fine: Any,
+    common: tuple[Any, ...],
+    parameters: Any,
+    e0: Any = None,
+    kicks: Any = None,
+) -> tuple[Any, Any, Any]:
+    """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
+    n, m = mesh.intervals, mesh.substeps
+    e0 = statement.boundary(parameters)[2] if e0 is None else e0
+    starts = x[:, :n]
+    if mesh.step == "rk4" and not statement.behind:
+        ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, common)
+        return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
+    before = starts
+    if m > 1:
+        before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
+        before = ca.reshape(before, statement.nx, n * m)
+    columns = (before, fine, *substep_columns(common, m, n))
+    first = e0[statement.entries(statement.ahead)]
+    passed = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
+    if statement.matrix_end is not None:
+        last = statement.matrix_end(x[:, -1], common[4][:, -1], parameters)
+        other = _backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind))
+        entries = np.argsort(statement.entries(statement.ahead) + statement.entries(statement.behind)).tolist()
+        passed = tuple(ca.vertcat(a, b)[entries, :] for a, b in zip(passed, other, strict=True))
+    e, begins, halves = passed
+    if not statement.running_uses_matrices:
+        return e, halves, ca.DM.zeros(1, n)
+    return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *common))
+
+
+def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:
+    """Running cost of each interval where it depends on the matrices; of a closed loop by parts in the first half."""
+    n, m = mesh.intervals, mesh.substeps
+    half = int(np.sum(early(mesh.nodes[:-1], np.diff(mesh.nodes)))) if statement.behind else 0
+    costs = []
+    for span, by_parts in ((range(half), True), (range(half, n), False)):
+        if len(span):
+            function = simpson_interval(statement, m, by_parts).map(len(span))
+            widths = (1, 1, m, m) + (1,) * (len(columns) - 4)
+            chosen = [c[:, span.start * w : span.stop * w] for c, w in zip(columns, widths, strict=True)]
+            costs.append(function(*chosen))
+    return ca.horzcat(*costs)
+
+
+def _of(kicks: Any, statement: Statement, positions: tuple[int, ...]) -> Any:
+    """The rows of the kicks that belong to some of the matrices."""
+    return None if kicks is None else kicks[statement.entries(positions), :]
+
+
+def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+    """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
+    n, m = mesh.intervals, mesh.substeps
+    later = None
+    if kicks is not None:
+        first, later = first + kicks[:, 0], kicks[:, 1:]
+    arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, later)
+    nodes = ca.horzcat(first, passed[:, m - 1 :: m])
+    return nodes, nodes[:, :n], arrived
+
+
+def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+    """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
+    n, m = mesh.intervals, mesh.substeps
+    before, after, start, end, s, ds, duration, parameters = columns
+    order = list(range(n * m - 1, -1, -1))
+    turned = tuple(column[:, order] for column in (after, before, end, start, s + ds, -ds, duration, parameters))
+    if kicks is not None:
+        last, kicks = last + kicks[:, n], kicks[:, list(range(n - 1, -1, -1))]
+    arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
+    points = ca.horzcat(passed[:, order], last)
+    return points[:, ::m], arrived[:, order][:, ::m], points[:, 1:]
+
+
+def _sequence(
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Any, columns: tuple[Any, ...], kicks: Any
+) -> tuple[Any, Any]:
+    """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
+    count = mesh.intervals * mesh.substeps
+    if mesh.step == "rk4":
+        step = runge_kutta_step(statement, positions)
+        matrices = [column for k, column in enumerate(columns) if k != 1]
+    else:
+        step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
+        matrices = [step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions]
+    if kicks is None:
+        values = _accumulated(step, first, matrices, count)
+        return values, values
+    inputs = step.mx_in()
+    kick = ca.MX.sym("kick", first.shape[0])
+    arrived = step(*inputs)
+    kicked = ca.Function("kicked", [*inputs, kick], [arrived + kick, arrived])
+    at_nodes = ca.MX(first.shape[0], count)
+    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
+    passed, before = kicked.mapaccum("propagate", count)(first, *matrices, at_nodes)
+    return before, passed
+
+
+def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int) -> Any:
+    """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
+    if not isinstance(arguments[0], ca.DM):
+        return step.mapaccum("propagate", count)(first, *arguments)
+    lengths = [min(NUMERIC_RUN, count - begin) for begin in range(0, count, NUMERIC_RUN)]
+    runs = {length: step if length == 1 else step.mapaccum("propagate", length) for length in set(lengths)}
+    parts = [ca.horzsplit(argument, NUMERIC_RUN * (argument.shape[1] // count)) for argument in arguments]
+    value, passed = first, []
+    for length, *columns in zip(lengths, *parts, strict=True):
+        passed.append(runs[length](value, *columns))
+        value = passed[-1][:, -1]
+    return ca.horzcat(*passed)
+
+
+def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """States and half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
+    x0, e0, duration, p = start
+    common = common_columns(mesh, u, duration, p)
+    if statement.coupled:
+        interval = full_interval(statement, mesh.substeps, mesh.step)
+        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
+        nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
+        return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
+    nominal = nominal_interval(statement, mesh.substeps, mesh.step)
+    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *common)
+    x = ca.horzcat(x0, ends)
+    if not statement.matrices:
+        return x, ca.MX(0, mesh.intervals + 1), cost
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
+    return x, e, cost + matrix_cost
+
+
+def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
+    """The common arguments for each substep, a column each."""
+    if m == 1:
+        return common
+    start, end, s, ds, duration, parameters = common
+
+    def interleave(columns: list[Any]) -> Any:
+        return ca.reshape(ca.vertcat(*columns), columns[0].shape[0], n * m)
+
+    at = [start + (j / m) * (end - start) for j in range(m + 1)]
+    return (
+        interleave(at[:m]),
+        interleave(at[1:]),
+        interleave([s + (j / m) * ds for j in range(m)]),
+        interleave([ds / m] * m),
+        interleave([duration] * m),
+        interleave([parameters] * m),
+    )
+
+
+def _runge_kutta_along(
+    statement: Statement, mesh: Mesh, e0: Any, starts: Any, common: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """The rk4 covariance step in sequence, restarted at the nominal of each node: at the ends, the substeps, cost."""
+    interval = joint_interval(statement, mesh.substeps)
+    symbolic: Any = statement.symbolic
+    x, e = symbolic.sym("x", statement.nx), symbolic.sym("e", statement.ne)
+    rest = interval_symbols(statement, symbolic)
+    end, inner, cost = interval(ca.vertcat(x, e), *rest)
+    step = ca.Function("matrix_step", [e, x, *rest], [end[statement.nx :], inner[statement.nx :, :], cost])
+    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *common))

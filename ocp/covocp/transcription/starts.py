@@ -1,0 +1,364 @@
+"""Where a solver starts: one start where the problem is plain, else several cheap ones, ranked before it is called.
+
+A problem is plain where a bend of its controls moves the states in proportion to it, and where a step or two of Gauss
+and Newton bring them to their final values. Elsewhere (a vehicle that turns, an arm that swings) there are several
+ways, which a solver does not leave once it has begun: so controls of several shapes and sizes are brought to the final
+values with little energy, on a coarse mesh, and what they cost decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import (
+    check_model,
+    control_scale,
+    controls_guess,
+    evaluate_guess,
+    is_plain,
+    matrices_function,
+    simulate_matrices,
+    simulate_states,
+    starts,
+    stiffness,
+)
+from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, explicit_substeps
+from covocp.transcription.steering import Run, least_energy, resampled, steer, track
+from covocp.transcription.steps import KEPT
+from covocp.transcription.trajectory import Trajectory
+
+# A bend is halved until its second half moves the states as its first half does, up to this share, or until it moves
+# none by more than FAINT of its scale.
+CURVED = 0.5
+FAINT = 0.05
+HALVINGS = 30
+# Share of the miss that the first step of steering may leave where a problem is plain.
+PLAIN_MISS = 0.3
+# A control that steering moved by more than so many bends is not bent.
+FAR = 5.0
+# Bend that a start of the ranking keeps, in units of the bend, so that none is a symmetric point.
+REMAINDER = 0.1
+# Intervals of the mesh on which starts are compared.
+COARSE = 24
+# Shapes of the controls of the starts, as cosines of that many half waves, and their sizes in units of the bend.
+SHAPES = (0, 1, 2)
+SIZES = (1.0, 3.0)
+SIGNS = (1.0, -1.0)
+# Controls that are bent apart from each other; more than these are bent together.
+APART = 2
+# A start counts as feasible up to this miss of final values and conditions, in their scales.
+FEASIBLE = 1e-2
+# Steps of each start before the first ranking, and of those that are left after it.
+ROUGH_STEPS = 6
+FINE_STEPS = 20
+# Relative difference of costs below which two starts are one; starts that are kept at most.
+SAME = 1e-3
+LARGEST_NUMBER = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class First:
+    """The problem's own start, and whether others are worth looking at."""
+
+    trajectory: Trajectory
+    plain: bool
+
+
+def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Trajectory]:
+    """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
+
+    Raises:
+        ProblemError: where a rate is NaN or inf at the start (says which).
+    """
+    own = own_start(statement, mesh, parameters)
+    free = statement.nu > 0 and not statement.coupled
+    if own.plain or not free:
+        yield own.trajectory
+        if free:
+            yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
+        return
+    found = list(_others(statement, mesh, parameters, own.trajectory))
+    yield from found or [own.trajectory]
+
+
+def _neutral(statement: Statement) -> Statement:
+    """The statement without the guesses that say how something moves: where they led nowhere."""
+    moving = [b.name for b in (*statement.states, *statement.controls) if not is_plain(statement.guesses[b.name])]
+    return replace(statement, guesses={**statement.guesses, **dict.fromkeys(moving)}) if moving else statement
+
+
+def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
+    """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated."""
+    duration = statement.duration.guess
+    start, e0 = starts(statement, mesh, parameters)
+    u = controls_guess(statement, mesh.nodes, mesh.control)
+    check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
+    plain = True
+    if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
+        followed = _followed(statement)
+        if followed:
+            u = _tracked(statement, mesh, parameters, followed)
+        else:
+            flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+            u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat)
+    return First(trajectory=completed(statement, mesh, parameters, u), plain=plain)
+
+
+def completed(
+    statement: Statement,
+    mesh: Mesh,
+    parameters: Array,
+    u: Array,
+    *,
+    start: Array | None = None,
+    duration: float | None = None,
+) -> Trajectory:
+    """The trajectory of some controls: guessed states as they are guessed, the others simulated, and the matrices.
+
+    Another initial state than the guessed one, or another duration, may be given.
+    """
+    own, e0 = starts(statement, mesh, parameters)
+    start = own if start is None else start
+    duration = statement.duration.guess if duration is None else duration
+    guessed = [b for b in statement.states if statement.guesses[b.name] is not None]
+    if len(guessed) < len(statement.states):
+        x = simulate_states(statement, mesh, start, e0, u, duration, parameters)
+    else:
+        x = np.zeros((mesh.intervals + 1, statement.nx))
+    for block in guessed:
+        x[:, block.span] = evaluate_guess(block, statement.guesses[block.name], mesh.nodes)
+        x[:, block.span] += (start - own)[block.span]
+    return Trajectory(x=x, u=u, e=simulate_matrices(statement, mesh, x, u, e0, duration, parameters), duration=duration)
+
+
+def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
+    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give."""
+    final = statement.boundary_values(parameters)[1]
+    lower, upper = statement.state_bounds
+    span = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), 0.0)
+    scale = np.maximum.reduce([np.abs(start), np.abs(np.nan_to_num(final)), span])
+    for block in statement.states:
+        given = statement.scales.get(block.name)
+        if given is not None:
+            scale[block.span] = given
+        elif block.size > 1:  # components of one vector have one magnitude unless they are told apart
+            scale[block.span] = np.where(scale[block.span] > 0, scale[block.span], scale[block.span].max())
+    run = Run(
+        statement=statement,
+        mesh=mesh,
+        start=start,
+        duration=statement.duration.guess,
+        parameters=parameters,
+        scale=scale,
+        units=np.ones(statement.nu),
+    )
+    travelled = np.abs(run.states(flat)).max(axis=0)
+    return replace(run, scale=np.where(np.isfinite(travelled), np.maximum(scale, travelled), scale))
+
+
+def _followed(statement: Statement) -> tuple[int, ...]:
+    """States whose guess says how they move: an array or a function."""
+    rows = [list(range(b.span.start, b.span.stop)) for b in statement.states if not is_plain(statement.guesses[b.name])]
+    return tuple(k for block in rows for k in block)
+
+
+def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[int, ...]) -> Array:
+    """Controls along which some states follow their guesses, as far as they can."""
+    coarse = _coarse(statement, mesh, tuple(parameters))
+    path = np.zeros((coarse.intervals + 1, statement.nx))
+    for block in statement.states:
+        guess = statement.guesses[block.name]
+        if guess is not None:
+            path[:, block.span] = _on(coarse, mesh, evaluate_guess(block, guess, mesh.nodes))
+    start = starts(statement, mesh, parameters)[0]
+    flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
+    run = base_run(statement, coarse, parameters, start, flat)
+    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat))
+    return run.clip(resampled(track(run, rows, path[:, list(rows)], flat), coarse, mesh))
+
+
+def _on(coarse: Mesh, mesh: Mesh, values: Array) -> Array:
+    """Values at the nodes of a mesh at those of a coarser one."""
+    return np.stack([np.interp(coarse.nodes, mesh.nodes, column) for column in values.T], axis=1)
+
+
+def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
+    """Controls steered to the final values and bent, and whether the problem is plain.
+
+    The bend 1 - s breaks symmetries; where the terminal conditions prefer a direction, it must not oppose them, and a
+    control that they move far has no symmetry left to break.
+    """
+    if not np.isfinite(run.start).all():
+        return bent, True
+    bend = bent - flat
+    size = bend_size(run, flat, bend)
+    fixed, target = targets(run)
+    steered, left = steer(run, fixed, target, flat) if fixed else (flat, 0.0)
+    sign = np.where(np.sum((steered - flat) * bend, axis=0) < 0, -1.0, 1.0)
+    far = np.linalg.norm(steered - flat, axis=0) > FAR * size * np.linalg.norm(bend, axis=0)
+    return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
+
+
+def targets(run: Run) -> tuple[tuple[int, ...], Array]:
+    """States with final values, and these."""
+    final = run.statement.boundary_values(run.parameters)[1]
+    fixed = np.flatnonzero(~np.isnan(final))
+    return tuple(int(k) for k in fixed), final[fixed]
+
+
+def bend_size(run: Run, flat: Array, bend: Array) -> float:
+    """Share of a bend to which the states answer in proportion, measured by their values at all nodes.
+
+    1 unless the second half of the bend moves them otherwise than the first: then it is halved, until it does not or is
+    faint.
+    """
+    if not bend.any():
+        return 1.0
+    size, base = 1.0, run.states(flat)
+    if not np.isfinite(base).all():
+        return size
+    full = run.states(run.clip(flat + bend))
+    for _ in range(HALVINGS):
+        half = run.states(run.clip(flat + 0.5 * size * bend))
+        if np.isfinite(full).all() and np.isfinite(half).all():
+            moved, bow = full - base, full - 2.0 * half + base
+            largest = np.abs(moved).max(axis=0)
+            scale = np.where(run.scale > 0, run.scale, np.where(largest > 0, largest, 1.0))
+            if 2.0 * np.linalg.norm(bow / scale) <= CURVED * np.linalg.norm(moved / scale):
+                return size
+            if (largest / scale).max() <= FAINT:
+                return size
+        size, full = 0.5 * size, half
+    return size
+
+
+def _units(run: Run, flat: Array) -> Array:
+    """Sizes of the bends of each control, from their effect on the states: constant changes."""
+    statement, units = run.statement, np.ones(run.statement.nu)
+    for block in statement.controls:
+        units[block.span] = control_scale(statement, block, flat[:, block.span])
+    for i in range(statement.nu):
+        bend = np.zeros_like(flat)
+        bend[:, i] = units[i]
+        units[i] *= bend_size(run, flat, bend)
+    return units
+
+
+@lru_cache(maxsize=KEPT)
+def _coarse(statement: Statement, mesh: Mesh, parameters: tuple[float, ...]) -> Mesh:
+    """The mesh on which starts are compared, with as many steps as the rates need."""
+    count = min(COARSE, mesh.intervals)
+    nodes = np.linspace(0.0, 1.0, count + 1)
+    stiff = stiffness(statement, Options(grid=nodes), np.array(parameters))
+    steps = IMPLICIT_SUBSTEPS if mesh.step == "rodas" else max(2, explicit_substeps(stiff.nominal))
+    return replace(mesh, nodes=nodes, substeps=steps + steps % 2, segments=(count,), eliminated=True, points=1)
+
+
+def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory) -> Iterator[Trajectory]:
+    """Starts of several shapes and sizes, brought to the final values with little energy, the cheapest first."""
+    coarse = _coarse(statement, mesh, tuple(parameters))
+    flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
+    run = base_run(statement, coarse, parameters, starts(statement, mesh, parameters)[0], flat)
+    run = replace(run, units=_units(run, flat))
+    fixed, target = targets(run)
+    judged = []
+    for shape in _shapes(run, flat, resampled(own.u, mesh, coarse)):
+        judged.append(_judged(run, fixed, target, shape, flat, ROUGH_STEPS))
+    best = _distinct(judged)
+    if fixed:
+        best = _distinct([_judged(run, fixed, target, entry.u, flat, FINE_STEPS) for entry in best])
+    for entry in best:
+        u = run.clip(resampled(_unsymmetric(run, entry.u, flat), coarse, mesh))
+        yield completed(statement, mesh, parameters, u)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Judged:
+    """Controls, what they cost, and what they violate (0 where that is little)."""
+
+    u: Array
+    cost: float
+    violation: float
+
+
+def _judged(run: Run, fixed: tuple[int, ...], target: Array, shape: Array, flat: Array, steps: int) -> _Judged:
+    """Controls near a shape, brought to the final values with little energy."""
+    u, miss = least_energy(run, fixed, target, shape, flat, steps) if fixed else (shape, 0.0)
+    cost, violation = _merit(run, u)
+    violation = max(violation, miss)
+    return _Judged(u=u, cost=cost, violation=violation if violation > FEASIBLE else 0.0)
+
+
+def _distinct(judged: list[_Judged]) -> list[_Judged]:
+    """The best of some starts, those left out that cost the same as a better one."""
+    kept: list[_Judged] = []
+    for entry in sorted(judged, key=lambda e: (e.violation, e.cost)):
+        if len(kept) == LARGEST_NUMBER or not np.isfinite(entry.cost):
+            break
+        twins = [k for k in kept if abs(entry.cost - k.cost) <= SAME * max(abs(entry.cost), abs(k.cost))]
+        if not any((k.violation > 0) == (entry.violation > 0) for k in twins):
+            kept.append(entry)
+    return kept
+
+
+def _unsymmetric(run: Run, u: Array, flat: Array) -> Array:
+    """Controls with a little of the bend, which follows their direction."""
+    at = run.mesh.nodes if run.mesh.control == "linear" else 0.5 * (run.mesh.nodes[1:] + run.mesh.nodes[:-1])
+    bend = run.units * (1.0 - at[:, None])
+    return np.asarray(u + REMAINDER * np.where(np.sum((u - flat) * bend, axis=0) < 0, -1.0, 1.0) * bend)
+
+
+def _shapes(run: Run, flat: Array, own: Array) -> Iterator[Array]:
+    """Controls from which the ranking begins."""
+    nu = run.statement.nu
+    at = run.mesh.nodes if run.mesh.control == "linear" else 0.5 * (run.mesh.nodes[1:] + run.mesh.nodes[:-1])
+    patterns = np.eye(nu) if nu <= APART else np.vstack([np.ones(nu), np.where(np.arange(nu) % 2, -1.0, 1.0)])
+    yield own
+    yield flat
+    for pattern in patterns:
+        for waves in SHAPES:
+            for size in SIZES:
+                for sign in SIGNS:
+                    wave = np.cos(np.pi * waves * at)[:, None]
+                    yield run.clip(flat + sign * size * pattern * run.units * wave)
+
+
+def _merit(run: Run, u: Array) -> tuple[float, float]:
+    """Cost of controls, and the largest violation of bounds and conditions, relative to their magnitude."""
+    st, duration, p = run.statement, run.duration, run.parameters
+    x = run.states(u)
+    if not np.isfinite(x).all():
+        return np.inf, np.inf
+    e, running = np.zeros((x.shape[0], 0)), run.running(u)
+    if st.matrices:
+        values = _matrices(st, run.mesh)(x.T, u.T, duration, p)
+        e, running = np.asarray(values[0].full()).T, float(np.asarray(values[1].full()).sum())
+    cost = running + float(st.terminal(x[-1], e[-1], duration, p))
+    lower, upper = st.state_bounds
+    violation = float((np.maximum(lower - x, x - upper) / run.divisors).max(initial=0.0))
+    at_nodes = u if u.shape[0] == x.shape[0] else np.vstack([u, u[-1:]])
+    count = x.shape[0]
+    columns = (x.T, at_nodes.T, e.T, run.mesh.nodes[None, :] * duration, np.full((1, count), duration))
+    for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(count - 1, count))):
+        if conditions.size:
+            chosen = [c[:, at] for c in columns]
+            number = chosen[0].shape[1]
+            rows = conditions.function.map(number)(*chosen, np.tile(p[:, None], (1, number))).full().T
+            limits = [np.nan_to_num(v, posinf=0.0, neginf=0.0) for v in (conditions.lower, conditions.upper)]
+            size = np.maximum.reduce([np.abs(rows).max(axis=0), np.abs(limits[0]), np.abs(limits[1])])
+            excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)
+            violation = max(violation, float((excess / np.where(size > 0, size, 1.0)).max(initial=0.0)))
+    return (cost, violation) if np.isfinite(violation) else (np.inf, np.inf)
+
+
+@lru_cache(maxsize=KEPT)
+def _matrices(statement: Statement, mesh: Mesh) -> ca.Function:
+    """See `guess.matrices_function`."""
+    return matrices_function(statement, mesh)

@@ -1,0 +1,430 @@
+"""Forward and backward sweeps of the gradient method: the miss at the end, and its slopes by influence functions.
+
+G. T. Schmidt, Sc.D. thesis, M.I.T. 1971, [4.3], steps 2 to 4, and appendix D, corrected. The matrices are half-vectors
+e; x and e are stacked as z, their costates p, P as one column, and each terminal condition z_j(T) has a column R_j
+beside it: the adjoint of the rates alone, with the slope of the condition as terminal value. So conditions on final
+matrices, and equalities between final values, are treated like fixed components of the final state.
+
+    h = L + p' f + tr(P V),   H_j = R_j' (f, V),   d(J) = int h_u du dt + ...,   d(z_j) = int H_ju du dt + ...
+
+The control is a combination of a few functions phi_i(t/T) (hats, or one on each interval), so the slopes come as the
+integrals of phi_i h_u by Simpson's rule on the starts, middles and ends of the pairs of substeps. Controls are held in
+t/T: a change of T stretches them, and the slope of J by T is
+
+    k_T + int_0^1 d/dT [T H(t = s T)] ds,
+
+which is k_t + H(T) where H_u = 0 (appendix D); elsewhere it has the change of u at a fixed time that a stretch brings.
+
+In the closed loop (appendix E, corrected) z = (x, E, S), and S runs backward from s(x(T), T), after the nominal. Its
+costate Y runs forward from zero (it is -Xhat/2 [A-32]) and needs no other; p and P come last. With nu = k_S - Y(T)
+
+    p(T) = k_x + s_x' nu,   slope by T: k_T + s_T' nu + ...,
+
+which is (1/2 tr S(T) X(T))_x where the terminal cost is not quadratic, a term that the source drops. No condition
+depends on S elsewhere, so the influence functions have no part in S.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.extremal.hamiltonian import backward_interval, forward_costates, hamiltonian
+from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.rosenbrock import one_sided, part_of
+from covocp.transcription.shooting import common_columns, matrices_along
+from covocp.transcription.steps import COMMON, full_interval, inside_interval, interval_symbols, nominal_interval
+
+# Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.
+LARGEST_FLAT = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terminal:
+    """The conditions at the end that influence functions meet.
+
+    Args:
+        fixed: entries of z = (x, e) with a final value.
+        rows: equalities among the final conditions that do not depend on the control.
+        names: of all of them, in this order.
+        matrices: whether the matrices have an influence on them.
+        function: (z, T, p, Y) -> terminal cost k, the values of the conditions, the slopes of both by z (size,
+            1 + q) and by T (1, 1 + q), S(T) = s(x(T), T) inserted and the slopes of k with -Y' s.
+    """
+
+    fixed: tuple[int, ...]
+    rows: tuple[int, ...]
+    names: tuple[str, ...]
+    matrices: bool
+    function: ca.Function
+
+    def targets(self, statement: Statement, parameters: Array) -> Array:
+        """What the conditions must be."""
+        _, final, _, matrices = statement.boundary_values(parameters)
+        values = np.concatenate([final, matrices])[list(self.fixed)]
+        return np.concatenate([values, statement.end.lower[list(self.rows)]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweeps:
+    """The compiled sweeps of a statement on a mesh; `pairs` Runge-Kutta steps backward in each interval.
+
+    forward: (z(0), *common) -> z at the nodes (size, N + 1), running cost of each interval.
+    refine: z at the starts and at the ends of the intervals, *common -> z at the starts, middles and ends of the pairs.
+    given: costates of the matrices that run backward there; None without such matrices.
+    """
+
+    statement: Statement
+    mesh: Mesh
+    pairs: int
+    terminal: Terminal
+    forward: ca.Function
+    refine: ca.Function
+    given: ca.Function | None
+    backward: ca.Function
+    quadrature: ca.Function
+    curvature: ca.Function
+    terms: ca.Function
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A forward sweep: z at the nodes (N + 1, size), costs, miss of the terminal conditions (q,)."""
+
+    u: Array
+    duration: float
+    z: Array
+    running: float
+    terminal: float
+    miss: Array
+
+    @property
+    def cost(self) -> float:
+        """J."""
+        return self.running + self.terminal
+
+    @property
+    def finite(self) -> bool:
+        """Whether the model stayed in its domain."""
+        return bool(np.isfinite(self.cost) and np.isfinite(self.z).all())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slopes:
+    """A backward sweep; the first of the 1 + q entries belongs to the cost, the others to the terminal conditions.
+
+    control: slopes by the control values, (1 + q, K, nu); cost: the part of the running cost alone, (K, nu).
+    duration: by T, (1 + q,). start: by z(0), (1 + q, size), the columns p, P, R at t = 0.
+    columns: costates and influence functions at the nodes, (N + 1, size, 1 + q).
+    middles: values of z in the intervals, and columns at the ends of the pairs: what `reweigh` needs.
+    """
+
+    control: Array
+    cost: Array
+    duration: Array
+    start: Array
+    columns: Array
+    middles: tuple[Array, ...]
+
+
+def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
+    """Compile the sweeps.
+
+    Args:
+        statement: the problem.
+        mesh: nodes, control, integration of the cost.
+        pairs: Runge-Kutta steps of the costates in each interval.
+    """
+    terminal = terminal_conditions(statement)
+    n, count = mesh.intervals, len(terminal.names)
+    make = hamiltonian(statement)
+    curvature = make("curvature", lambda h, x, u, e, t: [ca.hessian(h, u)[0] if statement.nu else ca.DM(0, 0)])
+    given = _flat(statement, pairs, forward_costates(statement, pairs)) if statement.behind else None
+    backward = _flat(statement, pairs, backward_interval(statement, pairs, count, matrices=terminal.matrices))
+    quadrature = _flat(statement, pairs, quadrature_interval(statement, pairs, count, matrices=terminal.matrices))
+    return Sweeps(
+        statement=statement,
+        mesh=mesh,
+        pairs=pairs,
+        terminal=terminal,
+        forward=_passage(statement, mesh),
+        refine=inside_interval(statement, 2 * pairs, mesh.step, mesh.linear_solver).map(n),
+        given=None if given is None else given.mapaccum("given", n),
+        backward=backward.mapaccum("backward", n),
+        quadrature=quadrature.map(n),
+        curvature=curvature.map(n + 1),
+        terms=slope_terms(statement).map(n + 1),
+    )
+
+
+def _flat(statement: Statement, pairs: int, function: ca.Function) -> ca.Function:
+    """A function of an interval in scalar operations, where they are not too many: what is not used is not computed."""
+    if statement.symbolic is not ca.SX or pairs * statement.rates.n_instructions() > LARGEST_FLAT:
+        return function
+    return function.expand()
+
+
+def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
+    """(z(0), *common) -> z at the nodes (size, N + 1), running cost of each interval (steps 2 and 3 of appendix E)."""
+    n, nx, solver = mesh.intervals, statement.nx, mesh.linear_solver
+    start = ca.MX.sym("start", nx + statement.ne)
+    symbols = zip(COMMON, interval_symbols(statement, ca.MX), strict=True)
+    common = tuple(ca.MX.sym(name, symbol.shape[0], n) for name, symbol in symbols)
+    if not statement.behind:
+        interval = full_interval(statement, mesh.substeps, mesh.step, solver).mapaccum("passage", n)
+        ends, _, cost = interval(start, *common)
+        return ca.Function("forward", [start, *common], [ca.horzcat(start, ends), cost])
+    ends, fine, cost = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("passage", n)(start[:nx], *common)
+    x = ca.horzcat(start[:nx], ends)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common[-1][:, 0], start[nx:])
+    return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
+
+
+def terminal_conditions(statement: Statement) -> Terminal:
+    """Fixed final components and equalities at the end, with their slopes."""
+    _, final, _, matrices = statement.boundary_values(statement.values)
+    fixed = tuple(int(i) for i in np.flatnonzero(~np.isnan(np.concatenate([final, matrices]))))
+    end = statement.end
+    by_control = end.function.jac_sparsity(0, 1).row() if end.size else []
+    rows = tuple(i for i in range(end.size) if end.lower[i] == end.upper[i] and i not in by_control)
+    z = ca.MX.sym("z", statement.nx + statement.ne)
+    duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
+    behind = statement.entries(statement.behind)
+    x, e, y = z[: statement.nx], z[statement.nx :], ca.MX.sym("y", len(behind))
+    cost = statement.terminal(x, e, duration, p)
+    adjoint = cost
+    if statement.matrix_end is not None:
+        ends = statement.matrix_end(x, duration, p)
+        e = ca.MX(e)
+        e[behind] = ends
+        adjoint = statement.terminal(x, e, duration, p) - ca.dot(y, ends)
+    values = [z[list(fixed)]] if fixed else []
+    if rows:
+        values.append(end.function(x, ca.DM.zeros(statement.nu), e, duration, duration, p)[list(rows)])
+    conditions = ca.vertcat(ca.MX(0, 1), *values)
+    stacked = ca.vertcat(adjoint, conditions)
+    slopes = [ca.densify(ca.jacobian(stacked, z)).T, ca.densify(ca.jacobian(stacked, duration)).T]
+    names = (*statement.state_names, *statement.matrix_names)
+    return Terminal(
+        fixed=fixed,
+        rows=rows,
+        names=(*(f"final value of {names[i]}" for i in fixed), *(end.names[i] for i in rows)),
+        matrices=statement.coupled
+        or any(j >= statement.nx for j in ca.jacobian(conditions, z).sparsity().get_triplet()[1]),
+        function=ca.Function("terminal", [z, duration, p, y], [cost, conditions, *slopes]),
+    )
+
+
+def quadrature_interval(statement: Statement, pairs: int, influences: int, *, matrices: bool = True) -> ca.Function:
+    """Slopes of one control interval by the controls at its ends and by T, with Simpson's rule on each pair.
+
+    Between the ends of a pair the columns are cubic (values and rates at both ends).
+
+    Returns:
+        (columns at the end (size, 1 + q), columns at the starts of the pairs, z at starts, middles and ends of the
+        pairs, *common) -> slopes by the control at the start (nu, 1 + q), at the end, by T (1, 1 + q), the part of the
+        running cost alone by the control at the start (nu, 1), at the end.
+    """
+    size, width = statement.nx + statement.ne, 1 + influences
+    after, passed = ca.MX.sym("after", size, width), ca.MX.sym("passed", size, width * pairs)
+    z = ca.MX.sym("z", size, 2 * pairs + 1)
+    common = interval_symbols(statement, ca.MX)
+    points = _columnwise(_point_slopes(statement), _point_slopes(statement, cost=False, matrices=matrices))
+    rates = _columnwise(_point_rates(statement), _point_rates(statement, cost=False, matrices=matrices))
+    rest = (common[4], common[5])
+    ends = [*(passed[:, j * width : (j + 1) * width] for j in range(pairs)), after]
+    where = [part_of(common, c, c) for c in np.arange(2 * pairs + 1) / (2 * pairs)]
+    sides = [common[2] + one_sided(i / (2 * pairs)) * common[3] for i in range(2 * pairs + 1)]
+    at = [(z[:, i], place[0], sides[i], *rest) for i, place in enumerate(where)]
+    slopes = [rates(ends[j], *at[2 * j])[0] for j in range(pairs + 1)]
+    step = common[4] * common[3] / pairs
+    totals: list[Any] = [0.0] * 5
+    for i in range(2 * pairs + 1):
+        c, j = i / (2 * pairs), i // 2
+        area = (1 if i in (0, 2 * pairs) else 4 if i % 2 else 2) / (6 * pairs) * common[3]
+        columns = ends[j] if i % 2 == 0 else (ends[j] + ends[j + 1]) / 2 + step / 8 * (slopes[j] - slopes[j + 1])
+        by_control, by_duration = points(columns, *at[i])
+        by_cost = points(ca.DM.zeros(size, 1), *at[i])[0]
+        parts = ((1 - c) * by_control, c * by_control, by_duration, (1 - c) * by_cost, c * by_cost)
+        totals = [total + area * part for total, part in zip(totals, parts, strict=True)]
+    return ca.Function("quadrature", [after, passed, z, *common], totals)
+
+
+def _columnwise(first: ca.Function, others: ca.Function) -> Callable[..., list[Any]]:
+    """(columns, z, u, s, T, p) -> outputs side by side: of `first` for the first column, of `others` for the rest."""
+
+    def apply(columns: Any, *arguments: Any) -> list[Any]:
+        split = ca.horzsplit(columns)
+        outputs = [(others if k else first).call([*arguments, column]) for k, column in enumerate(split)]
+        return [ca.horzcat(*values) for values in zip(*outputs, strict=True)]
+
+    return apply
+
+
+def _point_slopes(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
+    """(z, u, s, T, p, column) -> slopes of T H(t = s T) by u and by T."""
+    arguments, value = _point(statement, cost, matrices)
+    slopes = [ca.densify(ca.gradient(arguments[3] * value, symbol)) for symbol in (arguments[1], arguments[3])]
+    return ca.Function("point_slopes", arguments, slopes)
+
+
+def _point_rates(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
+    """(z, u, s, T, p, column) -> rate of the column, -H_z."""
+    arguments, value = _point(statement, cost, matrices)
+    return ca.Function("point_rates", arguments, [ca.densify(-ca.gradient(value, arguments[0]))])
+
+
+def _point(statement: Statement, cost: bool, matrices: bool) -> tuple[list[Any], Any]:
+    """Symbols z, u, s, T, p, column, and the Hamiltonian of z and column at the time s T."""
+    symbolic: Any = statement.symbolic
+    nx, size = statement.nx, statement.nx + statement.ne
+    z, u, column = symbolic.sym("z", size), symbolic.sym("u", statement.nu), symbolic.sym("column", size)
+    s, duration, p = symbolic.sym("s"), symbolic.sym("T"), symbolic.sym("p", statement.np)
+    value = hamiltonian(statement, cost=cost, matrices=matrices)("value", lambda h, x, u, e, t: [h])
+    h = value(z[:nx], u, z[nx:], s * duration, duration, p, column[:nx], column[nx:])
+    return [z, u, s, duration, p, column], h
+
+
+def sweep_forward(sweeps: Sweeps, u: Array, duration: float, start: Array, parameters: Array) -> Run:
+    """Integrate x and E forward, S backward along them (step 2; in appendix E steps 2 and 3).
+
+    Args:
+        sweeps: compiled.
+        u: controls, (K, nu).
+        duration: T [s].
+        start: z(0), (size,); S(0) follows from the others.
+        parameters: of the statement.
+    """
+    common = common_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
+    nodes, cost = sweeps.forward(start, *common)
+    z = np.ascontiguousarray(nodes.full().T)
+    terminal, values, *_ = sweeps.terminal.function(z[-1], duration, parameters, 0.0)
+    targets = sweeps.terminal.targets(sweeps.statement, parameters)
+    return Run(
+        u=u,
+        duration=duration,
+        z=z,
+        running=float(np.sum(cost.full())),
+        terminal=float(terminal),
+        miss=np.asarray(values.full()).ravel() - targets,
+    )
+
+
+def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) -> Slopes:
+    """Integrate Y forward, p, P and R backward, and form the integrals of h_u and H_u (steps 3 to 6).
+
+    Args:
+        sweeps: compiled.
+        run: where to linearise.
+        parameters: of the statement.
+        jumps: of the costates at the nodes (N + 1, size), from the penalties; the last is added to the terminal value.
+    """
+    mesh, pairs = sweeps.mesh, sweeps.pairs
+    n, size, width = mesh.intervals, run.z.shape[1], 1 + len(sweeps.terminal.names)
+    common = common_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
+    points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+    z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
+    given, given_end = _given(sweeps, points, common)
+    _, _, last, by_duration = (
+        np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters, given_end)
+    )
+    behind = [sweeps.statement.nx + k for k in sweeps.statement.entries(sweeps.statement.behind)]
+    last[:, 0] += jumps[-1]
+    last[behind, 0] = given_end
+    order = list(range(n - 1, -1, -1))
+    stacked = [ca.DM(v[::-1].transpose(2, 0, 1).reshape(v.shape[2], n * v.shape[1])) for v in (z, given)]
+    columns = [column[:, order] for column in common]
+    starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), *stacked, *columns)
+    at_nodes = np.asarray(starts.full()).reshape(size, n, width)[:, ::-1].transpose(1, 0, 2)
+    at_pairs = np.asarray(passed.full()).reshape(size, n, pairs * width)[:, ::-1].transpose(1, 0, 2)
+    middles = (z, np.concatenate([at_nodes, last[None]]), at_pairs, by_duration.ravel())
+    return _slopes(sweeps, run.u, run.duration, parameters, middles)
+
+
+def _given(sweeps: Sweeps, points: Any, common: tuple[Any, ...]) -> tuple[Array, Array]:
+    """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
+    shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
+    if sweeps.given is None:
+        return np.zeros(shape), np.zeros(0)
+    ends, inside = sweeps.given(np.zeros(shape[2]), points, *common)
+    return np.asarray(inside.full()).T.reshape(shape), np.asarray(ends.full())[:, -1]
+
+
+def reweigh(sweeps: Sweeps, slopes: Slopes, u: Array, duration: float, parameters: Array) -> Slopes:
+    """The slopes with another control along the same z and costates: what the chord variant needs [4.2-10]."""
+    return _slopes(sweeps, u, duration, parameters, slopes.middles)
+
+
+def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middles: tuple[Array, ...]) -> Slopes:
+    z, at_nodes, at_pairs, by_duration = middles
+    n, size, width = sweeps.mesh.intervals, z.shape[2], at_nodes.shape[2]
+    nu = sweeps.statement.nu
+
+    def side_by_side(values: Array) -> Any:
+        return ca.DM(values.transpose(1, 0, 2).reshape(size, -1))
+
+    common = common_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
+    outputs = sweeps.quadrature(
+        side_by_side(at_nodes[1:]), side_by_side(at_pairs), side_by_side(z.transpose(0, 2, 1)), *common
+    )
+    first, second, by_time, cost_first, cost_second = (np.asarray(v.full()) for v in outputs)
+
+    def gather(one: Array, two: Array, count: int) -> Array:
+        """Slopes by the control values from those by both ends of the intervals, (count, K, nu)."""
+        total = np.zeros((count, sweeps.mesh.control_nodes, nu))
+        offset = int(sweeps.mesh.control == "linear")
+        total[:, :n] += one.reshape(nu, n, count).transpose(2, 1, 0)
+        total[:, offset : offset + n] += two.reshape(nu, n, count).transpose(2, 1, 0)
+        return total
+
+    return Slopes(
+        control=gather(first, second, width),
+        cost=gather(cost_first, cost_second, 1)[0],
+        duration=by_duration + by_time.reshape(n, width).sum(axis=0),
+        start=at_nodes[0].T,
+        columns=at_nodes,
+        middles=middles,
+    )
+
+
+def control_curvature(sweeps: Sweeps, run: Run, u: Array, columns: Array, ell: Array, parameters: Array) -> Array:
+    """H_uu at the nodes, (N + 1, nu, nu), with the costates p + R l, P + R_E l."""
+    st, n = sweeps.statement, sweeps.mesh.intervals
+    costates = columns[:, :, 0] + columns[:, :, 1:] @ ell
+    values = sweeps.curvature(*_at_nodes(sweeps, run, u, costates, parameters))
+    return np.asarray(values.full()).reshape(st.nu, n + 1, st.nu).transpose(1, 0, 2)
+
+
+def control_sizes(sweeps: Sweeps, run: Run, columns: Array, ell: Array, parameters: Array) -> Array:
+    """Sizes of H_u at the nodes, (N + 1, nu), where p, P and every R l count apart."""
+    costates = np.abs(columns[:, :, 0]) + np.abs(columns[:, :, 1:]) @ np.abs(ell)
+    terms = np.asarray(sweeps.terms(*_at_nodes(sweeps, run, run.u, costates, parameters)).full()).T
+    curvature = control_curvature(sweeps, run, run.u, columns, ell, parameters)
+    return slope_sizes(terms, curvature, controls_at_nodes(run.u, sweeps.mesh.intervals))
+
+
+def _at_nodes(sweeps: Sweeps, run: Run, u: Array, costates: Array, parameters: Array) -> tuple[Array, ...]:
+    """The arguments of the Hamiltonian at the nodes, a column each."""
+    nx, n = sweeps.statement.nx, sweeps.mesh.intervals
+    return (
+        run.z[:, :nx].T,
+        controls_at_nodes(u, n).T,
+        run.z[:, nx:].T,
+        (sweeps.mesh.nodes * run.duration)[None, :],
+        np.full((1, n + 1), run.duration),
+        np.tile(parameters[:, None], (1, n + 1)),
+        costates[:, :nx].T,
+        costates[:, nx:].T,
+    )
+
+
+def controls_at_nodes(u: Array, intervals: int) -> Array:
+    """Controls at all N + 1 nodes."""
+    return u if u.shape[0] == intervals + 1 else np.vstack([u, u[-1:]])

@@ -1,0 +1,144 @@
+"""Half-vectors: packing and unpacking are inverse, symbolic and numeric agree, and traces become products."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from covocp.base.matrices import (
+    half_indices,
+    half_length,
+    is_semidefinite,
+    pack,
+    pack_costate,
+    pack_symbolic,
+    smallest_eigenvalue,
+    unpack,
+    unpack_costate,
+    unpack_indices,
+    unpack_symbolic,
+)
+
+SIZES = st.integers(1, 6)
+ENTRIES = st.floats(-1e3, 1e3, allow_nan=False).map(lambda v: round(v, 6))
+repeatable = settings(derandomize=True, deadline=None, max_examples=60)
+
+
+def squares(lead=()):
+    return SIZES.flatmap(lambda n: arrays(float, (*lead, n, n), elements=ENTRIES))
+
+
+def symmetric(lead=()):
+    return squares(lead).map(lambda a: a + np.swapaxes(a, -1, -2))
+
+
+@repeatable
+@given(symmetric(lead=(3,)))
+def test_packing_is_invertible(matrices):
+    half = pack(matrices)
+    n = matrices.shape[-1]
+    assert half.shape == (3, n * (n + 1) // 2)
+    np.testing.assert_array_equal(unpack(half, n), matrices)
+
+
+@repeatable
+@given(squares())
+def test_packing_takes_the_symmetric_part(matrix):
+    np.testing.assert_allclose(unpack(pack(matrix), len(matrix)), (matrix + matrix.T) / 2, rtol=1e-15, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", range(1, 7))
+def test_order_of_the_half_vector(size):
+    """Column by column of the lower triangle: (0,0), (1,0), ..., (n-1,0), (1,1), ..."""
+    order = [(i, j) for j in range(size) for i in range(j, size)]
+    rows, columns = half_indices(size)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == order
+    assert half_length(size) == len(order)
+    positions = unpack_indices(size)
+    for k, (i, j) in enumerate(order):
+        assert positions[i, j] == positions[j, i] == k
+
+
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+@repeatable
+@given(squares())
+def test_symbolic_agrees_with_numeric(kind, matrix):
+    n = len(matrix)
+    symbol, half = kind.sym("A", n, n), kind.sym("h", half_length(n))
+    packed = ca.Function("pack", [symbol], [pack_symbolic(symbol)])(matrix)
+    np.testing.assert_allclose(packed.full().ravel(), pack(matrix), rtol=1e-15, atol=1e-12)
+    full = ca.Function("unpack", [half], [unpack_symbolic(half, n)])(pack(matrix))
+    np.testing.assert_array_equal(full.full(), unpack(pack(matrix), n))
+
+
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+def test_packing_of_sparse_expressions(kind):
+    d = kind.sym("d", 3)
+    packed = ca.Function("pack", [d], [pack_symbolic(ca.diag(d))])([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(packed.full().ravel(), [1, 0, 0, 2, 0, 3])
+
+
+@repeatable
+@given(SIZES.flatmap(lambda n: arrays(float, (2, n, n), elements=ENTRIES)))
+def test_trace_is_the_product_of_half_vectors(pair):
+    """tr(P V) = costate of the half-vector times half-vector: the off-diagonal costate is 2 P_ij."""
+    P, V = (a + a.T for a in pair)
+    np.testing.assert_allclose(pack_costate(P) @ pack(V), np.trace(P @ V), rtol=1e-12, atol=1e-6)
+    np.testing.assert_array_equal(unpack_costate(pack_costate(P), len(P)), P)
+
+
+def test_costate_is_the_slope_of_the_packed_entry():
+    """d tr(C E) / dE_12 as an entry of the half-vector, by finite difference, is 2 C_12."""
+    C, E = np.array([[1.0, 0.3], [0.3, 2.0]]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    slopes = []
+    for k in range(3):
+        moved = pack(E)
+        moved[k] += 1e-6
+        slopes.append((np.trace(C @ unpack(moved, 2)) - np.trace(C @ E)) / 1e-6)
+    np.testing.assert_allclose(slopes, pack_costate(C), rtol=1e-8)
+
+
+@repeatable
+@given(symmetric(lead=(4,)))
+def test_smallest_eigenvalue(matrices):
+    shift = smallest_eigenvalue(matrices)
+    n = matrices.shape[-1]
+    least = min(np.linalg.eigvals(m).real.min() for m in matrices)
+    assert shift == pytest.approx(least, rel=1e-9, abs=1e-6)
+    # the quadratic form is never below the smallest eigenvalue
+    vectors = np.random.default_rng(0).standard_normal((20, n))
+    forms = np.einsum("vi,kij,vj->kv", vectors, matrices, vectors) / (vectors**2).sum(axis=1)
+    assert (forms >= shift - 1e-6).all()
+
+
+@repeatable
+@given(squares(lead=(2,)))
+def test_squares_are_semidefinite(factors):
+    matrices = factors @ np.swapaxes(factors, -1, -2)
+    assert is_semidefinite(matrices)
+    n = matrices.shape[-1]
+    largest = np.linalg.norm(matrices, axis=(-2, -1)).max()
+    assert not is_semidefinite(matrices - (1e-3 + 2 * largest) * np.eye(n))
+
+
+def test_eigenvalues_of_nothing_and_of_nan():
+    assert smallest_eigenvalue(np.zeros((0, 2, 2))) == np.inf
+    assert smallest_eigenvalue(np.full((1, 2, 2), np.nan)) == -np.inf
+    assert is_semidefinite(np.zeros((0, 2, 2)))
+    assert is_semidefinite(np.zeros((3, 2, 2)))
+    assert not is_semidefinite(np.full((1, 2, 2), np.nan))
+    assert not is_semidefinite(np.full((1, 2, 2), np.inf))
+
+
+def test_roundoff_is_forgiven_but_not_more():
+    matrix = np.diag([1.0, -1e-12])
+    assert is_semidefinite(matrix)
+    assert not is_semidefinite(np.diag([1.0, -1e-6]))
+
+
+def test_one_indefinite_matrix_among_many():
+    assert not is_semidefinite(np.stack([np.eye(2), np.diag([1.0, -0.1]), np.eye(2)]))

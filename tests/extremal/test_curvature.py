@@ -1,0 +1,191 @@
+"""The sign of the reduced Hessian against closed forms and an NLP written out: active constraints, unstable plants."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import eigh, null_space
+
+import covocp as co
+from covocp.extremal.curvature import mass_matrix, smallest_curvature
+from covocp.transcription.trajectory import Multipliers
+
+
+def solve(problem, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return co.solve(problem, progress=False, **options)
+
+
+def at_rest(problem, intervals, **options):
+    """Everything zero, without multipliers: stationary for the problems below."""
+    solution = co.solve(
+        problem, intervals=intervals, max_iterations=0, allow_failure=True, progress=False, **options
+    ).extremal
+    t = solution.trajectory
+    still = replace(t, x=np.zeros_like(t.x), u=np.zeros_like(t.u))
+    return replace(solution, trajectory=still, multipliers=Multipliers.zero(solution.statement, solution.mesh))
+
+
+def quadratic(a, c, duration, *, final=0.0, lower=-np.inf, beside=False):
+    """x' = a x + u, J = int (u^2 - c x^2)/2: u = 0 is stationary; beside it a cart that runs into a wall."""
+    ocp = co.Problem(duration=duration)
+    x, u = ocp.state("x", initial=0.0, final=final), ocp.control("u", lower=lower, guess=lambda s: 0 * s)
+    ocp.dynamics(x, a * x + u)
+    cost = 0.5 * u**2 - 0.5 * c * x**2
+    if beside:
+        y = ocp.state("y", initial=0.0, final=0.0, upper=0.1)
+        v = ocp.control("v", guess=lambda s: 0 * s)
+        ocp.dynamics(y, v)
+        cost += 0.5 * (v - 1.0 + 2.0 * ocp.time / duration) ** 2
+    ocp.minimize(running=cost)
+    return ocp
+
+
+@pytest.mark.parametrize("control", ["linear", "constant"])
+@pytest.mark.parametrize(("a", "duration"), [(0.0, 2.0), (4.0, 8.0), (-1.0, 5.0)])
+def test_conjugate_point_of_a_plant_that_may_be_unstable(a, duration, control):
+    """With x = 0 at both ends the second variation is int x'^2 + (a^2 - c) x^2: positive iff c < a^2 + (pi/T)^2."""
+    limit = a**2 + (np.pi / duration) ** 2
+    verdicts = [
+        smallest_curvature(at_rest(quadratic(a, share * limit, duration), 120, control=control)).verdict
+        for share in (0.97, 1.03)
+    ]
+    assert verdicts == ["minimum", "saddle"]
+
+
+@pytest.mark.parametrize(("a", "duration"), [(2.0, 8.0), (6.0, 8.0)])
+def test_a_convex_problem_of_an_unstable_plant_has_a_minimum(a, duration):
+    ocp = co.Problem(duration=duration)
+    x = ocp.state("x", 2, initial=[1.0, 0.0], final=[0.5, 0.0], guess=0.5)
+    u = ocp.control("u", guess=lambda s: 0 * s)
+    ocp.dynamics(x, ca.vertcat(x[1], a * a * x[0] + u))
+    ocp.minimize(running=0.5 * u**2 + 0.5 * ca.sumsqr(x))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)  # the mesh is coarse for this plant
+        solution = co.solve(ocp, intervals=100, progress=False)
+    assert smallest_curvature(solution.extremal).verdict == "minimum"
+
+
+@pytest.mark.parametrize("points", [1, 2])
+@pytest.mark.parametrize(("share", "verdict"), [(0.9, "minimum"), (1.1, "saddle")])
+def test_a_saddle_beside_an_active_state_bound_is_told(share, verdict, points):
+    problem = quadratic(0.0, share * np.pi**2, 1.0, beside=True)
+    solution = solve(problem, intervals=40, tolerance=1e-9, points=points)
+    assert np.ptp(np.flatnonzero(solution["y"] > 0.0999)) > 3  # it rests at the wall
+    extremal = solution.extremal
+    x = extremal.trajectory.x.copy()
+    x[:, 0] = 0.0
+    assert smallest_curvature(replace(extremal, trajectory=replace(extremal.trajectory, x=x))).verdict == verdict
+
+
+def test_bounds_that_only_just_hold_leave_the_directions_they_allow():
+    """u >= 0 at u = 0: with x(T) free one may push, and gains where c > (pi/2T)^2; with x(T) = 0 nothing may move."""
+    limit = (np.pi / 2) ** 2
+    pushed = [
+        smallest_curvature(at_rest(quadratic(0.0, s * limit, 1.0, final=None, lower=0.0), 30)) for s in (0.9, 1.1)
+    ]
+    assert [found.verdict for found in pushed] == ["minimum", "saddle"]
+    assert (pushed[1].direction >= -1e-9).all()
+    held = smallest_curvature(at_rest(quadratic(0.0, 40.0, 1.0, lower=0.0), 30))
+    assert (held.value, held.verdict) == (np.inf, "minimum")  # no direction is left
+
+
+@pytest.mark.parametrize(("bound", "points"), [(0.9, 1), (0.5, 1), (0.5, 3)])
+def test_information_under_a_state_bound_is_no_false_alarm(bound, points):
+    """The last state is at its bound as well, whose multiplier is that of the terminal state."""
+    ocp = co.Problem(5.0)
+    x = ocp.state("x", initial=0.0, lower=-bound, upper=bound)
+    a = ocp.unknown("a", mean=1.0, variance=1.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, -a * x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(terminal=E[a, a])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)  # between the points the lower bound is passed
+        solution = co.solve(ocp, intervals=50, points=points, progress=False)
+    assert "NOT A MINIMUM" not in str(solution)
+    curvature = solution.optimality.curvature  # None at a vertex: limits leave no direction
+    assert curvature is None or curvature >= 0.0
+
+
+def oscillator(running):
+    ocp = co.Problem(duration=4.0)
+    x, u = ocp.state("x", 2, initial=[0.0, 1.0], final=[None, 0.2]), ocp.control("u", guess=lambda s: 0 * s)
+    ocp.dynamics(x, rate(x, u))
+    ocp.subject_to(x[0] + 0.1 * x[1] ** 2, upper=0.45, name="wall")
+    ocp.minimize(running=running(x, u))
+    return ocp
+
+
+def rate(x, u):
+    return ca.vertcat(x[1], (1 - x[0] ** 2) * x[1] - x[0] + u)
+
+
+def test_curvature_is_that_of_the_exact_hessian_of_an_nlp_written_out():
+    """Van der Pol's oscillator along a wall: single shooting, exact Hessian, dense null space of what is active."""
+    running = lambda x, u: 0.5 * u**2 + 0.3 * ca.cos(2 * x[0]) + 0.1 * x[1] ** 2  # noqa: E731
+    solution = solve(oscillator(running), intervals=20, substeps=4, tolerance=1e-9)
+    n, m, h = 20, 4, 4.0 / 20 / 4
+    u, state, cost, walls = ca.SX.sym("u", n + 1), ca.SX([0.0, 1.0]), 0, [ca.SX(0.1)]
+
+    def flow(z, w):
+        return ca.vertcat(rate(z[:2], w), running(z[:2], w))
+
+    for k in range(n):
+        z = ca.vertcat(state, cost)
+        for j in range(m):
+            ua, um, ub = (u[k] + (j + c) / m * (u[k + 1] - u[k]) for c in (0.0, 0.5, 1.0))
+            k1 = flow(z, ua)
+            k2 = flow(z + h / 2 * k1, um)
+            k3 = flow(z + h / 2 * k2, um)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(z + h * k3, ub))
+        state, cost = z[:2], z[2]
+        walls.append(state[0] + 0.1 * state[1] ** 2)
+    wall = ca.vertcat(*walls)
+    weights = solution.multiplier("wall")
+    active = np.flatnonzero(weights > 1e-4 * weights.max()).tolist()
+    assert active
+    value = cost + solution.multipliers.final[1] * state[1] + ca.dot(ca.DM(weights), wall)
+    hessian, slope = ca.hessian(value, u)
+    rows = ca.jacobian(ca.vertcat(state[1], wall[active]), u)
+    H, g, J = (np.asarray(v.full()) for v in ca.Function("nlp", [u], [hessian, slope, ca.densify(rows)])(solution["u"]))
+    assert np.abs(g).max() < 1e-6
+    basis = null_space(J)
+    M = mass_matrix(solution.mesh, 4.0, 1)
+    exact = eigh(basis.T @ H @ basis, basis.T @ M @ basis, eigvals_only=True)
+    found = smallest_curvature(solution.extremal)
+    assert found.value == pytest.approx(exact[0], rel=1e-4)
+    assert found.largest == pytest.approx(max(abs(exact)), rel=1e-3)
+
+
+def test_a_direction_without_curvature_is_called_flat():
+    """Two controls that do the same: their difference costs nothing."""
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u", 2, guess=lambda s: np.zeros((s.size, 2)))
+    ocp.dynamics(x, u[0] + u[1])
+    ocp.minimize(running=0.5 * (u[0] + u[1]) ** 2)
+    solution = solve(ocp, intervals=10)
+    assert smallest_curvature(solution.extremal).verdict == "flat"
+    assert solution.optimality.curvature == 0.0
+    assert "flat" in str(solution)
+
+
+def test_a_free_initial_state_counts():
+    """J = int x^2/2 - x(0)^2/2 with x' = u, u^2/2: x(0) = 0 is a saddle, because a constant x gains for T < 1."""
+    verdicts = []
+    for duration in (0.5, 2.0):
+        ocp = co.Problem(duration=duration)
+        x, u = ocp.state("x", initial=None, guess=0.0), ocp.control("u", guess=lambda s: 0 * s)
+        y = ocp.state("y", initial=None, guess=0.0)
+        ocp.dynamics(x, u)
+        ocp.dynamics(y, 0 * u)
+        ocp.subject_to(y - x, lower=0.0, upper=0.0, at="initial")
+        ocp.minimize(running=0.5 * x**2 + 50.0 * u**2, terminal=-0.5 * y**2)
+        verdicts.append(smallest_curvature(at_rest(ocp, 20)).verdict)
+    assert verdicts == ["saddle", "minimum"]

@@ -1,0 +1,226 @@
+"""The reported residuals of the necessary conditions: small at a solution, of the order they claim, and not blind."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from certificates import lag_hamiltonian
+from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, solve
+
+import covocp as co
+from covocp.base.krylov import krylov
+from covocp.extremal.curvature import smallest_curvature
+from covocp.models import brachistochrone, bryson_denham, free_time_integrator, mass_chain, noisy_integrator
+
+FORMULATIONS = ("eliminated", "states")
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("control", ["linear", "constant"])
+def test_residuals_of_a_solution(formulation, control):
+    optimality = solve(lag().problem, covariances=formulation, control=control, intervals=50).optimality
+    assert optimality.stationarity < 1e-5
+    assert optimality.costate_difference < 1e-3
+    assert optimality.curvature > 1e-3
+    assert optimality.transversality is None
+    assert 0 < optimality.mesh_error < 1e-5
+    assert optimality.smallest_eigenvalue > 0.1
+    if control == "linear":
+        assert optimality.hamiltonian_variation < 1e-3
+        assert optimality.control_slope < 2e-3
+
+
+def test_residuals_of_the_chain():
+    optimality = solve(mass_chain.problem(2), intervals=80).optimality
+    assert optimality.stationarity < 1e-5
+    assert optimality.costate_difference < 1e-2
+    assert optimality.hamiltonian_variation < 1e-3
+
+
+@pytest.mark.parametrize("final", [0.0, 1.0])
+def test_mesh_error_estimates_the_mesh_error(final):
+    """Against the true error of the integration: the cost of the same mesh with many substeps."""
+    for intervals in (20, 40):
+        problem = lag(10.0, final).problem
+        solution = solve(problem, intervals=intervals)
+        fine = solve(problem, intervals=intervals, substeps=8).cost
+        assert solution.mesh_error == pytest.approx(abs(fine - solution.cost) / fine, rel=0.35)
+
+
+@pytest.mark.parametrize(("control", "intervals"), [("constant", 20), ("linear", 5)])
+def test_control_error_estimates_the_error_of_the_control(control, intervals):
+    """The noisy integrator is integrated exactly, so that the error of the cost is that of the control's form."""
+    solution = solve(noisy_integrator.problem(0.0, 1.0), control=control, intervals=intervals, tolerance=1e-11)
+    truth = (solution.cost - 59 / 90) / (59 / 90)
+    assert solution.optimality.control_error == pytest.approx(truth, rel=0.1)
+
+
+def test_residuals_shrink_with_the_mesh():
+    counts, slopes, variations, differences = [20, 40, 80], [], [], []
+    for n in counts:
+        optimality = solve(lag().problem, intervals=n, substeps=1, tolerance=1e-10).optimality
+        slopes.append(optimality.control_slope)
+        variations.append(optimality.hamiltonian_variation)
+        differences.append(optimality.costate_difference)
+    assert order(counts, slopes) > 1.7
+    assert order(counts, variations) > 2.0
+    assert order(counts, differences) > 3.0
+
+
+def test_reported_hamiltonian_variation():
+    """Against H written out."""
+    solution = solve(lag().problem, intervals=50)
+    values = lag_hamiltonian(solution)
+    p, u, x = solution.costate("x"), solution["u"], solution["x"]
+    size = np.abs(p * (-x + u)).max()
+    reported = solution.optimality.hamiltonian_variation
+    assert np.ptp(values) / (10 * size) < reported < 10 * np.ptp(values) / size
+
+
+def test_explicit_time_has_no_constant_hamiltonian():
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u * ca.exp(ocp.time))
+    ocp.minimize(running=0.5 * u**2)
+    assert solve(ocp, intervals=20).optimality.hamiltonian_variation is None
+
+
+@pytest.mark.parametrize("w", [1.0, 0.2])
+def test_transversality_vanishes(w):
+    """The control is linear in time, and so exact."""
+    assert solve(free_time_integrator.problem(w), intervals=10, tolerance=1e-9).optimality.transversality < 1e-7
+
+
+def test_an_iterate_is_not_optimal():
+    solution = solve(lag().problem, max_iterations=2, allow_failure=True, intervals=30)
+    assert solution.optimality.stationarity > 1e-3
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_curvature_is_negative_at_the_saddle(formulation):
+    """u = 0 of 5.2 above the weight 0.0459816, positive below it."""
+    signs = []
+    for weight in (0.045, 0.047, 10.0):
+        solution = solve(
+            lag(weight, 0.0, guess=np.zeros(51)).problem,
+            covariances=formulation,
+            intervals=50,
+            max_iterations=0,
+            allow_failure=True,
+        )
+        np.testing.assert_allclose(solution["u"], 0, atol=1e-9)
+        signs.append(np.sign(solution.optimality.curvature))
+    assert signs == [1, -1, -1]
+
+
+def test_curvature_at_the_saddle_is_that_of_the_closed_form():
+    """J = C22/(1/5 + 2 lambda energy) + energy with energy = a^2/2 along the eigenfunction: J'' = 1 - 50 lambda C22."""
+    for weight in (0.02, 1.0):
+        problem = lag(weight, 0.0, guess=np.zeros(80)).problem
+        options = {"control": "constant", "intervals": 80, "max_iterations": 0, "allow_failure": True}
+        curvature = smallest_curvature(solve(problem, **options).extremal)
+        expected = 1 - 50 * LAG_EIGENVALUE * weight
+        assert curvature.value == pytest.approx(expected, abs=2e-3 * 50 * weight)
+
+
+def test_lanczos_finds_extreme_eigenvalues():
+    generator = np.random.default_rng(3)
+    vectors = np.linalg.qr(generator.standard_normal((80, 80)))[0]
+    values = np.concatenate([[-2.0], np.linspace(0.9, 1.1, 78), [5.0]])
+    matrix = vectors @ np.diag(values) @ vectors.T
+    found = krylov(
+        lambda v: matrix @ v,
+        generator.standard_normal(80),
+        60,
+        lambda value, residual, largest: residual < 1e-6 * largest,
+    )
+    assert found.asymmetry < 1e-12
+    right = generator.standard_normal(80)
+    solved = krylov(lambda v: matrix @ v, right, 60, lambda *_: False).inverse_form(
+        3.0, float(np.linalg.norm(right)), -2.0
+    )
+    assert solved == pytest.approx(right @ np.linalg.solve(matrix + 3.0 * np.eye(80), right), rel=1e-9)
+    assert found.values[0] == pytest.approx(-2.0, abs=1e-8)
+    assert found.values[-1] == pytest.approx(5.0, abs=1e-8)
+    assert abs(found.vectors[:, 0] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_state_bound_counts_in_the_residuals():
+    solution = solve(bryson_denham.problem(0.2), intervals=50)
+    assert solution.optimality.stationarity < 1e-6
+    assert solution.optimality.costate_difference < 1e-6
+
+
+def test_covariance_steps_that_explode_are_refused_by_name():
+    """rk4 far beyond its stability: the covariance of the first guess already leaves the range of numbers."""
+    problem = lag(10.0, 1.0, noise=1e-3).problem
+    with pytest.raises(co.ProblemError, match="covariance_step='gauss'"):
+        solve(problem, covariance_step="rk4", substeps=1, intervals=40, max_iterations=60, allow_failure=True)
+
+
+def test_substeps_follow_the_stiffness():
+    """Chosen for rk4 where it would explode otherwise; 5.2 with U = 1e-3 then costs what gauss finds."""
+    solution = solve(lag(10.0, 0.0, noise=1e-3).problem, covariance_step="rk4", intervals=400)
+    assert solution.mesh.substeps > 1
+    assert solution.cost == pytest.approx(4.5802190, rel=1e-6)
+
+
+def test_printing():
+    text = str(solve(lag().problem, intervals=20).optimality)
+    for word in ("stationarity", "curvature", "mesh error"):
+        assert word in text
+
+
+def test_cost_is_the_sum_of_its_terms():
+    solution = solve(lag().problem)
+    E22 = solution["E"][-1, 1, 1]
+    u, t = solution["u"], solution.t
+    energy = np.sum((u[1:] ** 2 + u[1:] * u[:-1] + u[:-1] ** 2) / 6 * np.diff(t))
+    assert solution.cost_terms["terminal"] == pytest.approx(10 * E22, rel=1e-10)
+    assert solution.cost_terms["running"] == pytest.approx(energy, rel=1e-10)
+    assert solution.cost == pytest.approx(LAG_COSTS[1.0, 10.0], rel=1e-6)
+
+
+def test_a_cost_of_zero_is_no_coarse_mesh():
+    """A decay followed exactly costs nothing; roundoff is no share of that."""
+    ocp = co.Problem(duration=1.0)
+    x = ocp.state("x", initial=None)
+    ocp.dynamics(x, -x)
+    ocp.minimize(terminal=(x - 1.0) ** 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", co.CovocpWarning)
+        solution = co.solve(ocp, intervals=20, progress=False)
+    assert solution["x"][0] == pytest.approx(np.e, rel=1e-6)
+    assert solution.mesh_error < 1e-8
+
+
+@pytest.mark.parametrize("method", ["ipopt", "gradient"])
+@pytest.mark.parametrize("dynamics", ["one term", "decaying term", "terms of the costates"])
+def test_slope_has_a_size_without_a_running_cost(method, dynamics):
+    """H_u = p' f_u alone: it vanishes at the optimum, and is no measure of itself."""
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    if dynamics == "terms of the costates":  # u = 1
+        y = ocp.state("y", initial=0.0, final=1.0)
+        ocp.dynamics(y, u)
+        ocp.dynamics(x, u**2)
+        ocp.minimize(terminal=x)
+        cost = 1.0
+    else:  # u = 1/2
+        decay = 0.3 if dynamics == "decaying term" else 0.0
+        ocp.dynamics(x, u - u**2 - decay * x)
+        ocp.minimize(terminal=-x)
+        cost = -0.25 * (1 - np.exp(-decay)) / decay if decay else -0.25
+    solution = solve(ocp, method=method, intervals=20)
+    assert solution.cost == pytest.approx(cost, rel=1e-7)
+    assert solution.optimality.stationarity < 1e-5
+    off = replace(solution, trajectory=replace(solution.trajectory, u=1.1 * solution["u"][:, None]))
+    assert off.optimality.stationarity > 1e-2
+
+
+def test_minimum_time_by_the_gradient_method_is_stationary():
+    assert solve(brachistochrone.problem(), method="gradient", intervals=50).optimality.stationarity < 1e-5
