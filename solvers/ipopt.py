@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
@@ -166,12 +166,10 @@ def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: An
     """Refuse a plugin that is not there, and options that mean nothing to it."""
     if not ca.has_nlpsol(plugin):
         raise ProblemError(
-            describe(
-                "The NLP plugin is not there.",
-                expected="a plugin of this CasADi, such as 'ipopt' or 'sqpmethod'",
-                received=repr(plugin),
-                remedy="correct plugin=, or install a CasADi that has it",
-            )
+            "The NLP plugin is not there.",
+            expected="a plugin of this CasADi, such as 'ipopt' or 'sqpmethod'",
+            received=repr(plugin),
+            remedy="correct plugin=, or install a CasADi that has it",
         )
     given = {
         "tolerance": tolerance,
@@ -185,12 +183,10 @@ def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: An
 
 def _option_error(name: str, expected: str, received: Any) -> ProblemError:
     return ProblemError(
-        describe(
-            f"The option '{name}' has a value that does not apply.",
-            expected=expected,
-            received=repr(received),
-            remedy=f"correct {name}=",
-        )
+        f"The option '{name}' has a value that does not apply.",
+        expected=expected,
+        received=repr(received),
+        remedy=f"correct {name}=",
     )
 
 
@@ -439,12 +435,10 @@ class ShootingSolver:
             return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
         except RuntimeError as error:
             raise ProblemError(
-                describe(
-                    f"The NLP plugin '{self._plugin}' refuses its settings.",
-                    expected="options that it has, in plugin_options; a C compiler where compile=True",
-                    received=str(error).strip().splitlines()[-1],
-                    remedy="correct plugin_options=, or leave compile= out",
-                )
+                f"The NLP plugin '{self._plugin}' refuses its settings.",
+                expected="options that it has, in plugin_options; a C compiler where compile=True",
+                received=str(error).strip().splitlines()[-1],
+                remedy="correct plugin_options=, or leave compile= out",
             ) from error
 
     def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Array) -> float:

@@ -33,7 +33,7 @@ from scipy.sparse.linalg import splu
 
 from covocp.base.arguments import checked, one_of, positive, share, whole
 from covocp.base.checks import as_number
-from covocp.base.errors import OutsideDomainError, ProblemError, describe, shown
+from covocp.base.errors import OutsideDomainError, ProblemError, shown
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Extremal, Guess, Outcome
@@ -157,12 +157,10 @@ def _definite(values: Array) -> bool:
 
 def _option_error(name: str, expected: str, received: Any) -> ProblemError:
     return ProblemError(
-        describe(
-            f"The option '{name}' of the gradient method has an unknown value.",
-            expected=expected,
-            received=shown(received),
-            remedy=f"correct {name}=",
-        )
+        f"The option '{name}' of the gradient method has an unknown value.",
+        expected=expected,
+        received=shown(received),
+        remedy=f"correct {name}=",
     )
 
 
@@ -190,12 +188,10 @@ class GradientSolver:
             check_costs(self._trajectory(current), current.run.running, current.run.terminal)
         if not current.run.finite:
             raise OutsideDomainError(
-                describe(
-                    "The trajectory of the first control is NaN or inf.",
-                    expected="a first control along which the model stays in its domain",
-                    received="a forward integration that diverges",
-                    remedy="give another guess of the controls, more intervals, or use method='ipopt'",
-                )
+                "The trajectory of the first control is NaN or inf.",
+                expected="a first control along which the model stays in its domain",
+                received="a forward integration that diverges",
+                remedy="give another guess of the controls, more intervals, or use method='ipopt'",
             )
         search = Search(space, self._settings, progress)
         current, measures, message, converged = search.run(current)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
@@ -190,16 +190,14 @@ class Search:
         names = [n for n, v in zip(space.sweeps.terminal.names, hopeless, strict=True) if v > 1e-6]
         if names:
             raise ProblemError(
-                describe(
-                    "Terminal conditions cannot be met: the controls have no influence on " + ", ".join(names) + ".",
-                    expected="D = int H_u H_u' dt invertible: influence functions of the terminal conditions that are "
-                    "linearly independent",
-                    received="a miss of "
-                    + ", ".join(
-                        f"{m:.4g} ({n})" for n, m in zip(space.sweeps.terminal.names, current.run.miss, strict=True)
-                    ),
-                    remedy="free one of these final values, or start where the controls act on them",
-                )
+                "Terminal conditions cannot be met: the controls have no influence on " + ", ".join(names) + ".",
+                expected="D = int H_u H_u' dt invertible: influence functions of the terminal conditions that are "
+                "linearly independent",
+                received="a miss of "
+                + ", ".join(
+                    f"{m:.4g} ({n})" for n, m in zip(space.sweeps.terminal.names, current.run.miss, strict=True)
+                ),
+                remedy="free one of these final values, or start where the controls act on them",
             )
 
     def _probe(self, current: Iterate, linear: Linear, ell: Array) -> None:

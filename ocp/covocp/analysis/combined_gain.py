@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.checks import check_kind
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.curvature import held_jacobian, mass_matrix
@@ -101,12 +101,10 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
     if problem.expected is None or problem.expected.gain is not None:
         raise ProblemError(
-            describe(
-                "worth() compares the classical with the combined design.",
-                expected="a problem with minimize_expected() and the best gain",
-                received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
-                remedy="compare solutions by their costs instead",
-            )
+            "worth() compares the classical with the combined design.",
+            expected="a problem with minimize_expected() and the best gain",
+            received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
+            remedy="compare solutions by their costs instead",
         )
     if nominal is None:
         classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)

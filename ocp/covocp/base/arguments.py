@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe, shown
+from covocp.base.errors import ProblemError, shown
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -66,12 +66,10 @@ def check_argument(owner: str, name: str, kind: Kind, value: Any) -> None:
     expected = kind(value)
     if expected:
         raise ProblemError(
-            describe(
-                f"The option '{name}' of {owner} has a value that does not apply.",
-                expected=expected,
-                received=shown(value),
-                remedy=f"correct {name}=",
-            )
+            f"The option '{name}' of {owner} has a value that does not apply.",
+            expected=expected,
+            received=shown(value),
+            remedy=f"correct {name}=",
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from covocp.base.arguments import is_number
 from covocp.base.arguments import is_whole as is_whole
-from covocp.base.errors import ProblemError, describe, kind_and_name, shown, spelling
+from covocp.base.errors import ProblemError, kind_and_name, shown, spelling
 from covocp.base.matrices import Array, pack_symbolic, real_numbers
 
 # Components of a symbol that still make a matrix that fits into a memory.
@@ -47,12 +47,10 @@ def check_kind(value: Any, kind: type, remedy: str) -> None:
     """
     if not isinstance(value, kind):
         raise ProblemError(
-            describe(
-                f"This is not a {kind.__name__.lower()}.",
-                expected=f"a {kind.__name__}",
-                received=kind_and_name(value),
-                remedy=remedy,
-            )
+            f"This is not a {kind.__name__.lower()}.",
+            expected=f"a {kind.__name__}",
+            received=kind_and_name(value),
+            remedy=remedy,
         )
 
 
@@ -60,23 +58,19 @@ def as_number(name: str, what: str, value: Any) -> Array:
     """The value as an array of floats, or an error that names the symbol."""
     if isinstance(value, (ca.SX, ca.MX)):
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' is a symbol.",
-                expected="numbers",
-                received=str(value),
-                remedy="give numbers here" + ("; a bound that varies is a subject_to()" if "bound" in what else ""),
-            )
+            f"The {what} of '{name}' is a symbol.",
+            expected="numbers",
+            received=str(value),
+            remedy="give numbers here" + ("; a bound that varies is a subject_to()" if "bound" in what else ""),
         )
     try:
         return real_numbers(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' is not a number.",
-                expected="a number or an array of numbers",
-                received=shown(value, 200),
-                remedy=f"check the {what} of '{name}'",
-            )
+            f"The {what} of '{name}' is not a number.",
+            expected="a number or an array of numbers",
+            received=shown(value, 200),
+            remedy=f"check the {what} of '{name}'",
         ) from error
 
 
@@ -94,12 +88,10 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
     numbers = numbers.reshape(size)
     if (not nan and np.isnan(numbers).any()) or (not inf and np.isinf(numbers).any()):
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' contains NaN or inf.",
-                expected="finite numbers" + (" (None: free)" if nan else ""),
-                received=str(numbers),
-                remedy=f"correct the {what} of '{name}'",
-            )
+            f"The {what} of '{name}' contains NaN or inf.",
+            expected="finite numbers" + (" (None: free)" if nan else ""),
+            received=str(numbers),
+            remedy=f"correct the {what} of '{name}'",
         )
     return numbers
 
@@ -180,12 +172,10 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
     if np.isfinite(numbers).all() and (difference > 1e-9 * np.abs(numbers).max(initial=0.0)).any():
         i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' is not symmetric.",
-                expected="a symmetric matrix",
-                received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
-                remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
-            )
+            f"The {what} of '{name}' is not symmetric.",
+            expected="a symmetric matrix",
+            received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
+            remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
         )
 
 
@@ -210,13 +200,11 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
         matrix = f"a symmetric positive {'definite' if definite else 'semidefinite'} matrix"
         text = np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12)
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' {problem}.",
-                expected=number if scalar else matrix,
-                received=f"{float(numbers.item()):g}" if scalar else text,
-                remedy=f"check the {what} given for '{name}'"
-                + (": every measurement needs some noise" if definite and "noise" in what else ""),
-            )
+            f"The {what} of '{name}' {problem}.",
+            expected=number if scalar else matrix,
+            received=f"{float(numbers.item()):g}" if scalar else text,
+            remedy=f"check the {what} given for '{name}'"
+            + (": every measurement needs some noise" if definite and "noise" in what else ""),
         )
 
 
@@ -225,12 +213,10 @@ def check_bounds(name: str, lower: Array, upper: Array) -> None:
     for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf)):
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
-            describe(
-                f"The bounds of {entry} cross." if lower[i] > upper[i] else f"The bounds of {entry} leave no number.",
-                expected="lower <= upper, lower < inf, upper > -inf",
-                received=f"lower = {lower[i]:g}, upper = {upper[i]:g}",
-                remedy="exchange or correct them",
-            )
+            f"The bounds of {entry} cross." if lower[i] > upper[i] else f"The bounds of {entry} leave no number.",
+            expected="lower <= upper, lower < inf, upper > -inf",
+            received=f"lower = {lower[i]:g}, upper = {upper[i]:g}",
+            remedy="exchange or correct them",
         )
 
 
@@ -240,12 +226,10 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
     for i in np.flatnonzero((values < lower - margin) | (values > upper + margin)):
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
-            describe(
-                f"The {what} value of {entry} lies outside its bounds.",
-                expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
-                received=f"{values[i]:g}",
-                remedy=f"move the {what} value or widen the bounds",
-            )
+            f"The {what} value of {entry} lies outside its bounds.",
+            expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
+            received=f"{values[i]:g}",
+            remedy=f"move the {what} value or widen the bounds",
         )
 
 
@@ -253,12 +237,10 @@ def check_size(name: str, size: Any) -> int:
     """The shape of a symbol must be a positive whole number."""
     if not is_whole(size, 1, LARGEST_SIZE):
         raise ProblemError(
-            describe(
-                f"The shape of '{name}' is not a number of components.",
-                expected=f"a positive whole number, at most {LARGEST_SIZE}",
-                received=repr(size),
-                remedy="give 1 for a scalar, n for a column of n",
-            )
+            f"The shape of '{name}' is not a number of components.",
+            expected=f"a positive whole number, at most {LARGEST_SIZE}",
+            received=repr(size),
+            remedy="give 1 for a scalar, n for a column of n",
         )
     return int(size)
 
@@ -268,12 +250,10 @@ def check_positive(name: str, value: Any, unit: str = "") -> float:
     number = np.full(1, np.nan) if value is None else as_number(name, "value", value)
     if number.size != 1 or not math.isfinite(float(number.reshape(()))) or float(number.reshape(())) <= 0:
         raise ProblemError(
-            describe(
-                f"'{name}' must be positive.",
-                expected=f"a finite number > 0{' ' + unit if unit else ''}",
-                received=repr(value),
-                remedy=f"give a positive {name}" + (", or Free(guess) to leave it free" if name == "duration" else ""),
-            )
+            f"'{name}' must be positive.",
+            expected=f"a finite number > 0{' ' + unit if unit else ''}",
+            received=repr(value),
+            remedy=f"give a positive {name}" + (", or Free(guess) to leave it free" if name == "duration" else ""),
         )
     return float(number.reshape(()))
 
@@ -282,12 +262,10 @@ def check_times(guess: float, lower: float, upper: float) -> None:
     """The three numbers of a free terminal time must be in order."""
     if not 0 < lower <= guess <= upper:
         raise ProblemError(
-            describe(
-                "The free duration is not ordered.",
-                expected="0 < lower <= guess <= upper [s]",
-                received=f"lower = {lower:g}, guess = {guess:g}, upper = {upper:g}",
-                remedy="correct the three numbers of Free(guess, lower, upper)",
-            )
+            "The free duration is not ordered.",
+            expected="0 < lower <= guess <= upper [s]",
+            received=f"lower = {lower:g}, guess = {guess:g}, upper = {upper:g}",
+            remedy="correct the three numbers of Free(guess, lower, upper)",
         )
 
 
@@ -298,12 +276,10 @@ def _numbers(size: int) -> str:
 def shape_error(name: str, what: str, expected: str, received: str) -> ProblemError:
     """The error for a shape that does not fit."""
     return ProblemError(
-        describe(
-            f"The {what} of '{name}' has the wrong size.",
-            expected=expected,
-            received=received,
-            remedy=f"give the {what} of '{name}' in that shape",
-        )
+        f"The {what} of '{name}' has the wrong size.",
+        expected=expected,
+        received=received,
+        remedy=f"give the {what} of '{name}' in that shape",
     )
 
 
@@ -314,12 +290,10 @@ def scale_column(name: str, scale: Any, size: int) -> Array | None:
     values = column(name, "scale", scale, size)
     if (values <= 0).any():
         raise ProblemError(
-            describe(
-                f"The scale of '{name}' must be positive.",
-                expected="typical magnitudes > 0",
-                received=str(values),
-                remedy="give magnitudes, or None for automatic scaling",
-            )
+            f"The scale of '{name}' must be positive.",
+            expected="typical magnitudes > 0",
+            received=str(values),
+            remedy="give magnitudes, or None for automatic scaling",
         )
     return values
 
@@ -328,28 +302,22 @@ def check_name(name: Any, declared: list[Any]) -> None:
     """A name must be a text that no declaration has yet."""
     if not isinstance(name, str) or not name:
         raise ProblemError(
-            describe(
-                "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
-            )
+            "A symbol needs a name.", expected="a text", received=repr(name), remedy="give a short unique name"
         )
     if name in ("time", "duration"):
         raise ProblemError(
-            describe(
-                f"The name '{name}' is taken.",
-                expected="any other name",
-                received=name,
-                remedy=f"use Problem.{name} for that symbol",
-            )
+            f"The name '{name}' is taken.",
+            expected="any other name",
+            received=name,
+            remedy=f"use Problem.{name} for that symbol",
         )
     for entry in declared:
         if name in (entry.name, *(f"{entry.name}[{i}]" for i in range(getattr(entry, "size", 0)))):
             raise ProblemError(
-                describe(
-                    f"The name '{name}' is used twice.",
-                    expected="a unique name for each symbol, measurement and constraint",
-                    received=f"'{name}', declared before at {entry.where}",
-                    remedy="choose another name",
-                )
+                f"The name '{name}' is used twice.",
+                expected="a unique name for each symbol, measurement and constraint",
+                received=f"'{name}', declared before at {entry.where}",
+                remedy="choose another name",
             )
 
 
@@ -358,12 +326,10 @@ def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
     for entry in entries:
         if entry.name not in rates:
             raise ProblemError(
-                describe(
-                    f"'{entry.name}' has no dynamics (declared at {entry.where}).",
-                    expected=f"dynamics({entry.name}, rate)",
-                    received="none",
-                    remedy="give its rate; 0 for a constant",
-                )
+                f"'{entry.name}' has no dynamics (declared at {entry.where}).",
+                expected=f"dynamics({entry.name}, rate)",
+                received="none",
+                remedy="give its rate; 0 for a constant",
             )
 
 
@@ -383,12 +349,10 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
             return str(entry.name)
     names = [str(entry.name) for entry in allowed]
     raise ProblemError(
-        describe(
-            f"{what}() was given something that is not a symbol of this problem.",
-            expected="one of " + ", ".join(names),
-            received=str(symbol),
-            remedy=spelling(symbol, names, "check the spelling; or pass the symbol that its declaration returned"),
-        )
+        f"{what}() was given something that is not a symbol of this problem.",
+        expected="one of " + ", ".join(names),
+        received=str(symbol),
+        remedy=spelling(symbol, names, "check the spelling; or pass the symbol that its declaration returned"),
     )
 
 
@@ -398,13 +362,11 @@ def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> c
         expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(real_numbers(value)))
     except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' is not an expression.",
-                expected="an expression of the symbols of this problem",
-                received=shown(value, 200),
-                remedy="use casadi functions on the symbols (casadi.vertcat, casadi.sin, @, *), not lists, arrays "
-                "of symbols or symbols made by casadi.SX.sym",
-            )
+            f"The {what} of '{name}' is not an expression.",
+            expected="an expression of the symbols of this problem",
+            received=shown(value, 200),
+            remedy="use casadi functions on the symbols (casadi.vertcat, casadi.sin, @, *), not lists, arrays "
+            "of symbols or symbols made by casadi.SX.sym",
         ) from error
     if expression.shape == (1, 1) and shape != (1, 1) and expression.is_zero():
         return ca.MX.zeros(*shape)
@@ -412,12 +374,10 @@ def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> c
         raise shape_error(name, what, f"shape {shape}", f"shape {expression.shape}")
     if expression.is_constant() and not np.isfinite(ca.evalf(expression).full()).all():
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' is NaN or inf.",
-                expected="a finite expression",
-                received=str(expression),
-                remedy=f"correct the {what}",
-            )
+            f"The {what} of '{name}' is NaN or inf.",
+            expected="a finite expression",
+            received=str(expression),
+            remedy=f"correct the {what}",
         )
     return expression
 
@@ -429,22 +389,18 @@ def column_expression(name: str, what: str, value: Any) -> ca.MX:
     """The value as a column of expressions; comparisons, lists and symbols of another kind are refused."""
     if not isinstance(value, (ca.MX, ca.DM)) and not is_number(value):
         raise ProblemError(
-            describe(
-                f"The {what} '{name}' is not an expression of this problem's symbols.",
-                expected="one expression; several go into one column by casadi.vertcat",
-                received=kind_and_name(value),
-                remedy="use the symbols that state(), control() and symmetric() return",
-            )
+            f"The {what} '{name}' is not an expression of this problem's symbols.",
+            expected="one expression; several go into one column by casadi.vertcat",
+            received=kind_and_name(value),
+            remedy="use the symbols that state(), control() and symmetric() return",
         )
     expression = ca.MX(value)
     if not expression.is_constant() and expression.is_binary() and expression.op() in COMPARISONS:
         raise ProblemError(
-            describe(
-                f"The {what} '{name}' is a comparison, whose value is true or false.",
-                expected="an expression, and its bounds apart: subject_to(x, upper=1)",
-                received=str(value),
-                remedy="give what is bounded, and its bounds by lower= and upper=",
-            )
+            f"The {what} '{name}' is a comparison, whose value is true or false.",
+            expected="an expression, and its bounds apart: subject_to(x, upper=1)",
+            received=str(value),
+            remedy="give what is bounded, and its bounds by lower= and upper=",
         )
     if expression.shape[1] != 1:
         raise shape_error(name, what, "a scalar or a column", f"shape {expression.shape}")
@@ -456,12 +412,10 @@ def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None
     fixed = {symbol.__hash__() for symbol in constants}
     if all(symbol.__hash__() in fixed for symbol in ca.symvar(expression)):
         raise ProblemError(
-            describe(
-                f"'{name}' contains no variable.",
-                expected="an expression of states, controls, matrix states or the free duration",
-                received=str(expression),
-                remedy="remove it, or use the symbols that state(), control() and symmetric() return",
-            )
+            f"'{name}' contains no variable.",
+            expected="an expression of states, controls, matrix states or the free duration",
+            received=str(expression),
+            remedy="remove it, or use the symbols that state(), control() and symmetric() return",
         )
 
 
@@ -469,21 +423,17 @@ def check_limits(name: str, lower: Array, upper: Array) -> None:
     """Bounds of a constraint must not cross, and one of them must bind."""
     if (lower > upper).any() and (upper == 0).all():
         raise ProblemError(
-            describe(
-                f"The bounds of '{name}' cross.",
-                expected="lower <= upper",
-                received=f"lower = {lower.max():g}, upper = 0 (which it is unless given)",
-                remedy="give the upper bound too; upper=numpy.inf where there is none",
-            )
+            f"The bounds of '{name}' cross.",
+            expected="lower <= upper",
+            received=f"lower = {lower.max():g}, upper = 0 (which it is unless given)",
+            remedy="give the upper bound too; upper=numpy.inf where there is none",
         )
     check_bounds(name, lower, upper)
     for i in np.flatnonzero(np.isneginf(lower) & np.isposinf(upper)):
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
-            describe(
-                f"{entry} has no bound.",
-                expected="a finite lower or upper bound",
-                received="lower = -inf, upper = inf",
-                remedy="give lower= or upper=, or remove the constraint",
-            )
+            f"{entry} has no bound.",
+            expected="a finite lower or upper bound",
+            received="lower = -inf, upper = inf",
+            remedy="give lower= or upper=, or remove the constraint",
         )

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 
 KINDS = "biuf"  # of arrays: truth values, whole numbers, floating-point numbers
 LARGEST_ITEM = 8  # bytes: what Python's own numbers hold exactly
@@ -57,12 +57,10 @@ def encode(value: Any, name: str, arrays: dict[str, Any] | None = None) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in KINDS and value.dtype.itemsize <= LARGEST_ITEM:
         return {"$array": _written_out(value) if arrays is None else _put_aside(value, name, arrays)}
     raise ExportError(
-        describe(
-            f"'{name}' cannot be written to a file.",
-            expected="numbers, words, arrays of numbers, and lists and dictionaries of them",
-            received=f"{type(value).__name__}: {str(value)[:60]}",
-            remedy=f"replace it by numbers or words: dataclasses.replace(solution, {name.split('.')[0]}=...)",
-        )
+        f"'{name}' cannot be written to a file.",
+        expected="numbers, words, arrays of numbers, and lists and dictionaries of them",
+        received=f"{type(value).__name__}: {str(value)[:60]}",
+        remedy=f"replace it by numbers or words: dataclasses.replace(solution, {name.split('.')[0]}=...)",
     )
 
 

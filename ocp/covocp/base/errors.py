@@ -6,7 +6,7 @@ import sys
 import warnings
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -22,7 +22,25 @@ _HELD_BACK = ContextVar("held_back", default=False)
 
 
 class CovocpError(Exception):
-    """Base of every error that covocp raises on purpose."""
+    """Base of every error that covocp raises on purpose: it says four things.
+
+    Attributes:
+        problem: what is wrong, with the user's name of the thing.
+        expected: what is needed; empty where the sentence says it all.
+        received: what was given.
+        remedy: what to do next.
+    """
+
+    def __init__(self, problem: str, *, expected: str = "", received: str = "", remedy: str = "") -> None:
+        """Make the message of what is given, a line each."""
+        parts = {"expected": expected, "received": received, "remedy": remedy}
+        lines = [f"\n  {name + ':':9s} {text}" for name, text in parts.items() if text]
+        super().__init__(problem + "".join(lines))
+        self.problem, self.expected, self.received, self.remedy = problem, expected, received, remedy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As it was made, in another process too: what is kept beside the message is set again."""
+        return _remade, (type(self), self.problem, self.__dict__)
 
 
 class ProblemError(CovocpError, ValueError):
@@ -43,10 +61,15 @@ class SolveError(CovocpError, RuntimeError):
     """
 
     def __init__(
-        self, message: str, *, solution: Solution | None = None, violations: Mapping[str, float] | None = None
+        self,
+        problem: str,
+        *,
+        solution: Solution | None = None,
+        violations: Mapping[str, float] | None = None,
+        **parts: str,
     ) -> None:
         """Keep the last iterate and the violated constraints beside the message."""
-        super().__init__(message)
+        super().__init__(problem, **parts)
         self.solution = solution
         self.violations = dict(violations or {})
 
@@ -70,6 +93,13 @@ class ExportError(CovocpError, RuntimeError):
 
 class CovocpWarning(UserWarning):
     """The result is usable, but the user should know something about it (mesh too coarse, saddle point left)."""
+
+
+def _remade(kind: type[CovocpError], problem: str, kept: dict[str, Any]) -> CovocpError:
+    """An error from what it was made of."""
+    error = kind(problem, **{name: kept[name] for name in ("expected", "received", "remedy")})
+    error.__dict__.update(kept)
+    return error
 
 
 def warn_user(message: str) -> None:
@@ -119,21 +149,6 @@ def evaluating(name: str) -> Iterator[None]:
         ) from error
 
 
-def describe(problem: str, *, expected: str, received: str, remedy: str) -> str:
-    """Text of an error in the one form that all of them have.
-
-    Args:
-        problem: what is wrong, with the user's name of the thing.
-        expected: what is needed.
-        received: what was given.
-        remedy: what to do next.
-
-    Returns:
-        The message, four lines.
-    """
-    return f"{problem}\n  expected: {expected}\n  received: {received}\n  remedy:   {remedy}"
-
-
 def shown(value: object, length: int = 100, form: Callable[[object], str] = repr) -> str:
     """The beginning of what Python shows of a value, on one line; of numbers that are too long for it the type."""
     try:
@@ -176,10 +191,8 @@ def no_option(what: str, name: str, value: object, known: Iterable[str], beside:
     """
     names = sorted(known)
     return ProblemError(
-        describe(
-            f"{what} has no option '{name}'.",
-            expected="one of " + ", ".join(names),
-            received=f"{name}={value!r}"[:100],
-            remedy=spelling(name, [*names, *beside], "correct or remove it"),
-        )
+        f"{what} has no option '{name}'.",
+        expected="one of " + ", ".join(names),
+        received=f"{name}={value!r}"[:100],
+        remedy=spelling(name, [*names, *beside], "correct or remove it"),
     )

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from covocp.base.disk import abandoned, flush, held
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 
 # Names of files that are being written; what is found under one and is written by nobody is left of a killed run.
 UNFINISHED = re.compile(r"\.covocp-[0-9a-f]{32}\.\w+")
@@ -36,30 +36,24 @@ def check_target(path: str | Path, suffixes: tuple[str, ...]) -> Path:
         pass
     except (TypeError, ValueError, OSError) as error:  # no name, a null byte, too long, a folder that is closed to us
         raise ExportError(
-            describe(
-                "The file cannot be written.",
-                expected="the name of a file in a folder that can be read",
-                received=f"{repr(path)[:60]}: {str(error)[:200]}",
-                remedy="choose another name or folder",
-            )
+            "The file cannot be written.",
+            expected="the name of a file in a folder that can be read",
+            received=f"{repr(path)[:60]}: {str(error)[:200]}",
+            remedy="choose another name or folder",
         ) from error
     if target.suffix.lower() not in suffixes:
         raise ExportError(
-            describe(
-                f"'{target.name}' cannot be written: its suffix names no format.",
-                expected="a file name that ends in " + ", ".join(suffixes),
-                received=str(path),
-                remedy="change the suffix",
-            )
+            f"'{target.name}' cannot be written: its suffix names no format.",
+            expected="a file name that ends in " + ", ".join(suffixes),
+            received=str(path),
+            remedy="change the suffix",
         )
     if target.is_dir() or not target.parent.is_dir():
         raise ExportError(
-            describe(
-                f"'{target.name}' cannot be written.",
-                expected="a file in a folder that exists",
-                received=f"{path}, " + ("which is a folder" if target.is_dir() else "whose folder does not exist"),
-                remedy="make the folder, or write elsewhere",
-            )
+            f"'{target.name}' cannot be written.",
+            expected="a file in a folder that exists",
+            received=f"{path}, " + ("which is a folder" if target.is_dir() else "whose folder does not exist"),
+            remedy="make the folder, or write elsewhere",
         )
     return target
 
@@ -92,12 +86,10 @@ def written_whole(path: str | Path, suffixes: tuple[str, ...]) -> Iterator[Path]
         flush(target.parent)
     except OSError as error:
         raise ExportError(
-            describe(
-                f"'{target.name}' cannot be written.",
-                expected="a folder that can be written to, and room on the disk",
-                received=str(error),
-                remedy="check the permissions, or write elsewhere",
-            )
+            f"'{target.name}' cannot be written.",
+            expected="a folder that can be written to, and room on the disk",
+            received=str(error),
+            remedy="check the permissions, or write elsewhere",
         ) from error
     finally:
         with suppress(OSError):

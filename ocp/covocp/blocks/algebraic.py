@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
 
@@ -97,12 +97,10 @@ def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
         i, j = np.unravel_index(int(np.argmin(np.abs(pairs))), pairs.shape)
         relation = "have the product one" if discrete else "add up to zero"
         raise ProblemError(
-            describe(
-                f"The Lyapunov equation has no unique solution: two modes of A {relation}.",
-                expected="modes of A inside the unit circle" if discrete else "modes of A in the left half plane",
-                received=f"{mode_text(values[i])} and {mode_text(values[j])}",
-                remedy="stabilise A first",
-            )
+            f"The Lyapunov equation has no unique solution: two modes of A {relation}.",
+            expected="modes of A inside the unit circle" if discrete else "modes of A in the left half plane",
+            received=f"{mode_text(values[i])} and {mode_text(values[j])}",
+            remedy="stabilise A first",
         )
     solve = linalg.solve_discrete_lyapunov if discrete else linalg.solve_continuous_lyapunov
     solution = np.asarray(solve(transition, right if discrete else -right), dtype=float)
@@ -190,12 +188,10 @@ def root(weights: Array) -> Array:
 def lost_mode(modes: Modes, pair: str, needed: str, remedy: str, why: str = "") -> ProblemError:
     """The error that names the first of some modes."""
     return ProblemError(
-        describe(
-            f"The pair {pair} is not {needed}.",
-            expected=f"a {needed} pair",
-            received="the mode " + ", ".join(mode_text(mode) for mode in modes[:3]) + (f", which {why}" if why else ""),
-            remedy=remedy,
-        )
+        f"The pair {pair} is not {needed}.",
+        expected=f"a {needed} pair",
+        received="the mode " + ", ".join(mode_text(mode) for mode in modes[:3]) + (f", which {why}" if why else ""),
+        remedy=remedy,
     )
 
 
@@ -285,12 +281,10 @@ def stabilising(
 
 def _unsolved(received: str) -> ProblemError:
     return ProblemError(
-        describe(
-            "The Riccati equation could not be solved.",
-            expected="a solution that makes the closed loop stable",
-            received=received,
-            remedy="scale states and inputs to similar sizes; look for modes that are hardly reached or weighted",
-        )
+        "The Riccati equation could not be solved.",
+        expected="a solution that makes the closed loop stable",
+        received=received,
+        remedy="scale states and inputs to similar sizes; look for modes that are hardly reached or weighted",
     )
 
 

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks.values import is_symbolic
 
 Array = NDArray[Any]
@@ -48,12 +48,10 @@ def apply(law: Callable[..., Sequence[Any]], *values: Any, precision: Any = np.f
     kinds = {type(value) for value in values if is_symbolic(value) and not value.is_constant()}
     if len(kinds) > 1:
         raise ProblemError(
-            describe(
-                "The arguments mix SX and MX.",
-                expected="expressions of one kind",
-                received="both",
-                remedy="make a casadi.Function of the SX part and call it with the MX",
-            )
+            "The arguments mix SX and MX.",
+            expected="expressions of one kind",
+            received="both",
+            remedy="make a casadi.Function of the SX part and call it with the MX",
         )
     symbols, given, inputs = [], [], []
     for k, value in enumerate(values):
@@ -179,10 +177,8 @@ def semidefinite(value: Any) -> Any:
 def _indefinite(what: str, matrix: Array) -> ProblemError:
     smallest = float(np.linalg.eigvalsh(matrix)[0]) if np.isfinite(matrix).all() else np.nan
     return ProblemError(
-        describe(
-            f"The {what} is singular.",
-            expected="a positive definite matrix",
-            received=f"a smallest eigenvalue of {smallest:.3g}",
-            remedy="give every measurement some noise; where rounding hides it, take the square-root form",
-        )
+        f"The {what} is singular.",
+        expected="a positive definite matrix",
+        received=f"a smallest eigenvalue of {smallest:.3g}",
+        remedy="give every measurement some noise; where rounding hides it, take the square-root form",
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.riccati_rates import riccati_rate
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.updates import row_matrix
@@ -111,9 +111,7 @@ def time_step(value: Any) -> Any:
     step = matrix("step", value, (1, 1))
     if not is_symbolic(step) and not float(step) > 0.0:
         raise ProblemError(
-            describe(
-                "The step is not positive.", expected="a time [s]", received=f"{float(step):g}", remedy="correct it"
-            )
+            "The step is not positive.", expected="a time [s]", received=f"{float(step):g}", remedy="correct it"
         )
     return step
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, whole
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks import values
 
 Array = NDArray[np.float64]
@@ -35,12 +35,10 @@ def in_state(name: str, x: Any, expression: Any, state: Any) -> Any:
     """
     if not isinstance(x, values.SYMBOLIC) or not x.is_valid_input() or x.shape != state.shape:
         raise ProblemError(
-            describe(
-                "The argument 'x' is not the state.",
-                expected=f"the CasADi symbol that {name} is written in, shape {state.shape[0]} x 1",
-                received=f"{type(x).__name__}: {x!r}"[:100],
-                remedy='make it with casadi.SX.sym("x", n)',
-            )
+            "The argument 'x' is not the state.",
+            expected=f"the CasADi symbol that {name} is written in, shape {state.shape[0]} x 1",
+            received=f"{type(x).__name__}: {x!r}"[:100],
+            remedy='make it with casadi.SX.sym("x", n)',
         )
     if isinstance(expression, ca.DM):
         return ca.SX(expression)
@@ -54,12 +52,10 @@ def in_state(name: str, x: Any, expression: Any, state: Any) -> Any:
         except (RuntimeError, NotImplementedError) as error:
             received = "the symbols " + ", ".join(others) if others else " ".join(str(error).split())[-200:]
     raise ProblemError(
-        describe(
-            f"The argument '{name}' is no function of x alone.",
-            expected=f"an expression in x, {type(x).__name__} like x, of operations that CasADi can write as SX",
-            received=received,
-            remedy=f"write {name} with x and numbers only",
-        )
+        f"The argument '{name}' is no function of x alone.",
+        expected=f"an expression in x, {type(x).__name__} like x, of operations that CasADi can write as SX",
+        received=received,
+        remedy=f"write {name} with x and numbers only",
     )
 
 
@@ -136,12 +132,10 @@ def _at_state(f: Callable[[Any], Any], x: Any) -> Any:
         return f(x)
     except Exception as error:  # whatever the user's function raises
         raise ProblemError(
-            describe(
-                "The function f fails for the symbol of the state.",
-                expected="a function of x, by CasADi's functions",
-                received=f"{type(error).__name__}: {error}"[:200],
-                remedy="call it by itself with that symbol",
-            )
+            "The function f fails for the symbol of the state.",
+            expected="a function of x, by CasADi's functions",
+            received=f"{type(error).__name__}: {error}"[:200],
+            remedy="call it by itself with that symbol",
         ) from error
 
 
@@ -186,10 +180,8 @@ def as_rows(value: Any) -> Any:
 
 def _wrong(expected: str, received: str) -> ProblemError:
     return ProblemError(
-        describe(
-            "The factorisation (A0 + A(x)) x does not equal f(x).",
-            expected=expected,
-            received=received,
-            remedy="correct A0 and A(x), or give states in the domain of f",
-        )
+        "The factorisation (A0 + A(x)) x does not equal f(x).",
+        expected=expected,
+        received=received,
+        remedy="correct A0 and A(x), or give states in the domain of f",
     )

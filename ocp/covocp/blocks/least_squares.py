@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, positive, share, whole
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks import values
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric, unit
 from covocp.blocks.updates import Missing, check_choice, reading, updating
@@ -92,12 +92,10 @@ def least_squares_start(
     phi, y = phi[..., None] if phi.ndim == 2 else phi, y[:, None] if y.ndim == 1 else y
     if phi.ndim != 3 or y.ndim != 2 or (phi.shape[0], phi.shape[2]) != y.shape:
         raise ProblemError(
-            describe(
-                "The samples do not fit together.",
-                expected="regressors (N, n) with outputs (N,), or (N, n, p) with (N, p)",
-                received=f"{phi.shape} and {y.shape}",
-                remedy="one row of each for a sample",
-            )
+            "The samples do not fit together.",
+            expected="regressors (N, n) with outputs (N,), or (N, n, p) with (N, p)",
+            received=f"{phi.shape} and {y.shape}",
+            remedy="one row of each for a sample",
         )
     g = float(values.numeric("forgetting", _forgetting(forgetting)).item())
     a = values.numeric("weight", _weight(weight, y.shape[1]))
@@ -135,12 +133,10 @@ def _solved(rows: Array, right: Array, size: int) -> tuple[Array, Array]:
     rank = int(np.linalg.matrix_rank(rows)) if rows.size else 0
     if rank < size:
         raise ProblemError(
-            describe(
-                "The samples do not determine every parameter.",
-                expected=f"regressors that span {size} dimensions",
-                received=f"{rank} from {len(rows)} samples",
-                remedy="start with more samples, or with diffuse_start",
-            )
+            "The samples do not determine every parameter.",
+            expected=f"regressors that span {size} dimensions",
+            received=f"{rank} from {len(rows)} samples",
+            remedy="start with more samples, or with diffuse_start",
         )
     orthogonal, triangle = np.linalg.qr(rows)
     inverse = np.linalg.solve(triangle, np.eye(size))

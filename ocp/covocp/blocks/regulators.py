@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
@@ -241,12 +241,10 @@ def reference_input(A: Any, B: Any, output: Any, *, discrete: bool = False) -> R
     error = np.abs(system @ solution - right).max(initial=0.0)
     if error > 1e-9:
         raise ProblemError(
-            describe(
-                "There is no steady state for every reference.",
-                expected="as many controls as outputs, and no zero at rest",
-                received=f"{b.shape[1]} controls, {count} outputs, an error of {error:.2g} in the best steady state",
-                remedy="track fewer outputs, or use integral_states",
-            )
+            "There is no steady state for every reference.",
+            expected="as many controls as outputs, and no zero at rest",
+            received=f"{b.shape[1]} controls, {count} outputs, an error of {error:.2g} in the best steady state",
+            remedy="track fewer outputs, or use integral_states",
         )
     return ReferenceInput(state=frozen(solution[:size]), control=frozen(solution[size:]))
 

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks import values
 from covocp.blocks.algebraic import continuous
 from covocp.blocks.factorisation import as_rows, dependence
@@ -146,10 +146,8 @@ def _reason(A: Array, B: Array, Q: Array, R: Array) -> str:
 def _unsolved(state: Array, received: str) -> ProblemError:
     at = "(" + ", ".join(f"{value:.6g}" for value in state) + ")"
     return ProblemError(
-        describe(
-            f"The state-dependent Riccati equation has no solution at x = {at}.",
-            expected="A0 + A(x) that the input can stabilise and the weights see",
-            received=received,
-            remedy="keep away from this state, change the factorisation, or use covocp.blocks.theta_d",
-        )
+        f"The state-dependent Riccati equation has no solution at x = {at}.",
+        expected="A0 + A(x) that the input can stabilise and the weights see",
+        received=received,
+        remedy="keep away from this state, change the factorisation, or use covocp.blocks.theta_d",
     )

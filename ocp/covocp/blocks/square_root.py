@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks.arithmetic import apply, below, beside, diagonal, is_there, precision, unit_triangular, where, zeros
 from covocp.blocks.updates import Missing, reading, row_matrix, shift
 from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
@@ -158,12 +158,10 @@ def _substituted(lower: Any, right: Any) -> Any:
     if isinstance(lower, np.ndarray):
         if np.diag(lower).min(initial=np.inf) <= 0.0:
             raise ProblemError(
-                describe(
-                    "The covariance of the innovation is singular.",
-                    expected="measurements with noise, or of what is not known exactly",
-                    received=f"a smallest entry of its factor of {np.diag(lower).min():.3g}",
-                    remedy="give every measurement some noise, and no measurement twice without noise",
-                )
+                "The covariance of the innovation is singular.",
+                expected="measurements with noise, or of what is not known exactly",
+                received=f"a smallest entry of its factor of {np.diag(lower).min():.3g}",
+                remedy="give every measurement some noise, and no measurement twice without noise",
             )
         return np.linalg.solve(lower, right)
     rows: list[Any] = []

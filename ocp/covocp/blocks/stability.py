@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
 from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 
@@ -67,12 +67,10 @@ def lyapunov_certificate(
         v = _symmetric(numeric("matrix", square("matrix", matrix, size)))
     else:
         raise ProblemError(
-            describe(
-                "Both the matrix of V and its decrease are given.",
-                expected="one of them: each follows from the other",
-                received="both",
-                remedy="leave one out",
-            )
+            "Both the matrix of V and its decrease are given.",
+            expected="one of them: each follows from the other",
+            received="both",
+            remedy="leave one out",
         )
     d = symmetrised(v - a.T @ v @ a if discrete else -(a.T @ v + v @ a))
     proves, reason = _verdict(a, v, d, discrete)

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.blocks.arithmetic import (
     apply,
     definite_solve,
@@ -156,12 +156,10 @@ def reading(name: str, value: Any, size: int, missing: Missing) -> Any:
     gaps = ~np.isfinite(numbers)
     if gaps.any() and missing == "raise":
         raise ProblemError(
-            describe(
-                f"The argument '{name}' has a missing reading.",
-                expected="finite numbers",
-                received=f"{numbers.ravel()}",
-                remedy="missing='skip' leaves such rows out",
-            )
+            f"The argument '{name}' has a missing reading.",
+            expected="finite numbers",
+            received=f"{numbers.ravel()}",
+            remedy="missing='skip' leaves such rows out",
         )
     column = matrix(name, np.where(gaps, 0.0, numbers), (size, 1))
     if gaps.any():
@@ -177,12 +175,10 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     """
     if not isinstance(value, str) or value not in choices:
         raise ProblemError(
-            describe(
-                f"The argument '{name}' is unknown.",
-                expected=", ".join(repr(choice) for choice in choices),
-                received=repr(value),
-                remedy="choose one of them",
-            )
+            f"The argument '{name}' is unknown.",
+            expected=", ".join(repr(choice) for choice in choices),
+            received=repr(value),
+            remedy="choose one of them",
         )
 
 

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.errors import ProblemError, describe, shown
+from covocp.base.errors import ProblemError, shown
 from covocp.base.matrices import real_numbers
 
 SYMBOLIC = (ca.SX, ca.MX)
@@ -129,10 +129,5 @@ def symmetrised(value: Any) -> Any:
 def wrong_argument(name: str, expected: str, received: str, remedy: str = "") -> ProblemError:
     """The error of an argument that does not fit."""
     return ProblemError(
-        describe(
-            f"The argument '{name}' does not fit.",
-            expected=expected,
-            received=received,
-            remedy=remedy or f"correct {name}",
-        )
+        f"The argument '{name}' does not fit.", expected=expected, received=received, remedy=remedy or f"correct {name}"
     )

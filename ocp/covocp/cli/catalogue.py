@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from covocp.base.errors import CovocpError, ProblemError, describe, kind_and_name, spelling
+from covocp.base.errors import CovocpError, ProblemError, kind_and_name, spelling
 from covocp.problem.builder import Problem
 
 MODELS = "covocp.models"
@@ -68,12 +68,10 @@ class Model:
         problem = _called(self.label, self.script, lambda: self.make(**values))
         if not isinstance(problem, Problem):
             raise ProblemError(
-                describe(
-                    f"'{self.label}' did not return a problem.",
-                    expected="a covocp.Problem",
-                    received=kind_and_name(problem),
-                    remedy="end the function by returning the problem that it makes",
-                )
+                f"'{self.label}' did not return a problem.",
+                expected="a covocp.Problem",
+                received=kind_and_name(problem),
+                remedy="end the function by returning the problem that it makes",
             )
         return problem
 
@@ -99,23 +97,19 @@ class Model:
             name, text = split_setting("--set", setting)
             if name not in named and not anything:
                 raise ProblemError(
-                    describe(
-                        f"'{self.label}' has no parameter '{name}'.",
-                        expected="one of " + (", ".join(named) or "none: it has no parameters"),
-                        received=f"--set {setting}",
-                        remedy=spelling(name, named, "correct the name"),
-                    )
+                    f"'{self.label}' has no parameter '{name}'.",
+                    expected="one of " + (", ".join(named) or "none: it has no parameters"),
+                    received=f"--set {setting}",
+                    remedy=spelling(name, named, "correct the name"),
                 )
             values[name] = _fitting(name, text, named[name]) if name in named else parse_value(text)
         missing = [n for n, p in named.items() if p.default is p.empty and n not in values]
         if missing:
             raise ProblemError(
-                describe(
-                    f"'{self.label}' needs a value of {', '.join(missing)}.",
-                    expected=" ".join(f"--set {name}=VALUE" for name in missing),
-                    received=", ".join(settings) or "no --set",
-                    remedy="give the missing values",
-                )
+                f"'{self.label}' needs a value of {', '.join(missing)}.",
+                expected=" ".join(f"--set {name}=VALUE" for name in missing),
+                received=", ".join(settings) or "no --set",
+                remedy="give the missing values",
             )
         return values
 
@@ -151,14 +145,10 @@ def find_model(text: str) -> Model:
         if colon and model.name == path:
             return _other_function(model, function)
     raise ProblemError(
-        describe(
-            f"There is no model '{text}'.",
-            expected="one of " + ", ".join(model.name for model in available) + ", or path/to/script.py:function",
-            received=text,
-            remedy=spelling(
-                text, [m.name for m in available], "correct the name; `covocp list` shows what the models are"
-            ),
-        )
+        f"There is no model '{text}'.",
+        expected="one of " + ", ".join(model.name for model in available) + ", or path/to/script.py:function",
+        received=text,
+        remedy=spelling(text, [m.name for m in available], "correct the name; `covocp list` shows what the models are"),
     )
 
 
@@ -181,12 +171,10 @@ def _other_function(model: Model, name: str) -> Model:
     own = {entry.make.__name__: entry for entry in problems(model)}
     if name not in own:
         raise ProblemError(
-            describe(
-                f"The model '{model.name}' has no problem '{name}'.",
-                expected="one of " + ", ".join(f"{model.name}:{n}" for n in own),
-                received=f"{model.name}:{name}",
-                remedy=spelling(name, own, "correct the name"),
-            )
+            f"The model '{model.name}' has no problem '{name}'.",
+            expected="one of " + ", ".join(f"{model.name}:{n}" for n in own),
+            received=f"{model.name}:{name}",
+            remedy=spelling(name, own, "correct the name"),
         )
     return own[name]
 
@@ -195,12 +183,10 @@ def _from_script(path: Path, name: str) -> Model:
     """A function of a script, which is run as a module; its folder may be imported from."""
     if not path.is_file():
         raise ProblemError(
-            describe(
-                f"There is no script '{path}'.",
-                expected="path/to/script.py:function",
-                received=str(path),
-                remedy="check the path",
-            )
+            f"There is no script '{path}'.",
+            expected="path/to/script.py:function",
+            received=str(path),
+            remedy="check the path",
         )
     spec = importlib.util.spec_from_file_location(f"covocp_script_{path.stem}", path)
     assert spec is not None
@@ -214,12 +200,10 @@ def _from_script(path: Path, name: str) -> Model:
     if not callable(make):
         own = [n for n, v in vars(module).items() if inspect.isfunction(v) and v.__module__ == module.__name__]
         raise ProblemError(
-            describe(
-                f"'{path}' has no function '{name}'." if name else f"Which function of '{path}' makes the problem?",
-                expected=f"{path}:function, the function one of " + (", ".join(own) or "none: the script has none"),
-                received=f"{path}:{name}" if name else str(path),
-                remedy="name a function that returns a covocp.Problem",
-            )
+            f"'{path}' has no function '{name}'." if name else f"Which function of '{path}' makes the problem?",
+            expected=f"{path}:function, the function one of " + (", ".join(own) or "none: the script has none"),
+            received=f"{path}:{name}" if name else str(path),
+            remedy="name a function that returns a covocp.Problem",
         )
     return Model(name=path.stem, label=f"{path}:{name}", make=make, module=module, script=path)
 
@@ -244,12 +228,10 @@ def _called(name: str, script: Path | None, function: Callable[[], Any]) -> Any:
             place = f" at {script}:{line}" if line else f" in {script}"
         text = " ".join(str(error).split())[:300]
         raise ProblemError(
-            describe(
-                f"'{name}' failed{place}.",
-                expected="a function that makes a problem",
-                received=f"{type(error).__name__}: {text}" if text else type(error).__name__,
-                remedy="correct the script" if script else "check the values of --set",
-            )
+            f"'{name}' failed{place}.",
+            expected="a function that makes a problem",
+            received=f"{type(error).__name__}: {text}" if text else type(error).__name__,
+            remedy="correct the script" if script else "check the values of --set",
         ) from error
 
 
@@ -262,12 +244,10 @@ def split_setting(option: str, text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name.strip().replace(".", "_").isidentifier() or not value.strip():
         raise ProblemError(
-            describe(
-                f"'{option} {text}' is not understood.",
-                expected=f"{option} name=value",
-                received=f"{option} {text}",
-                remedy="write the name, an equals sign and the value without blanks",
-            )
+            f"'{option} {text}' is not understood.",
+            expected=f"{option} name=value",
+            received=f"{option} {text}",
+            remedy="write the name, an equals sign and the value without blanks",
         )
     return name.strip(), value.strip()
 
@@ -318,10 +298,5 @@ def _fitting(name: str, text: str, parameter: inspect.Parameter) -> Any:
     if fits:
         return value
     raise ProblemError(
-        describe(
-            f"The value of '{name}' does not fit.",
-            expected=kind,
-            received=text,
-            remedy=f"correct --set {name}={text}",
-        )
+        f"The value of '{name}' does not fit.", expected=kind, received=text, remedy=f"correct --set {name}={text}"
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import covocp as co
-from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, describe, spelling
+from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, spelling
 from covocp.base.files import check_target
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
@@ -310,12 +310,10 @@ def _solved(problem: Any, arguments: argparse.Namespace, nominal: Any = None) ->
         raise
     except (RuntimeError, TypeError, ValueError, ArithmeticError, ImportError) as error:
         raise ProblemError(
-            describe(
-                f"The problem could not be given to {arguments.method}.",
-                expected="options that it understands, and a model that can be evaluated",
-                received=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
-                remedy="check the values of --option and --set",
-            )
+            f"The problem could not be given to {arguments.method}.",
+            expected="options that it understands, and a model that can be evaluated",
+            received=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
+            remedy="check the values of --option and --set",
         ) from error
     return solution, 0 if solution.converged else FAILED
 
@@ -331,12 +329,10 @@ def _options(given: list[str], methods: Sequence[str]) -> tuple[dict[str, Any], 
             own.setdefault(method, {})[rest] = parse_value(value)
         elif name in TAKEN:
             raise ProblemError(
-                describe(
-                    f"'{name}' is not an option of the solver.",
-                    expected="an option of the method or the mesh, such as control=constant",
-                    received=f"--option {entry}",
-                    remedy=f"use --{name}" if name in ("method", "intervals") else "remove it",
-                )
+                f"'{name}' is not an option of the solver.",
+                expected="an option of the method or the mesh, such as control=constant",
+                received=f"--option {entry}",
+                remedy=f"use --{name}" if name in ("method", "intervals") else "remove it",
             )
         else:
             shared[name] = parse_value(value)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from covocp.base.arguments import checked, mapping, optional, positive, truth
-from covocp.base.errors import ExportError, describe, spelling, warn_user
+from covocp.base.errors import ExportError, spelling, warn_user
 from covocp.base.threads import one_at_a_time
 from covocp.export.compiled.building import Sources
 from covocp.export.compiled.folder import check_folder, check_names, package_files, write_folder
@@ -230,14 +230,10 @@ def _solution(
             laws.append(sampled_law(design, tables, samples, tolerance))
     elif period is not None or limits is not None:
         raise ExportError(
-            describe(
-                "period= and limits= are those of a controller.",
-                expected="a solution of a problem with minimize_expected()",
-                received=f"'{solution.name}'"
-                + ("" if feedback else " with feedback=False")
-                + ": no controller is made",
-                remedy="leave them out",
-            )
+            "period= and limits= are those of a controller.",
+            expected="a solution of a problem with minimize_expected()",
+            received=f"'{solution.name}'" + ("" if feedback else " with feedback=False") + ": no controller is made",
+            remedy="leave them out",
         )
     return Content(laws=tuple(laws), title=f"{solution.name or 'Solution'}: {', '.join(law.name for law in laws)}.")
 
@@ -248,12 +244,10 @@ def _problem(
     """The solver of a problem."""
     if precision != "double":
         raise ExportError(
-            describe(
-                "A solver is exported in double precision only.",
-                expected="precision='double'",
-                received=f"precision={precision!r}",
-                remedy="leave precision= out; what it plans may be rounded afterwards",
-            )
+            "A solver is exported in double precision only.",
+            expected="precision='double'",
+            received=f"precision={precision!r}",
+            remedy="leave precision= out; what it plans may be rounded afterwards",
         )
     law, linking = solver_law(problem, method, options)
     if tolerance is not None:
@@ -267,12 +261,10 @@ def _functions(what: Any, ranges: Mapping[str, Any], units: Mapping[str, str], t
     listed = isinstance(functions, Sequence) and not isinstance(functions, str) and len(functions) > 0
     if not listed or not all(isinstance(entry, ca.Function) for entry in functions):
         raise ExportError(
-            describe(
-                "This cannot be exported.",
-                expected="a Solution, a casadi.Function, a list of them, or a Problem",
-                received=f"{type(what).__name__}: {what!r}"[:100],
-                remedy="make a casadi.Function of a law: casadi.Function('law', [x, t], [u], ['x', 't'], ['u'])",
-            )
+            "This cannot be exported.",
+            expected="a Solution, a casadi.Function, a list of them, or a Problem",
+            received=f"{type(what).__name__}: {what!r}"[:100],
+            remedy="make a casadi.Function of a law: casadi.Function('law', [x, t], [u], ['x', 't'], ['u'])",
         )
     laws = function_laws(functions, ranges, units, tolerance)
     return Content(laws=tuple(laws), title="Functions: " + ", ".join(law.name for law in laws) + ".")
@@ -292,24 +284,20 @@ def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) 
     for name, value in given.items():
         if value is not None and name not in known:
             raise ExportError(
-                describe(
-                    f"export_c has no option '{name}' for {what}.",
-                    expected="one of " + ", ".join(allowed),
-                    received=f"{name}={value!r}"[:100],
-                    remedy=spelling(name, allowed, "leave it out"),
-                )
+                f"export_c has no option '{name}' for {what}.",
+                expected="one of " + ", ".join(allowed),
+                received=f"{name}={value!r}"[:100],
+                remedy=spelling(name, allowed, "leave it out"),
             )
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     if not isinstance(value, str) or value not in choices:
         raise ExportError(
-            describe(
-                f"The option '{name}' has an unknown value.",
-                expected=" or ".join(map(repr, choices)),
-                received=repr(value)[:100],
-                remedy=f"correct {name}=",
-            )
+            f"The option '{name}' has an unknown value.",
+            expected=" or ".join(map(repr, choices)),
+            received=repr(value)[:100],
+            remedy=f"correct {name}=",
         )
 
 
@@ -323,7 +311,7 @@ def _positive(name: str, value: Any) -> float:
 def _wrong_number(name: str, expected: str, received: Any) -> ExportError:
     """An option that is not the number that it must be."""
     headline = f"The option '{name}' is not " + ("a positive number." if "> 0" in expected else "such a number.")
-    return ExportError(describe(headline, expected=expected, received=repr(received)[:100], remedy=f"correct {name}="))
+    return ExportError(headline, expected=expected, received=repr(received)[:100], remedy=f"correct {name}=")
 
 
 def _version() -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.arguments import checked, either, optional, positives, sequence, text, texts_by_name, truth
-from covocp.base.errors import ProblemError, describe, no_option
+from covocp.base.errors import ProblemError, no_option
 from covocp.base.files import check_target, written_whole
 from covocp.plot.curves import Panel
 from covocp.plot.legends import fold_title, place_legend
@@ -182,20 +182,16 @@ def _labels(solutions: list[Solution], labels: Sequence[str] | None) -> list[str
     """Labels of the solutions: the given ones, else methods or names where they differ, else numbers."""
     if not solutions:
         raise ProblemError(
-            describe(
-                "There is nothing to draw.", expected="at least one solution", received="none", remedy="solve first"
-            )
+            "There is nothing to draw.", expected="at least one solution", received="none", remedy="solve first"
         )
     if labels is not None:
         words = [str(label) for label in labels]
         if isinstance(labels, str) or len(words) != len(solutions):
             raise ProblemError(
-                describe(
-                    "The labels do not fit the solutions.",
-                    expected=f"{len(solutions)} labels",
-                    received=repr(labels),
-                    remedy="give one label for each solution",
-                )
+                "The labels do not fit the solutions.",
+                expected=f"{len(solutions)} labels",
+                received=repr(labels),
+                remedy="give one label for each solution",
             )
         return words
     for candidates in ([s.method for s in solutions], [s.name for s in solutions], [_kind(s) for s in solutions]):

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, half_indices
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
@@ -142,12 +142,10 @@ def _shared(panels: list[Panel]) -> Panel:
     """
     if not panels:
         raise ProblemError(
-            describe(
-                "A panel has nothing to show.",
-                expected="a list of names or symbols that share it",
-                received="an empty list",
-                remedy="name what is to be drawn, or leave the list out",
-            )
+            "A panel has nothing to show.",
+            expected="a list of names or symbols that share it",
+            received="an empty list",
+            remedy="name what is to be drawn, or leave the list out",
         )
     entries: list[str] = []
     curves: list[Curve] = []
@@ -230,12 +228,10 @@ def _uncertain(solutions: list[Solution], word: str, key: Any) -> Any:
         names |= {b.name for solution in loops for b in solution.blocks if b.kind == "control" and b.name != GAIN}
     if not isinstance(of, str) or not names & {of, of.split("[")[0]}:
         raise ProblemError(
-            describe(
-                f"There is no ('{word}', {shortened(key)}).",
-                expected="a state or an unknown with a covariance: " + ", ".join(sorted(names)),
-                received=shortened(key),
-                remedy="choose one of them" + (", or an expression of them" if word == RMS else ""),
-            )
+            f"There is no ('{word}', {shortened(key)}).",
+            expected="a state or an unknown with a covariance: " + ", ".join(sorted(names)),
+            received=shortened(key),
+            remedy="choose one of them" + (", or an expression of them" if word == RMS else ""),
         )
     return of
 
@@ -249,12 +245,10 @@ def _declared(solutions: list[Solution], word: str) -> bool:
 def _unknown_word(word: str) -> ProblemError:
     needed = {FILTER: "a measurement and an estimation covariance", RMS: "an estimation covariance"}
     return ProblemError(
-        describe(
-            f"'{word}' is not in this solution.",
-            expected=f"a problem with {needed.get(word, 'minimize_expected()')}",
-            received=f"'{word}' of a problem without",
-            remedy="draw something else",
-        )
+        f"'{word}' is not in this solution.",
+        expected=f"a problem with {needed.get(word, 'minimize_expected()')}",
+        received=f"'{word}' of a problem without",
+        remedy="draw something else",
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.plot.curves import Drawn, Ellipse, Panel, shortened, unit_of
 from covocp.statement.names import block_of
@@ -37,12 +37,10 @@ def over_panels(drawn: Sequence[Drawn], panels: list[Panel], key: Any, units: Ma
             at_nodes = solution[key]
             if at_nodes.ndim != 1:
                 raise ProblemError(
-                    describe(
-                        "The abscissa of a figure is one number at each time.",
-                        expected="a scalar state, control or expression",
-                        received=f"{shortened(key)}, {at_nodes[0].size} numbers",
-                        remedy="choose over= among the scalars, or one entry of it",
-                    )
+                    "The abscissa of a figure is one number at each time.",
+                    expected="a scalar state, control or expression",
+                    received=f"{shortened(key)}, {at_nodes[0].size} numbers",
+                    remedy="choose over= among the scalars, or one entry of it",
                 )
             smooth = solution.at(curve.t)[key] if isinstance(key, str) else np.interp(curve.t, solution.t, at_nodes)
             curves.append(replace(curve, t=smooth))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_inside, column, data_column, is_symbolic
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 
 
@@ -42,12 +42,10 @@ def check_free(name: str, what: str, value: Any) -> None:
     """
     if any(isinstance(entry, (float, np.floating)) and np.isnan(entry) for entry in _entries(value)):
         raise ProblemError(
-            describe(
-                f"The {what} of '{name}' contains NaN.",
-                expected="finite numbers; None, by itself or in a sequence, for what is free",
-                received=str(value)[:200],
-                remedy=f"write None for what is free, such as [1.0, None]; otherwise correct the {what} of '{name}'",
-            )
+            f"The {what} of '{name}' contains NaN.",
+            expected="finite numbers; None, by itself or in a sequence, for what is free",
+            received=str(value)[:200],
+            remedy=f"write None for what is free, such as [1.0, None]; otherwise correct the {what} of '{name}'",
         )
 
 

@@ -30,7 +30,7 @@ from covocp.base.checks import (
     is_symbolic,
     scale_column,
 )
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import pack_symbolic
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
@@ -322,12 +322,10 @@ class Problem:
         labels = augmented_names(entries)
         if not labels:
             raise ProblemError(
-                describe(
-                    "There is nothing to estimate.",
-                    expected="states and unknowns declared before estimation_covariance()",
-                    received="none",
-                    remedy="call estimation_covariance() after the last state() and unknown()",
-                )
+                "There is nothing to estimate.",
+                expected="states and unknowns declared before estimation_covariance()",
+                received="none",
+                remedy="call estimation_covariance() after the last state() and unknown()",
             )
         self._declare("E", len(labels))
         if initial is None:
@@ -360,24 +358,20 @@ class Problem:
             matrix = next((entry for entry in self.matrices if entry.name == name and not entry.estimation), None)
             if matrix is None or noise is not None:
                 raise ProblemError(
-                    describe(
-                        f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
-                        expected="a state, or a symmetric matrix without noise",
-                        received=f"'{name}'",
-                        remedy="unknowns are constant, and the estimation covariance has its rate already",
-                    )
+                    f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
+                    expected="a state, or a symmetric matrix without noise",
+                    received=f"'{name}'",
+                    remedy="unknowns are constant, and the estimation covariance has its rate already",
                 )
             full = as_expression(name, "rate", rate, (matrix.size, matrix.size))
             check_symmetric(name, "rate", full)
             value, density = pack_symbolic(full), None
         if name in self.rates:
             raise ProblemError(
-                describe(
-                    f"The rate of '{name}' is given twice.",
-                    expected="one call of dynamics() for each state",
-                    received=f"a first one at {self.rates[name].where}",
-                    remedy="remove one of them",
-                )
+                f"The rate of '{name}' is given twice.",
+                expected="one call of dynamics() for each state",
+                received=f"a first one at {self.rates[name].where}",
+                remedy="remove one of them",
             )
         one = density is not None and is_scalar(noise)
         self.rates[name] = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
@@ -477,12 +471,10 @@ class Problem:
         label = name if name is not None else f"constraint {len(self.constraints) + 1}"
         if not isinstance(at, str) or at not in ("path", "initial", "final"):
             raise ProblemError(
-                describe(
-                    f"'{label}' has an unknown place.",
-                    expected="at='path', 'initial' or 'final'",
-                    received=repr(at),
-                    remedy="choose one of the three",
-                )
+                f"'{label}' has an unknown place.",
+                expected="at='path', 'initial' or 'final'",
+                received=repr(at),
+                remedy="choose one of the three",
             )
         value = column_expression(label, "constraint", expression)
         constants = [q.symbol for q in self.parameters] + [q.symbol for q in self.unknowns] + [self._time]

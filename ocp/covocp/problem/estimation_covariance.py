@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 
 from covocp.base.checks import is_symbolic
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.declarations import Matrix, State, Unknown
 
@@ -53,12 +53,10 @@ class EstimationCovariance:
         """
         if not isinstance(key, tuple) or len(key) != 2:
             raise ProblemError(
-                describe(
-                    "A covariance is indexed by two symbols.",
-                    expected="E[a, b] with a, b of " + ", ".join(self.labels),
-                    received=f"E[{key}]",
-                    remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
-                )
+                "A covariance is indexed by two symbols.",
+                expected="E[a, b] with a, b of " + ", ".join(self.labels),
+                received=f"E[{key}]",
+                remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
             )
         left, right = (self._rows(entry) for entry in key)
         if isinstance(left, slice) and isinstance(right, slice):
@@ -85,11 +83,9 @@ class EstimationCovariance:
         jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
         if jacobian.nnz() == 0:
             raise ProblemError(
-                describe(
-                    f"'{key}' is not part of the estimated state.",
-                    expected="a symbol or name of " + ", ".join(self.labels),
-                    received=str(key),
-                    remedy="index the covariance with states and unknowns of this problem",
-                )
+                f"'{key}' is not part of the estimated state.",
+                expected="a symbol or name of " + ", ".join(self.labels),
+                received=str(key),
+                remedy="index the covariance with states and unknowns of this problem",
             )
         return ca.densify(jacobian)

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_dynamics, density_matrix
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.problem.declarations import Expansion, Expected
 
 if TYPE_CHECKING:
@@ -108,21 +108,17 @@ def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> An
     for i, name in enumerate(names):
         if not weights.sparsity().has_nz(i, i) or (numbers is not None and numbers[i, i] == 0):
             raise ProblemError(
-                describe(
-                    f"The control '{name}' has no weight: the second derivative of the running cost by it is zero.",
-                    expected="a positive weight of its deviations, or the feedback gain would be infinite",
-                    received=f"running = {expected.running}",
-                    remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
-                )
+                f"The control '{name}' has no weight: the second derivative of the running cost by it is zero.",
+                expected="a positive weight of its deviations, or the feedback gain would be infinite",
+                received=f"running = {expected.running}",
+                remedy=f"give control_weight={{{name.split('[')[0]}: ...}} to minimize_expected()",
             )
     if numbers is not None and np.linalg.eigvalsh(numbers)[0] <= 0:
         raise ProblemError(
-            describe(
-                f"The weight of the controls {', '.join(names)} is not positive definite.",
-                expected="a minimum of the running cost by the controls, or control_weight= in its place",
-                received=f"second derivatives {numbers.tolist()}",
-                remedy="give control_weight={...} to minimize_expected(), or correct the running cost",
-            )
+            f"The weight of the controls {', '.join(names)} is not positive definite.",
+            expected="a minimum of the running cost by the controls, or control_weight= in its place",
+            received=f"second derivatives {numbers.tolist()}",
+            remedy="give control_weight={...} to minimize_expected(), or correct the running cost",
         )
     return ca.sparsify(ca.evalf(weights)) if constant else weights
 
@@ -137,13 +133,11 @@ def _check_terminal_weights(problem: Problem, end: Any) -> None:
         for i in range(state.size):
             if not free[i] and not end.sparsity().has_nz(offset + i, offset + i):
                 raise ProblemError(
-                    describe(
-                        f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
-                        expected="a weight of its deviation at the end: only the nominal meets a terminal condition "
-                        "exactly, the actual system scatters around it",
-                        received=f"final value of {state.name}, no terminal cost or weight of it",
-                        remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
-                        "to scatter",
-                    )
+                    f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
+                    expected="a weight of its deviation at the end: only the nominal meets a terminal condition "
+                    "exactly, the actual system scatters around it",
+                    received=f"final value of {state.name}, no terminal cost or weight of it",
+                    remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
+                    "to scatter",
                 )
         offset += state.size

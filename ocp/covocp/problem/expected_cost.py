@@ -33,7 +33,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_expression, as_number, caller, density_matrix, find_name
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.problem.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, State, declare_matrix
@@ -55,12 +55,10 @@ def expected_cost(
     """Check and keep what `Problem.minimize_expected` was given."""
     if gain is not None and not isinstance(gain, Gain):
         raise ProblemError(
-            describe(
-                "The gain of minimize_expected() is not a description of a gain.",
-                expected="Gain(structure=..., constant=..., lower=..., upper=...), or None for the best gain",
-                received=repr(gain)[:100],
-                remedy="correct gain=, or leave it out",
-            )
+            "The gain of minimize_expected() is not a description of a gain.",
+            expected="Gain(structure=..., constant=..., lower=..., upper=...), or None for the best gain",
+            received=repr(gain)[:100],
+            remedy="correct gain=, or leave it out",
         )
     entries: list[Any] = [*problem.states, *problem.unknowns]
     return Expected(
@@ -78,14 +76,12 @@ def check_first_cost(problem: Any, call: str) -> None:
     former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
     if former:
         raise ProblemError(
-            describe(
-                "The cost is given twice.",
-                expected="one call of minimize() or minimize_expected()",
-                received=f"{call}() after {former}()",
-                remedy="add the terms up in one call"
-                if call == former
-                else "use one of the two: minimize_expected() stands in place of minimize()",
-            )
+            "The cost is given twice.",
+            expected="one call of minimize() or minimize_expected()",
+            received=f"{call}() after {former}()",
+            remedy="add the terms up in one call"
+            if call == former
+            else "use one of the two: minimize_expected() stands in place of minimize()",
         )
 
 
@@ -168,21 +164,17 @@ def deterministic(problem: Problem) -> Problem:
     expected = problem.expected
     if expected is None:
         raise ProblemError(
-            describe(
-                "nominal='deterministic' needs an expected cost.",
-                expected="a problem with minimize_expected()",
-                received=f"'{problem.name}' with minimize()",
-                remedy="leave nominal= out: the cost is deterministic already",
-            )
+            "nominal='deterministic' needs an expected cost.",
+            expected="a problem with minimize_expected()",
+            received=f"'{problem.name}' with minimize()",
+            remedy="leave nominal= out: the cost is deterministic already",
         )
     if expected.gain is not None:
         raise ProblemError(
-            describe(
-                "nominal='deterministic' needs the best gain.",
-                expected="minimize_expected() without gain=: the gain follows from the nominal",
-                received=str(expected.gain),
-                remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
-            )
+            "nominal='deterministic' needs the best gain.",
+            expected="minimize_expected() without gain=: the gain follows from the nominal",
+            received=str(expected.gain),
+            remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
         )
     plain = _copied(problem)
     plain.cost = (expected.running, expected.terminal)
@@ -194,12 +186,10 @@ def deterministic(problem: Problem) -> Problem:
         chosen.add(problem.duration.__hash__())
     if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*plain.cost))):
         raise ProblemError(
-            describe(
-                "The deterministic part of the expected cost depends on nothing that can be chosen.",
-                expected="a running or terminal cost of states, controls or the free duration",
-                received=f"running = {expected.running}, terminal = {expected.terminal}",
-                remedy="evaluate(problem, nominal=...) takes any nominal; or add a small deterministic cost",
-            )
+            "The deterministic part of the expected cost depends on nothing that can be chosen.",
+            expected="a running or terminal cost of states, controls or the free duration",
+            received=f"running = {expected.running}, terminal = {expected.terminal}",
+            remedy="evaluate(problem, nominal=...) takes any nominal; or add a small deterministic cost",
         )
     return plain
 
@@ -223,12 +213,10 @@ def _check_random(problem: Problem) -> None:
     uncertain = [*(started or variances), *densities]
     if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
         raise ProblemError(
-            describe(
-                "The expected cost is deterministic: nothing in the system is uncertain.",
-                expected="variance= of a state or an unknown, or noise= in dynamics()",
-                received="no initial variance and no process noise",
-                remedy="use minimize() for a deterministic problem, or say what is uncertain",
-            )
+            "The expected cost is deterministic: nothing in the system is uncertain.",
+            expected="variance= of a state or an unknown, or noise= in dynamics()",
+            received="no initial variance and no process noise",
+            remedy="use minimize() for a deterministic problem, or say what is uncertain",
         )
 
 
@@ -236,12 +224,10 @@ def _check_contents(problem: Problem, expected: Expected) -> None:
     """There is a control, the actual system contains no matrices, and the weights no symbols of another problem."""
     if not problem.controls:
         raise ProblemError(
-            describe(
-                "An expected cost needs a control: without one nothing is fed back.",
-                expected="control(...), whose deviations the feedback chooses",
-                received="none",
-                remedy="declare one; or state a cost of the covariance, by estimation_covariance() and minimize()",
-            )
+            "An expected cost needs a control: without one nothing is fed back.",
+            expected="control(...), whose deviations the feedback chooses",
+            received="none",
+            remedy="declare one; or state a cost of the covariance, by estimation_covariance() and minimize()",
         )
     own: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
     known = {symbol.__hash__() for symbol in (problem.time, problem.duration, *(entry.symbol for entry in own))}
@@ -260,14 +246,12 @@ def _check_contents(problem: Problem, expected: Expected) -> None:
             if matrix is not None or (symbol.__hash__() not in known and what.endswith("weight")):
                 content = f"the matrix '{matrix}'" if matrix else f"'{symbol.name()}', which is not a symbol of it"
                 raise ProblemError(
-                    describe(
-                        f"The {what} of a problem with an expected cost contains {content}.",
-                        expected="states, unknowns, controls, parameters, time: the actual system has no covariance",
-                        received=str(expression)[:200],
-                        remedy="state a cost or a condition of covariances by minimize() or subject_to()"
-                        if matrix
-                        else f"declare '{symbol.name()}' in this problem",
-                    )
+                    f"The {what} of a problem with an expected cost contains {content}.",
+                    expected="states, unknowns, controls, parameters, time: the actual system has no covariance",
+                    received=str(expression)[:200],
+                    remedy="state a cost or a condition of covariances by minimize() or subject_to()"
+                    if matrix
+                    else f"declare '{symbol.name()}' in this problem",
                 )
 
 
@@ -276,12 +260,10 @@ def _check_free_names(problem: Problem) -> None:
     for entry in problem._declared:
         if entry.name in (FEEDBACK, ESTIMATE, GAIN):
             raise ProblemError(
-                describe(
-                    f"The name '{entry.name}' is taken by minimize_expected().",
-                    expected=f"any name but {FEEDBACK}, {ESTIMATE}, {GAIN}: they are the matrices of the feedback",
-                    received=f"'{entry.name}', declared at {entry.where}",
-                    remedy="choose another name",
-                )
+                f"The name '{entry.name}' is taken by minimize_expected().",
+                expected=f"any name but {FEEDBACK}, {ESTIMATE}, {GAIN}: they are the matrices of the feedback",
+                received=f"'{entry.name}', declared at {entry.where}",
+                remedy="choose another name",
             )
 
 
@@ -373,22 +355,18 @@ def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, An
             numbers = np.full(shape, float(numbers.reshape(())))
         if numbers.shape != shape or np.isnan(numbers).any():
             raise ProblemError(
-                describe(
-                    f"The {what} of the gain does not fit.",
-                    expected=f"a number, or an array of shape {shape}: controls by augmented states, without NaN",
-                    received=f"shape {numbers.shape}",
-                    remedy=f"correct Gain({what}=...)",
-                )
+                f"The {what} of the gain does not fit.",
+                expected=f"a number, or an array of shape {shape}: controls by augmented states, without NaN",
+                received=f"shape {numbers.shape}",
+                remedy=f"correct Gain({what}=...)",
             )
         values.append(numbers)
     pattern, low, high, guess = values
     if not pattern.any() or (low > high).any():
         raise ProblemError(
-            describe(
-                "The gain leaves nothing to choose.",
-                expected="a structure with at least one entry, and lower <= upper",
-                received=str(gain),
-                remedy="correct Gain(...)",
-            )
+            "The gain leaves nothing to choose.",
+            expected="a structure with at least one entry, and lower <= upper",
+            received=str(gain),
+            remedy="correct Gain(...)",
         )
     return pattern != 0, low, high, np.clip(guess, low, high)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_kind
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, unpack
 from covocp.blocks.bucy import time_step
 from covocp.blocks.extended import bucy_slopes, corrected_by, propagated
@@ -112,12 +112,10 @@ class _System:
         statement = _statement(problem)
         if statement.coupled:
             raise ProblemError(
-                describe(
-                    "The dynamics depend on matrices of the problem.",
-                    expected="rates of states, unknowns, controls and time",
-                    received="rates that contain a covariance or another matrix state",
-                    remedy="build the filter from f and h with kalman.extended",
-                )
+                "The dynamics depend on matrices of the problem.",
+                expected="rates of states, unknowns, controls and time",
+                received="rates that contain a covariance or another matrix state",
+                remedy="build the filter from f and h with kalman.extended",
             )
         kind: Any = statement.symbolic
         known, means = _parameters(statement)

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_dynamics
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.problem.declarations import Constraint, Matrix, Place
@@ -113,40 +113,32 @@ def _check_complete(problem: Problem) -> None:
     check_dynamics(moving, problem.rates)
     if not problem.states:
         raise ProblemError(
-            describe(
-                "The problem has no state.", expected="at least one state", received="none", remedy="add one by state()"
-            )
+            "The problem has no state.", expected="at least one state", received="none", remedy="add one by state()"
         )
     if problem.cost is None:
         raise ProblemError(
-            describe(
-                "The problem has no cost.",
-                expected="minimize(running=..., terminal=...), or minimize_expected",
-                received="none",
-                remedy="say what is to be minimised",
-            )
+            "The problem has no cost.",
+            expected="minimize(running=..., terminal=...), or minimize_expected",
+            received="none",
+            remedy="say what is to be minimised",
         )
     if not problem.controls and problem.free_duration is None:
         free = [s for s in problem.states if not s.initial.is_constant() or np.isnan(ca.evalf(s.initial).full()).any()]
         if not free:
             raise ProblemError(
-                describe(
-                    "There is nothing to choose.",
-                    expected="a control, a free initial value or a free duration",
-                    received="none of them",
-                    remedy="declare a control by control()",
-                )
+                "There is nothing to choose.",
+                expected="a control, a free initial value or a free duration",
+                received="none of them",
+                remedy="declare a control by control()",
             )
     entry_augmented = sum(entry.size for entry in _estimated(problem))
     covariance = next((m for m in problem.matrices if m.estimation), None)
     if covariance is not None and covariance.size != entry_augmented:
         raise ProblemError(
-            describe(
-                "States or unknowns were declared after estimation_covariance().",
-                expected="estimation_covariance() after the last state() and unknown()",
-                received=f"a covariance of {covariance.size} rows for {entry_augmented} states and unknowns",
-                remedy="move the call down",
-            )
+            "States or unknowns were declared after estimation_covariance().",
+            expected="estimation_covariance() after the last state() and unknown()",
+            received=f"a covariance of {covariance.size} rows for {entry_augmented} states and unknowns",
+            remedy="move the call down",
         )
     _check_symbols(problem)
     check_readings(problem.measurements, problem.matrices)
@@ -168,14 +160,12 @@ def _check_symbols(problem: Problem) -> None:
             if symbol.__hash__() not in hashes:
                 twin = symbol.name() in known
                 raise ProblemError(
-                    describe(
-                        f"There is an unknown symbol '{symbol.name()}' in {what}.",
-                        expected="symbols of this problem: " + ", ".join(known),
-                        received=str(expression)[:200] + (" with a symbol of another problem" if twin else ""),
-                        remedy=f"use the '{symbol.name()}' that was declared in this problem"
-                        if twin
-                        else f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
-                    )
+                    f"There is an unknown symbol '{symbol.name()}' in {what}.",
+                    expected="symbols of this problem: " + ", ".join(known),
+                    received=str(expression)[:200] + (" with a symbol of another problem" if twin else ""),
+                    remedy=f"use the '{symbol.name()}' that was declared in this problem"
+                    if twin
+                    else f"declare '{symbol.name()}' with state(), unknown(), parameter() or control()",
                 )
     passing: list[Any] = [*problem.controls, SimpleNamespace(name="time", symbol=problem.time)]
     terminal_cost = problem.cost[1] if problem.cost is not None else ca.MX(0)
@@ -183,23 +173,19 @@ def _check_symbols(problem: Problem) -> None:
     for entry in passing:
         if entry.symbol.__hash__() in terminal:
             raise ProblemError(
-                describe(
-                    f"The terminal cost contains '{entry.name}'.",
-                    expected="states, matrix states, parameters and the duration",
-                    received=str(terminal_cost)[:200],
-                    remedy="use Problem.duration for the terminal time; controls belong into the running cost",
-                )
+                f"The terminal cost contains '{entry.name}'.",
+                expected="states, matrix states, parameters and the duration",
+                received=str(terminal_cost)[:200],
+                remedy="use Problem.duration for the terminal time; controls belong into the running cost",
             )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
     if all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
         raise ProblemError(
-            describe(
-                "The cost depends on nothing that can be chosen.",
-                expected="a cost of states, controls, matrix states or the free duration",
-                received="running = {}, terminal = {}".format(*problem.cost or ()),
-                remedy="check the arguments of minimize()",
-            )
+            "The cost depends on nothing that can be chosen.",
+            expected="a cost of states, controls, matrix states or the free duration",
+            received="running = {}, terminal = {}".format(*problem.cost or ()),
+            remedy="check the arguments of minimize()",
         )
 
 
@@ -409,12 +395,10 @@ def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
     for symbol in ca.symvar(ca.veccat(*outputs)):
         if symbol.__hash__() not in known:
             raise ProblemError(
-                describe(
-                    f"An initial or final value contains '{symbol.name()}'.",
-                    expected="numbers, or expressions of parameters of this problem",
-                    received=f"'{symbol.name()}'",
-                    remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
-                )
+                f"An initial or final value contains '{symbol.name()}'.",
+                expected="numbers, or expressions of parameters of this problem",
+                received=f"'{symbol.name()}'",
+                remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
             )
     arguments = [p[i:j] for i, j in pairwise(offsets)]
     values = ca.Function("boundary", own, outputs).call(arguments, True, False)

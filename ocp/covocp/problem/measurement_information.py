@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 
 from covocp.base.checks import check_density, density_matrix
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.problem.declarations import Matrix, Measurement
 
 # The density that stands for no information is the inverse of this: a sensor of such noise tells nothing in double
@@ -24,12 +24,10 @@ def stated_noise(name: str, noise: Any, information: Any, size: int) -> tuple[An
     """
     if (noise is None) == (information is None):
         raise ProblemError(
-            describe(
-                f"The noise of the measurement '{name}' is given {'not at all' if noise is None else 'twice'}.",
-                expected="noise=, its power spectral density, or information=, the inverse of it",
-                received="neither" if noise is None else "both",
-                remedy="give one of them",
-            )
+            f"The noise of the measurement '{name}' is given {'not at all' if noise is None else 'twice'}.",
+            expected="noise=, its power spectral density, or information=, the inverse of it",
+            received="neither" if noise is None else "both",
+            remedy="give one of them",
         )
     if information is None:
         density = density_matrix(name, "noise density", noise, size)
@@ -42,12 +40,10 @@ def stated_noise(name: str, noise: Any, information: Any, size: int) -> tuple[An
     diagonal = ca.densify(ca.diag(stated))
     if not stated.sparsity().is_diag():
         raise ProblemError(
-            describe(
-                f"The information of the measurement '{name}' is not diagonal.",
-                expected=f"a number or {size} numbers" if size > 1 else "a number",
-                received=str(stated)[:200],
-                remedy="state measurements without correlation, or give their noise= as a matrix",
-            )
+            f"The information of the measurement '{name}' is not diagonal.",
+            expected=f"a number or {size} numbers" if size > 1 else "a number",
+            received=str(stated)[:200],
+            remedy="state measurements without correlation, or give their noise= as a matrix",
         )
     return ca.diag(1.0 / ca.fmax(diagonal, LEAST)), ca.diag(diagonal)
 
@@ -74,11 +70,9 @@ def check_readings(measurements: list[Measurement], matrices: list[Matrix]) -> N
             for symbol in ca.symvar(value):
                 if symbol.__hash__() in names:
                     raise ProblemError(
-                        describe(
-                            f"The {what}measurement '{measurement.name}' contains the matrix "
-                            f"'{names[symbol.__hash__()]}' (declared at {measurement.where}).",
-                            expected="states, unknowns, controls, parameters and time",
-                            received=str(value)[:200],
-                            remedy="measure what the actual system shows; matrices go into costs and constraints",
-                        )
+                        f"The {what}measurement '{measurement.name}' contains the matrix "
+                        f"'{names[symbol.__hash__()]}' (declared at {measurement.where}).",
+                        expected="states, unknowns, controls, parameters and time",
+                        received=str(value)[:200],
+                        remedy="measure what the actual system shows; matrices go into costs and constraints",
                     )

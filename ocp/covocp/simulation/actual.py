@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, unpack
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
@@ -72,22 +72,18 @@ def design_system(solution: Solution) -> System:
     statement = solution.statement
     if statement is None:
         raise ProblemError(
-            describe(
-                "This solution knows no problem, so there is nothing to simulate.",
-                expected="a solution with its problem",
-                received=f"'{solution.name}', read from a file",
-                remedy="load(path, problem=...) with the problem that was solved",
-            )
+            "This solution knows no problem, so there is nothing to simulate.",
+            expected="a solution with its problem",
+            received=f"'{solution.name}', read from a file",
+            remedy="load(path, problem=...) with the problem that was solved",
         )
     block = _estimation(statement)
     if block is None:
         raise ProblemError(
-            describe(
-                "Nothing is estimated in this problem, so there is neither noise nor a filter to simulate.",
-                expected="a problem with minimize_expected() or estimation_covariance()",
-                received=f"'{statement.name}' without either",
-                remedy="say what is uncertain (variance=, noise=) and call estimation_covariance()",
-            )
+            "Nothing is estimated in this problem, so there is neither noise nor a filter to simulate.",
+            expected="a problem with minimize_expected() or estimation_covariance()",
+            received=f"'{statement.name}' without either",
+            remedy="say what is uncertain (variance=, noise=) and call estimation_covariance()",
         )
     start = np.concatenate([solution.trajectory.x[0], solution.parameters])
     return _system(
@@ -116,13 +112,10 @@ def actual_system(design: System, truth: Any) -> System:
         return _with_values(design, truth)
     if not isinstance(truth, Problem):
         raise ProblemError(
-            describe(
-                "The truth is of an unknown kind.",
-                expected="a Problem with the same states, unknowns, controls and measurements, or a dict of name to "
-                "value",
-                received=repr(truth)[:100],
-                remedy="correct truth=",
-            )
+            "The truth is of an unknown kind.",
+            expected="a Problem with the same states, unknowns, controls and measurements, or a dict of name to value",
+            received=repr(truth)[:100],
+            remedy="correct truth=",
         )
     _check_measured(design, truth)
     statement = _statement_of(truth)
@@ -165,12 +158,10 @@ def _linear(statement: Statement, fed_back: int) -> ca.Function:
     form = statement.riccati[position]
     if statement.nominal is None or form is None:
         raise ProblemError(
-            describe(
-                "The dynamics depend on a matrix, which the actual system does not have.",
-                expected="rates of the states that depend on states, controls, time and parameters",
-                received=f"'{statement.name}', a rate of which contains a matrix",
-                remedy="simulate a problem whose states move without the matrices",
-            )
+            "The dynamics depend on a matrix, which the actual system does not have.",
+            expected="rates of the states that depend on states, controls, time and parameters",
+            received=f"'{statement.name}', a rate of which contains a matrix",
+            remedy="simulate a problem whose states move without the matrices",
         )
     symbolic: Any = statement.symbolic
     sizes = (statement.nx, statement.nu, 1, 1, statement.np)
@@ -244,13 +235,10 @@ def _check_symbols(design: System, truth: Statement) -> None:
         other = [(b.name, b.size) for b in truth.blocks if b.kind == kind]
         if own != other:
             raise ProblemError(
-                describe(
-                    f"The truth has other {what} than the design.",
-                    expected=_listed(own),
-                    received=_listed(other),
-                    remedy=f"declare the same {what} in the same order and size; dynamics, noises and variances may "
-                    "differ",
-                )
+                f"The truth has other {what} than the design.",
+                expected=_listed(own),
+                received=_listed(other),
+                remedy=f"declare the same {what} in the same order and size; dynamics, noises and variances may differ",
             )
 
 
@@ -260,12 +248,10 @@ def _check_measured(design: System, truth: Problem) -> None:
     rows = sum(m.expression.shape[0] for m in truth.measurements)
     if names != tuple(m.name for m in truth.measurements) or rows != design.measured:
         raise ProblemError(
-            describe(
-                "The truth has other measurements than the design.",
-                expected=f"{', '.join(names) or 'none'}: {design.measured} values",
-                received=f"{', '.join(m.name for m in truth.measurements) or 'none'}: {rows} values",
-                remedy="declare the same measurements in the same order and size; expressions and noises may differ",
-            )
+            "The truth has other measurements than the design.",
+            expected=f"{', '.join(names) or 'none'}: {design.measured} values",
+            received=f"{', '.join(m.name for m in truth.measurements) or 'none'}: {rows} values",
+            remedy="declare the same measurements in the same order and size; expressions and noises may differ",
         )
 
 

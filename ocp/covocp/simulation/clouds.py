@@ -10,7 +10,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, optional, positives, text, texts_by_name
 from covocp.base.checks import as_number
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
 from covocp.plot.figure import (
@@ -146,12 +146,10 @@ def _chosen(sample: MonteCarlo, names: tuple[Any, ...]) -> tuple[list[tuple[str,
 
 def _wrong(name: str, expected: str, received: Any) -> ProblemError:
     return ProblemError(
-        describe(
-            f"The argument '{name}' of plot_monte_carlo() is wrong.",
-            expected=expected,
-            received=repr(received)[:100],
-            remedy=f"correct {name}",
-        )
+        f"The argument '{name}' of plot_monte_carlo() is wrong.",
+        expected=expected,
+        received=repr(received)[:100],
+        remedy=f"correct {name}",
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
-from covocp.base.errors import CovocpError, ProblemError, describe, shown
+from covocp.base.errors import CovocpError, ProblemError, shown
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
@@ -384,12 +384,10 @@ def _value(function: Law, *arguments: Any) -> Any:
         raise
     except Exception as error:  # whatever a function of the user raises
         raise ProblemError(
-            describe(
-                "A function of the loop fails.",
-                expected="functions as simulate_law() says: plant (x, u), law (estimate, t), running (x, u)",
-                received=f"{type(error).__name__} in {shown(function, 60)}: {error}"[:300],
-                remedy="call it by itself with a state and a control of these sizes",
-            )
+            "A function of the loop fails.",
+            expected="functions as simulate_law() says: plant (x, u), law (estimate, t), running (x, u)",
+            received=f"{type(error).__name__} in {shown(function, 60)}: {error}"[:300],
+            remedy="call it by itself with a state and a control of these sizes",
         ) from error
     return numbers.ravel() if numbers.ndim < 2 or numbers.shape[1] == 1 else numbers
 

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.arguments import checked, one_of
 from covocp.base.arguments import truth as a_truth
 from covocp.base.checks import as_number
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
@@ -206,12 +206,10 @@ class MonteCarlo:
         """
         if not self.estimated:
             raise ProblemError(
-                describe(
-                    "There are no errors of estimates.",
-                    expected="a filter of the design, or a law with an attribute 'estimate'",
-                    received="a law without one",
-                    remedy="let the law tell its estimate of the deviation from the nominal, (n,)",
-                )
+                "There are no errors of estimates.",
+                expected="a filter of the design, or a law with an attribute 'estimate'",
+                received="a law without one",
+                remedy="let the law tell its estimate of the deviation from the nominal, (n,)",
             )
         one, two = self.rows(a, controls=False)[0], self.rows(a if b is None else b, controls=False)[0]
         n, product = self.size, self.moments.product
@@ -239,12 +237,10 @@ class MonteCarlo:
         limit = as_number(block.name, "largest deviation", value)
         if limit.size not in (1, block.size) or not (limit >= 0).all():
             raise ProblemError(
-                describe(
-                    f"The largest deviation of '{block.name}' does not fit.",
-                    expected="a number that is not negative" + (f", or {block.size} of them" if block.size > 1 else ""),
-                    received=repr(value),
-                    remedy="correct value",
-                )
+                f"The largest deviation of '{block.name}' does not fit.",
+                expected="a number that is not negative" + (f", or {block.size} of them" if block.size > 1 else ""),
+                received=repr(value),
+                remedy="correct value",
             )
         beyond = (np.abs(self.deviations[:, rows]) > limit.ravel()).any(axis=1)
         return float((beyond | ~self.stayed).mean())

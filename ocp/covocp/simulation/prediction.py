@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.simulation.actual import System
 from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
@@ -165,12 +165,10 @@ def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: S
     sides = [_evaluate(solution, joint, t, grid.interval, actual, n)[0] for t in (grid.t[:-1], grid.t[1:])]
     if not all(np.isfinite(side).all() for side in sides):
         raise ProblemError(
-            describe(
-                "The loop of this solution becomes NaN or inf along its nominal.",
-                expected="finite dynamics, gains and noise densities",
-                received=f"'{solution.name}': {solution.status}",
-                remedy="simulate a solution that converged, or mend the truth",
-            )
+            "The loop of this solution becomes NaN or inf along its nominal.",
+            expected="finite dynamics, gains and noise densities",
+            received=f"'{solution.name}': {solution.status}",
+            remedy="simulate a solution that converged, or mend the truth",
         )
     whole = [_fastest(side) for side in sides]
     # With an estimate that is right the deviation goes by F - G C.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from covocp.base.arguments import MOST, is_whole, positive
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.simulation.schedule import Filter
 from covocp.simulation.vectorised import padded
 
@@ -51,10 +51,8 @@ class Request:
 def wrong_argument(name: str, expected: str, received: Any, remedy: str | None = None) -> ProblemError:
     """An argument of `simulate` that means nothing."""
     return ProblemError(
-        describe(
-            f"The argument '{name}' of simulate() is wrong.",
-            expected=expected,
-            received=(received if isinstance(received, str) else repr(received))[:200],
-            remedy=remedy or f"correct {name}=",
-        )
+        f"The argument '{name}' of simulate() is wrong.",
+        expected=expected,
+        received=(received if isinstance(received, str) else repr(received))[:200],
+        remedy=remedy or f"correct {name}=",
     )

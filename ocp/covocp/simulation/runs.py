@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import checked, truth
-from covocp.base.errors import ProblemError, SolveError, describe, warn_user
+from covocp.base.errors import ProblemError, SolveError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
@@ -139,21 +139,17 @@ def _design(solution: Solution) -> System:
     """The system of a solution, which should have converged."""
     if not isinstance(solution, Solution):
         raise ProblemError(
-            describe(
-                "This cannot be simulated.",
-                expected="a Solution",
-                received=type(solution).__name__,
-                remedy="solve or evaluate the problem first: simulate(solve(problem), runs, seed)",
-            )
+            "This cannot be simulated.",
+            expected="a Solution",
+            received=type(solution).__name__,
+            remedy="solve or evaluate the problem first: simulate(solve(problem), runs, seed)",
         )
     if solution.message.startswith(UNDER_TRUTH):
         raise ProblemError(
-            describe(
-                "This solution was evaluated under other statistics, which simulate() does not see in it.",
-                expected="the solution of the design",
-                received=f"'{solution.name}', {solution.message}",
-                remedy="simulate(design, runs, seed, truth=...) with the same truth",
-            )
+            "This solution was evaluated under other statistics, which simulate() does not see in it.",
+            expected="the solution of the design",
+            received=f"'{solution.name}', {solution.message}",
+            remedy="simulate(design, runs, seed, truth=...) with the same truth",
         )
     design = design_system(solution)
     if not solution.converged:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
@@ -60,12 +60,10 @@ class Grid:
         needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
         if not float(np.sum(needed)) <= MOST_STEPS:
             raise ProblemError(
-                describe(
-                    "The simulation would need too many steps.",
-                    expected=f"at most {MOST_STEPS:.0e} steps a run",
-                    received=f"{float(np.sum(needed)):.1e} steps of {float(np.min(length)):.2g} s",
-                    remedy="correct the truth if it moves too fast, or give a longer step=",
-                )
+                "The simulation would need too many steps.",
+                expected=f"at most {MOST_STEPS:.0e} steps a run",
+                received=f"{float(np.sum(needed)):.1e} steps of {float(np.min(length)):.2g} s",
+                remedy="correct the truth if it moves too fast, or give a longer step=",
             )
         return needed.astype(int)
 

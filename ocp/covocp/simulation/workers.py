@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.threads import TURN
 from covocp.simulation.batches import Batch, StoppedError, run_batch
 from covocp.simulation.flown import LawFailedError
@@ -130,13 +130,11 @@ def _submit(executor: Any, plan: Plan, first: int, last: int) -> Any:
     future = submit(run_batch, plan, first, last) if callable(submit) else None
     if not isinstance(future, concurrent.futures.Future):
         raise ProblemError(
-            describe(
-                "This executor cannot be used.",
-                expected="the interface of concurrent.futures: ProcessPoolExecutor, mpi4py.futures.MPIPoolExecutor, or "
-                "get_executor() of a Dask client",
-                received=repr(executor)[:100],
-                remedy="pass such an executor, or None to simulate in this process",
-            )
+            "This executor cannot be used.",
+            expected="the interface of concurrent.futures: ProcessPoolExecutor, mpi4py.futures.MPIPoolExecutor, or "
+            "get_executor() of a Dask client",
+            received=repr(executor)[:100],
+            remedy="pass such an executor, or None to simulate in this process",
         )
     return future
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe, warn_user
+from covocp.base.errors import ProblemError, warn_user
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import missed
 from covocp.extremal.nodes import rates_along
@@ -57,13 +57,11 @@ def _of_another(solution: Solution, statement: Statement, found: list[Difference
     plural = len(found) > 1 or names.startswith(PLURAL)
     called = f" (stored: '{solution.name}', given: '{statement.name}')" if solution.name != statement.name else ""
     return ProblemError(
-        describe(
-            f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
-            expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
-            received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
-            remedy="give the problem that was solved, or load without one; evaluate(problem, nominal=load(path)) tells "
-            "what the stored nominal means for another problem",
-        )
+        f"The stored solution is of another problem: {names}{more} {'differ' if plural else 'differs'}{called}.",
+        expected="as stored: " + "; ".join(f"{entry.what} {entry.stored}" for entry in shown),
+        received="as given: " + "; ".join(f"{entry.what} {entry.given}" for entry in shown),
+        remedy="give the problem that was solved, or load without one; evaluate(problem, nominal=load(path)) tells "
+        "what the stored nominal means for another problem",
     )
 
 

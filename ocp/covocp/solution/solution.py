@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_number, is_whole
-from covocp.base.errors import CovocpError, ProblemError, describe
+from covocp.base.errors import CovocpError, ProblemError
 from covocp.base.matrices import (
     Array,
     is_semidefinite,
@@ -325,12 +325,10 @@ class Solution:
         margin = 1e-9 * self.duration
         if times.ndim != 1 or not ((times >= -margin) & (times <= self.duration + margin)).all():
             raise ProblemError(
-                describe(
-                    "A solution has no values there.",
-                    expected=f"a time or a row of times within [0, {self.duration:g}] s",
-                    received=str(t)[:100],
-                    remedy="stay within the duration of the solution",
-                )
+                "A solution has no values there.",
+                expected=f"a time or a row of times within [0, {self.duration:g}] s",
+                received=str(t)[:100],
+                remedy="stay within the duration of the solution",
             )
         z, u = self.dense.at(np.clip(times / self.duration, 0.0, 1.0)), self.controls_at(times)
         nx = self.trajectory.x.shape[1]
@@ -374,12 +372,10 @@ class Solution:
         if b is None or b.kind not in ("state", "matrix"):
             names = ", ".join(q.name for q in self.blocks if q.kind in ("state", "matrix"))
             raise ProblemError(
-                describe(
-                    f"'{name}' has no costate.",
-                    expected=f"a state or a matrix: {names}",
-                    received=name,
-                    remedy="ask for one of them",
-                )
+                f"'{name}' has no costate.",
+                expected=f"a state or a matrix: {names}",
+                received=name,
+                remedy="ask for one of them",
             )
         if b.kind == "matrix":
             return unpack_costate(self.costates.matrices[:, b.span], b.size)
@@ -430,12 +426,10 @@ class Solution:
         block = next((q for q in self.blocks if q.kind == "matrix" and q.estimation), None)
         if block is None:
             raise ProblemError(
-                describe(
-                    "The problem has no estimation covariance.",
-                    expected="a problem with estimation_covariance()",
-                    received=self.name,
-                    remedy="index the matrices of the problem by their names",
-                )
+                "The problem has no estimation covariance.",
+                expected="a problem with estimation_covariance()",
+                received=self.name,
+                remedy="index the matrices of the problem by their names",
             )
         full = self._matrix(block) if self.loop is None else self.loop.X
         rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
@@ -478,12 +472,10 @@ class Solution:
         """
         if not is_whole(points):
             raise ProblemError(
-                describe(
-                    "check_path needs a number of parts of each interval.",
-                    expected="1, 2, 3, ...",
-                    received=repr(points),
-                    remedy="correct points",
-                )
+                "check_path needs a number of parts of each interval.",
+                expected="1, 2, 3, ...",
+                received=repr(points),
+                remedy="correct points",
             )
         return {entry.name: entry.by for entry in self.passed_limits(points)}
 

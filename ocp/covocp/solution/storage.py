@@ -16,7 +16,7 @@ from typing import Any
 
 from covocp.base.archive import packed, unpacked
 from covocp.base.encoding import DamagedFileError
-from covocp.base.errors import ExportError, ProblemError, describe
+from covocp.base.errors import ExportError, ProblemError
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
 from covocp.base.threads import one_at_a_time
@@ -64,12 +64,10 @@ def save(solution: Solution, path: str | Path) -> Path:
         from_tree(tree)
     except DamagedFileError as error:
         raise ExportError(
-            describe(
-                f"The solution of '{solution.name}' cannot be written: it could not be read again.",
-                expected="arrays that fit its mesh and its symbols",
-                received=str(error),
-                remedy="save the solution that the solver returned",
-            )
+            f"The solution of '{solution.name}' cannot be written: it could not be read again.",
+            expected="arrays that fit its mesh and its symbols",
+            received=str(error),
+            remedy="save the solution that the solver returned",
         ) from error
     with written_whole(path, SUFFIXES) as part:
         part.write_bytes(packed(tree, part.suffix))
@@ -150,12 +148,10 @@ def _damaged(file: Path, error: Exception) -> ProblemError:
 
 def _unreadable(file: Path, reason: str, remedy: str) -> ProblemError:
     return ProblemError(
-        describe(
-            f"'{file.name}' cannot be read as a solution: {reason}.",
-            expected=f"a .npz or .json file that Solution.save wrote (format '{FORMAT}', version {VERSION})",
-            received=str(file),
-            remedy=remedy,
-        )
+        f"'{file.name}' cannot be read as a solution: {reason}.",
+        expected=f"a .npz or .json file that Solution.save wrote (format '{FORMAT}', version {VERSION})",
+        received=str(file),
+        remedy=remedy,
     )
 
 
@@ -179,12 +175,10 @@ def to_xarray(solution: Solution) -> Any:
         import xarray
     except ImportError as error:
         raise ExportError(
-            describe(
-                "A solution cannot be converted to xarray: xarray is not installed.",
-                expected="the package xarray",
-                received=str(error),
-                remedy="pip install 'covocp[xarray]'",
-            )
+            "A solution cannot be converted to xarray: xarray is not installed.",
+            expected="the package xarray",
+            received=str(error),
+            remedy="pip install 'covocp[xarray]'",
         ) from error
     variables: dict[str, tuple[tuple[str, ...], Array]] = {}
     coordinates: dict[str, Any] = {"time": ("time", solution.t, {"units": "s"})}

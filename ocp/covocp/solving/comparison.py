@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
-from covocp.base.errors import CovocpError, Interrupted, ProblemError, describe, spelling
+from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
 from covocp.solution.report import number, render_table, wrapped
@@ -92,12 +92,10 @@ class Comparison:
             row = self.rows[labels.index(str(key))]
         if row is None or row.solution is None:
             raise ProblemError(
-                describe(
-                    f"The comparison has no solution '{key}'.",
-                    expected="one of " + (", ".join(self.solutions) or "none: no run came to an end"),
-                    received=repr(key) if row is None else f"{key}: {row.reason}",
-                    remedy="ask for one of them",
-                )
+                f"The comparison has no solution '{key}'.",
+                expected="one of " + (", ".join(self.solutions) or "none: no run came to an end"),
+                received=repr(key) if row is None else f"{key}: {row.reason}",
+                remedy="ask for one of them",
             )
         return row.solution
 
@@ -257,7 +255,7 @@ def _option_names(method: str) -> set[str]:
 
 
 def _wrong(problem: str, expected: str, received: str, remedy: str) -> ProblemError:
-    return ProblemError(describe(problem, expected=expected, received=received, remedy=remedy))
+    return ProblemError(problem, expected=expected, received=received, remedy=remedy)
 
 
 def _entries(row: Row, best: float) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.checks import as_number, check_density, check_kind
-from covocp.base.errors import ProblemError, describe, evaluating, no_option
+from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.matrices import Array, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import Statistics, close_loop, densities
@@ -68,12 +68,10 @@ def evaluate(
     if isinstance(problem, Solution):
         if nominal is not None or options or parameters is not None:
             raise ProblemError(
-                describe(
-                    "evaluate(solution) keeps its nominal, mesh and parameters.",
-                    expected="truth=... only",
-                    received="nominal=, parameters= or options of the mesh",
-                    remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
-                )
+                "evaluate(solution) keeps its nominal, mesh and parameters.",
+                expected="truth=... only",
+                received="nominal=, parameters= or options of the mesh",
+                remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
             )
         solution = problem
     else:
@@ -166,12 +164,10 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Any, asked: int) -> tup
         return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
     if not isinstance(nominal, Mapping):
         raise ProblemError(
-            describe(
-                "The nominal is of an unknown kind.",
-                expected="a Solution, or a dict of control to number, array over the nodes or function of s = t/T",
-                received=repr(nominal)[:100],
-                remedy="correct nominal=",
-            )
+            "The nominal is of an unknown kind.",
+            expected="a Solution, or a dict of control to number, array over the nodes or function of s = t/T",
+            received=repr(nominal)[:100],
+            remedy="correct nominal=",
         )
     names = tuple(block.name for block in statement.controls)
     given = {name_of(key, statement.symbols, names): value for key, value in nominal.items()}
@@ -189,12 +185,10 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Any, asked: int) -> tup
 
 def _not_given(name: str, received: str) -> ProblemError:
     return ProblemError(
-        describe(
-            f"The nominal does not give the control '{name}'.",
-            expected="a history of every control",
-            received=received,
-            remedy=f"add '{name}' to nominal=",
-        )
+        f"The nominal does not give the control '{name}'.",
+        expected="a history of every control",
+        received=received,
+        remedy=f"add '{name}' to nominal=",
     )
 
 
@@ -202,22 +196,18 @@ def _under(solution: Solution, truth: Any) -> Solution:
     """The solution with the covariances and the cost of other statistics, and the gains of its design."""
     if solution.loop is None:
         raise ProblemError(
-            describe(
-                "truth= needs a closed loop.",
-                expected="a solution of a problem with minimize_expected()",
-                received=f"'{solution.name}' with a deterministic cost",
-                remedy="for an estimator alone, simulate(solution, truth=...) shows the effect",
-            )
+            "truth= needs a closed loop.",
+            expected="a solution of a problem with minimize_expected()",
+            received=f"'{solution.name}' with a deterministic cost",
+            remedy="for an estimator alone, simulate(solution, truth=...) shows the effect",
         )
     loop = close_loop(solution.extremal, true_statistics(solution.extremal, truth))
     if loop is None:
         raise ProblemError(
-            describe(
-                "The covariances under this truth are no numbers.",
-                expected="finite covariances with the gains of the design",
-                received="inf or NaN on the way",
-                remedy="check the variances and densities of truth=, and that the solution converged",
-            )
+            "The covariances under this truth are no numbers.",
+            expected="finite covariances with the gains of the design",
+            received="inf or NaN on the way",
+            remedy="check the variances and densities of truth=, and that the solution converged",
         )
     return replace(
         solution,
@@ -245,23 +235,19 @@ def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
         _check_same(st, other)
     else:
         raise ProblemError(
-            describe(
-                "The truth is of an unknown kind.",
-                expected="a Problem with the same symbols, or a dict of parameter name to value",
-                received=repr(truth)[:100],
-                remedy="correct truth=",
-            )
+            "The truth is of an unknown kind.",
+            expected="a Problem with the same symbols, or a dict of parameter name to value",
+            received=repr(truth)[:100],
+            remedy="correct truth=",
         )
     _check_system(extremal, other, values)
     block = next((b for b in other.matrices if b.estimation), None)
     if block is None or other.loop is None:
         raise ProblemError(
-            describe(
-                "The truth has no expected cost, so its statistics are not known.",
-                expected="a problem built like the design's, with minimize_expected()",
-                received=f"'{other.name}'",
-                remedy="build it by the same function with other numbers",
-            )
+            "The truth has no expected cost, so its statistics are not known.",
+            expected="a problem built like the design's, with minimize_expected()",
+            received=f"'{other.name}'",
+            remedy="build it by the same function with other numbers",
         )
     statistics = Statistics(
         initial=unpack(other.boundary_values(values)[2][block.span], block.size),
@@ -297,14 +283,10 @@ def _check_same(design: Statement, truth: Statement) -> None:
     measured = (design.measurement_names, truth.measurement_names)
     if signature(design) != signature(truth) or measured[0] != measured[1]:
         raise ProblemError(
-            describe(
-                "The truth is another system than the design's.",
-                expected=", ".join(f"{k} {n} ({s})" for k, n, s in signature(design))
-                + "; measured "
-                + str(measured[0]),
-                received=", ".join(f"{k} {n} ({s})" for k, n, s in signature(truth)) + "; measured " + str(measured[1]),
-                remedy="declare the same states, controls, unknowns and measurements in the same order",
-            )
+            "The truth is another system than the design's.",
+            expected=", ".join(f"{k} {n} ({s})" for k, n, s in signature(design)) + "; measured " + str(measured[0]),
+            received=", ".join(f"{k} {n} ({s})" for k, n, s in signature(truth)) + "; measured " + str(measured[1]),
+            remedy="declare the same states, controls, unknowns and measurements in the same order",
         )
 
 
@@ -344,10 +326,8 @@ def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None
         if off.any():
             name = names[min(int(np.flatnonzero(off)[0]), len(names) - 1)]
             raise ProblemError(
-                describe(
-                    f"The truth {what} of '{name}' along the nominal is another one.",
-                    expected="the system of the design, with other variances and noise densities",
-                    received=f"'{truth.name}', which differs in more",
-                    remedy="use simulate(solution, truth=...), which takes any dynamics",
-                )
+                f"The truth {what} of '{name}' along the nominal is another one.",
+                expected="the system of the design, with other variances and noise densities",
+                received=f"'{truth.name}', which differs in more",
+                remedy="use simulate(solution, truth=...), which takes any dynamics",
             )

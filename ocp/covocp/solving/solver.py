@@ -17,7 +17,6 @@ from covocp.base.errors import (
     Interrupted,
     ProblemError,
     SolveError,
-    describe,
     evaluating,
     no_option,
     spelling,
@@ -117,12 +116,10 @@ class Solver:
         """Build the statement and make the method ready."""
         if method not in METHODS:
             raise ProblemError(
-                describe(
-                    "There is no such method.",
-                    expected="one of " + ", ".join(repr(name) for name in METHODS),
-                    received=repr(method),
-                    remedy=spelling(method, METHODS, "correct method="),
-                )
+                "There is no such method.",
+                expected="one of " + ", ".join(repr(name) for name in METHODS),
+                received=repr(method),
+                remedy=spelling(method, METHODS, "correct method="),
             )
         check_problem(problem)
         self._prepare = importlib.import_module(METHODS[method]).prepare
@@ -132,12 +129,10 @@ class Solver:
                 raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
         if nominal not in NOMINALS:
             raise ProblemError(
-                describe(
-                    "The option 'nominal' has an unknown value.",
-                    expected="'combined' or 'deterministic'",
-                    received=repr(nominal),
-                    remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
-                )
+                "The option 'nominal' has an unknown value.",
+                expected="'combined' or 'deterministic'",
+                received=repr(nominal),
+                remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
             )
         self.method = method
         self.nominal = nominal
@@ -288,22 +283,18 @@ class Solver:
         """The best of the problem's own start and several random ones."""
         if guess != "multistart":
             raise ProblemError(
-                describe(
-                    "The guess is an unknown word.",
-                    expected="None, 'multistart', a Solution, or a dict of name to guess",
-                    received=repr(guess),
-                    remedy="correct guess=",
-                )
+                "The guess is an unknown word.",
+                expected="None, 'multistart', a Solution, or a dict of name to guess",
+                received=repr(guess),
+                remedy="correct guess=",
             )
         for name, number, most in (("starts", starts, MOST_STARTS), ("seed", seed, None)):
             if not is_whole(number, 0, most):
                 raise ProblemError(
-                    describe(
-                        f"The option '{name}' is not a whole number.",
-                        expected="0, 1, 2, ...",
-                        received=repr(number),
-                        remedy=f"correct {name}=",
-                    )
+                    f"The option '{name}' is not a whole number.",
+                    expected="0, 1, 2, ...",
+                    received=repr(number),
+                    remedy=f"correct {name}=",
                 )
         guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
         return best_of(self._prepared, values, guesses, starts + 1, reporter)
@@ -466,12 +457,10 @@ def solve(
     extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
     if extra and not isinstance(guess, str):
         raise ProblemError(
-            describe(
-                "The options of multistart are given, but not multistart.",
-                expected="guess='multistart'",
-                received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
-                remedy="add guess='multistart', or remove them",
-            )
+            "The options of multistart are given, but not multistart.",
+            expected="guess='multistart'",
+            received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
+            remedy="add guess='multistart', or remove them",
         )
     solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
     return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, describe, spelling
+from covocp.base.errors import ProblemError, spelling
 from covocp.base.matrices import Array, pack
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
@@ -41,12 +41,10 @@ def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Any
             yield Guess(trajectory=trajectory)
     else:
         raise ProblemError(
-            describe(
-                "The guess is of an unknown kind.",
-                expected="None, 'multistart', a Solution, or a dict of name to guess",
-                received=repr(guess)[:100],
-                remedy="correct guess=",
-            )
+            "The guess is of an unknown kind.",
+            expected="None, 'multistart', a Solution, or a dict of name to guess",
+            received=repr(guess)[:100],
+            remedy="correct guess=",
         )
 
 
@@ -61,12 +59,10 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
         name = name_of(key, statement.symbols, tuple(guesses), missing_ok=True)
         if not name:
             raise ProblemError(
-                describe(
-                    f"The guess names '{key}', which cannot be guessed.",
-                    expected="states, controls or matrices: " + ", ".join(guesses),
-                    received=str(key),
-                    remedy=spelling(key, guesses, "correct the name"),
-                )
+                f"The guess names '{key}', which cannot be guessed.",
+                expected="states, controls or matrices: " + ", ".join(guesses),
+                received=str(key),
+                remedy=spelling(key, guesses, "correct the name"),
             )
         guesses[name] = value
     return replace(statement, guesses=guesses) if given else statement
@@ -128,12 +124,10 @@ def _check_common(statement: Statement, solution: Solution) -> None:
     if not own & given:
         words = [", ".join(f"{kind} {name} ({size})" for kind, name, size in sorted(side)) for side in (own, given)]
         raise ProblemError(
-            describe(
-                f"The solution of '{solution.name}' is no guess: it has nothing in common with this problem.",
-                expected=f"some of {words[0]}",
-                received=words[1],
-                remedy="give a solution of a problem with the same names and sizes, or a dict of name to guess",
-            )
+            f"The solution of '{solution.name}' is no guess: it has nothing in common with this problem.",
+            expected=f"some of {words[0]}",
+            received=words[1],
+            remedy="give a solution of a problem with the same names and sizes, or a dict of name to guess",
         )
 
 

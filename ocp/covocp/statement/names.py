@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import bound_columns, check_bounds, column
-from covocp.base.errors import ProblemError, describe, spelling
+from covocp.base.errors import ProblemError, spelling
 from covocp.base.matrices import Array, half_length, unpack_indices
 from covocp.statement.statement import Block, Statement
 
@@ -126,12 +126,10 @@ def _no_such_entry(key: Any, sizes: Mapping[str, int]) -> ProblemError | None:
         return None
     vector, size = entry[0], sizes[entry[0]]
     return ProblemError(
-        describe(
-            f"'{vector}' has no entry {entry[1]}.",
-            expected=f"'{vector}'" + (f", or an entry '{vector}[0]' to '{vector}[{size - 1}]'" if size > 1 else ""),
-            received=f"'{key}'",
-            remedy="entries are counted from 0",
-        )
+        f"'{vector}' has no entry {entry[1]}.",
+        expected=f"'{vector}'" + (f", or an entry '{vector}[0]' to '{vector}[{size - 1}]'" if size > 1 else ""),
+        received=f"'{key}'",
+        remedy="entries are counted from 0",
     )
 
 
@@ -150,23 +148,19 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
     blocks = {b.name: b for b in (*statement.of_kind("parameter"), *statement.of_kind("unknown"))}
     if not isinstance(given, Mapping):
         raise ProblemError(
-            describe(
-                "The parameters are not given by name.",
-                expected="a dict of name or symbol to value",
-                received=repr(given)[:100],
-                remedy="write parameters={'name': value}",
-            )
+            "The parameters are not given by name.",
+            expected="a dict of name or symbol to value",
+            received=repr(given)[:100],
+            remedy="write parameters={'name': value}",
         )
     for key, value in given.items():
         name = name_of(key, statement.symbols, tuple(blocks), missing_ok=True)
         if not name:
             raise ProblemError(
-                describe(
-                    f"There is no parameter '{key}'.",
-                    expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
-                    received=repr(key)[:100],
-                    remedy=spelling(key, blocks, _not_given(str(key), statement, bool(blocks))),
-                )
+                f"There is no parameter '{key}'.",
+                expected="one of " + (", ".join(blocks) or "none: the problem has no parameters"),
+                received=repr(key)[:100],
+                remedy=spelling(key, blocks, _not_given(str(key), statement, bool(blocks))),
             )
         values[blocks[name].span] = column(name, "value", value, blocks[name].size)
     return values
@@ -196,12 +190,10 @@ def _is_matrix_of(key: Any, half: Any) -> bool:
 def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
     """The error for something that is not in the solution."""
     return ProblemError(
-        describe(
-            f"'{key}' is not in this solution.",
-            expected="a symbol or name of " + ", ".join(names),
-            received=str(key),
-            remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
-        )
+        f"'{key}' is not in this solution.",
+        expected="a symbol or name of " + ", ".join(names),
+        received=str(key),
+        remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
     )
 
 
@@ -224,12 +216,10 @@ def control_limits(statement: Statement, count: int, given: Any) -> Limits:
         return statement.control_bounds[0][:count].copy(), statement.control_bounds[1][:count].copy()
     if not isinstance(given, Mapping):
         raise ProblemError(
-            describe(
-                "The limits of the control are of an unknown kind.",
-                expected="limits=None, 'bounds', or a dict of control to (lower, upper)",
-                received=repr(given)[:100],
-                remedy="give limits={'name': (lower, upper)}",
-            )
+            "The limits of the control are of an unknown kind.",
+            expected="limits=None, 'bounds', or a dict of control to (lower, upper)",
+            received=repr(given)[:100],
+            remedy="give limits={'name': (lower, upper)}",
         )
     controls = tuple(b for b in statement.controls if b.span.stop <= count)
     names, sizes = tuple(b.name for b in controls), sizes_of(controls)
@@ -238,12 +228,10 @@ def control_limits(statement: Statement, count: int, given: Any) -> Limits:
         assert block is not None
         if not isinstance(pair, (tuple, list)) or len(pair) != 2:
             raise ProblemError(
-                describe(
-                    f"The limits of '{block.name}' are no pair.",
-                    expected="(lower, upper)",
-                    received=repr(pair)[:100],
-                    remedy=f"give limits={{'{block.name}': (lower, upper)}}",
-                )
+                f"The limits of '{block.name}' are no pair.",
+                expected="(lower, upper)",
+                received=repr(pair)[:100],
+                remedy=f"give limits={{'{block.name}': (lower, upper)}}",
             )
         low, high = bound_columns(block.name, pair[0], pair[1], block.size)
         check_bounds(block.name, low, high)

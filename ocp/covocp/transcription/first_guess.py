@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.checks import as_number, check_density
-from covocp.base.errors import ProblemError, describe
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, half_indices, pack, real_numbers, unpack
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
@@ -82,13 +82,11 @@ def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
         numbers = np.stack([np.interp(at, own, column) for column in numbers.T], axis=1)
     if numbers.shape != (at.size, block.size) or not np.isfinite(numbers).all():
         raise ProblemError(
-            describe(
-                f"The guess of '{block.name}' does not fit.",
-                expected=f"a finite number, an array over the nodes with {block.size} column(s), or a function of "
-                "s = t/T in [0, 1] that returns one",
-                received=f"shape {numbers.shape}" if np.isfinite(numbers).all() else "NaN or inf",
-                remedy=f"correct the guess of '{block.name}'",
-            )
+            f"The guess of '{block.name}' does not fit.",
+            expected=f"a finite number, an array over the nodes with {block.size} column(s), or a function of "
+            "s = t/T in [0, 1] that returns one",
+            received=f"shape {numbers.shape}" if np.isfinite(numbers).all() else "NaN or inf",
+            remedy=f"correct the guess of '{block.name}'",
         )
     return numbers
 
@@ -106,12 +104,10 @@ def _called(name: str, guess: Callable[[Any], Any], at: Array) -> Any:
             return np.array([real_numbers(guess(float(s))) for s in at])
         except Exception as error:
             raise ProblemError(
-                describe(
-                    f"The guess of '{name}' is a function that fails.",
-                    expected="a function of s = t/T, an array of numbers in [0, 1], that returns as many values",
-                    received=f"{type(error).__name__}: {error}"[:200],
-                    remedy=f"correct the guess of '{name}': numpy.sin, not math.sin; one argument",
-                )
+                f"The guess of '{name}' is a function that fails.",
+                expected="a function of s = t/T, an array of numbers in [0, 1], that returns as many values",
+                received=f"{type(error).__name__}: {error}"[:200],
+                remedy=f"correct the guess of '{name}': numpy.sin, not math.sin; one argument",
             ) from error
 
 
@@ -146,12 +142,10 @@ def matrix_guess(block: Block, guess: Any) -> Array:
     wrong = numbers.shape != (block.size, block.size)
     if wrong or not np.isfinite(numbers).all() or not np.allclose(numbers, numbers.T):
         raise ProblemError(
-            describe(
-                f"The guess of '{block.name}' does not fit.",
-                expected=f"a symmetric {block.size} x {block.size} matrix, or a number (times identity)",
-                received=f"shape {numbers.shape}" if wrong else str(numbers),
-                remedy=f"correct the guess of '{block.name}'",
-            )
+            f"The guess of '{block.name}' does not fit.",
+            expected=f"a symmetric {block.size} x {block.size} matrix, or a number (times identity)",
+            received=f"shape {numbers.shape}" if wrong else str(numbers),
+            remedy=f"correct the guess of '{block.name}'",
         )
     return pack(numbers)
 
@@ -196,12 +190,10 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
         for name, value in zip(names, values, strict=True):
             if not np.isfinite(value):
                 raise ProblemError(
-                    describe(
-                        f"The {what} '{name}' is {value} at the initial guess.",
-                        expected="finite values where the solver starts",
-                        received=f"state {_short(x)}, control {_short(u)}, parameters {_short(parameters)}, t = 0",
-                        remedy="give another guess or initial value, or bounds that keep the model in its domain",
-                    )
+                    f"The {what} '{name}' is {value} at the initial guess.",
+                    expected="finite values where the solver starts",
+                    received=f"state {_short(x)}, control {_short(u)}, parameters {_short(parameters)}, t = 0",
+                    remedy="give another guess or initial value, or bounds that keep the model in its domain",
                 )
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
         if form is not None and block.estimation:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from covocp.base.checks import as_number, is_whole
-from covocp.base.errors import ProblemError, describe, spelling
+from covocp.base.errors import ProblemError, spelling
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
@@ -85,12 +85,10 @@ class Options:
         nodes = as_number("grid", "option", self.grid).ravel()
         if nodes.size < 2 or nodes[0] != 0 or nodes[-1] != 1 or not (np.diff(nodes) > 0).all():
             raise ProblemError(
-                describe(
-                    "The grid does not rise from 0 to 1.",
-                    expected="increasing nodes of t/T, the first 0, the last 1",
-                    received=np.array2string(nodes, threshold=8),
-                    remedy="divide the times by the duration",
-                )
+                "The grid does not rise from 0 to 1.",
+                expected="increasing nodes of t/T, the first 0, the last 1",
+                received=np.array2string(nodes, threshold=8),
+                remedy="divide the times by the duration",
             )
         return nodes
 
@@ -228,12 +226,10 @@ def _choose_points(statement: Statement, options: Options, substeps: int, group:
     least = options.points * group if options.points > 1 else 1
     if options.substeps != "auto" and substeps % least:
         raise ProblemError(
-            describe(
-                f"The points at which limits are imposed are no ends of {'pairs of ' * (group > 1)}integration steps.",
-                expected=f"substeps={least}, {2 * least}, ... for points={options.points}",
-                received=f"substeps={options.substeps}",
-                remedy="leave substeps='auto', or take a divisor of them as points",
-            )
+            f"The points at which limits are imposed are no ends of {'pairs of ' * (group > 1)}integration steps.",
+            expected=f"substeps={least}, {2 * least}, ... for points={options.points}",
+            received=f"substeps={options.substeps}",
+            remedy="leave substeps='auto', or take a divisor of them as points",
         )
     return -(-substeps // least) * least, options.points
 
@@ -242,14 +238,12 @@ def _too_few_substeps(substeps: int, rate: float) -> ProblemError:
     """Explicit steps that diverge."""
     needed = int(np.ceil(rate / STIFFNESS_PER_STEP))
     return ProblemError(
-        describe(
-            "The integration steps of the nominal are too long: classical Runge-Kutta diverges.",
-            expected=f"about {needed} steps an interval: the fastest rate of the system, at its start, times the "
-            f"longest interval is {rate:.3g}",
-            received=f"{substeps} steps an interval",
-            remedy=f"leave step= and substeps= 'auto' (implicit steps where they apply), or give substeps={needed} or "
-            "more intervals",
-        )
+        "The integration steps of the nominal are too long: classical Runge-Kutta diverges.",
+        expected=f"about {needed} steps an interval: the fastest rate of the system, at its start, times the "
+        f"longest interval is {rate:.3g}",
+        received=f"{substeps} steps an interval",
+        remedy=f"leave step= and substeps= 'auto' (implicit steps where they apply), or give substeps={needed} or "
+        "more intervals",
     )
 
 
@@ -277,14 +271,12 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
     possible = riccati and options.covariance_step in ("auto", "gauss")
     if options.step == "rodas" and not possible:
         raise ProblemError(
-            describe(
-                "step='rodas' does not apply: it goes with gauss steps of the covariances.",
-                expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
-                received=f"covariance_step='{options.covariance_step}'"
-                if riccati
-                else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
-                remedy="leave step='auto', with more substeps= where the system is stiff",
-            )
+            "step='rodas' does not apply: it goes with gauss steps of the covariances.",
+            expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
+            received=f"covariance_step='{options.covariance_step}'"
+            if riccati
+            else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
+            remedy="leave step='auto', with more substeps= where the system is stiff",
         )
     needed = explicit_substeps(stiffness.nominal)
     too_few = options.substeps == "auto" or options.substeps < needed
@@ -309,13 +301,11 @@ def _choose_covariance_step(statement: Statement, options: Options) -> Step:
         names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
         reason = "feeds back into the nominal" if statement.coupled else "is not of the form F E + E F' + Q - E W E"
         raise ProblemError(
-            describe(
-                f"covariance_step='{options.covariance_step}' does not apply: the rate of "
-                f"{', '.join(names) or 'a matrix'} {reason}.",
-                expected="rates of Riccati or Lyapunov form that depend on the nominal only",
-                received=", ".join(names) or "a coupled problem",
-                remedy="use covariance_step='rk4' (or leave it 'auto')",
-            )
+            f"covariance_step='{options.covariance_step}' does not apply: the rate of "
+            f"{', '.join(names) or 'a matrix'} {reason}.",
+            expected="rates of Riccati or Lyapunov form that depend on the nominal only",
+            received=", ".join(names) or "a coupled problem",
+            remedy="use covariance_step='rk4' (or leave it 'auto')",
         )
     return options.covariance_step
 
@@ -337,12 +327,10 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         obstacle = f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
     if options.covariances == "eliminated" and obstacle:
         raise ProblemError(
-            describe(
-                "The matrices cannot be eliminated.",
-                expected="matrices that follow from the nominal",
-                received=obstacle,
-                remedy="use covariances='states' (or leave it 'auto')",
-            )
+            "The matrices cannot be eliminated.",
+            expected="matrices that follow from the nominal",
+            received=obstacle,
+            remedy="use covariances='states' (or leave it 'auto')",
         )
     if options.covariances != "auto":
         return options.covariances == "eliminated"
@@ -368,22 +356,18 @@ def _bounded_matrices(statement: Statement) -> list[str]:
 def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
     if not is_whole(value):
         raise ProblemError(
-            describe(
-                f"The option '{name}' must be a positive whole number.",
-                expected=expected,
-                received=repr(value),
-                remedy=f"correct {name}=",
-            )
+            f"The option '{name}' must be a positive whole number.",
+            expected=expected,
+            received=repr(value),
+            remedy=f"correct {name}=",
         )
 
 
 def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     if not isinstance(value, str) or value not in choices:
         raise ProblemError(
-            describe(
-                f"The option '{name}' has an unknown value.",
-                expected="one of " + ", ".join(repr(choice) for choice in choices),
-                received=repr(value),
-                remedy=spelling(value, choices, f"correct {name}="),
-            )
+            f"The option '{name}' has an unknown value.",
+            expected="one of " + ", ".join(repr(choice) for choice in choices),
+            received=repr(value),
+            remedy=spelling(value, choices, f"correct {name}="),
         )

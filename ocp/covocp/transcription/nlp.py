@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import OutsideDomainError, describe
+from covocp.base.errors import OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -295,10 +295,8 @@ def check_costs(trajectory: Trajectory, running: float, terminal: float) -> None
                     "the steps of the matrices are too long: use covariance_step='gauss', more substeps or intervals"
                 )
             raise OutsideDomainError(
-                describe(
-                    f"The cost '{name}' is {value} {where} the initial guess.",
-                    expected="a finite cost where the solver starts",
-                    received=f"final state {last}, T = {trajectory.duration:g} s",
-                    remedy=remedy,
-                )
+                f"The cost '{name}' is {value} {where} the initial guess.",
+                expected="a finite cost where the solver starts",
+                received=f"final state {last}, T = {trajectory.duration:g} s",
+                remedy=remedy,
             )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.export.compiled.linking import Linking
 
 COMPILERS = ("cc", "gcc", "clang")
@@ -77,12 +77,10 @@ def build(sources: Sources, tool: str = "auto", flags: Sequence[str] = ()) -> Bu
     """
     if tool not in TOOLS:
         raise ExportError(
-            describe(
-                "There is no such tool to build with.",
-                expected="one of " + ", ".join(map(repr, TOOLS)),
-                received=repr(tool),
-                remedy="correct tool=",
-            )
+            "There is no such tool to build with.",
+            expected="one of " + ", ".join(map(repr, TOOLS)),
+            received=repr(tool),
+            remedy="correct tool=",
         )
     compiler = _compiler()
     if compiler is not None and tool != "cmake":
@@ -90,12 +88,10 @@ def build(sources: Sources, tool: str = "auto", flags: Sequence[str] = ()) -> Bu
     if tool != "cc" and shutil.which("cmake"):
         return _by_cmake(sources, tuple(flags))
     raise ExportError(
-        describe(
-            f"'{sources.name}' cannot be compiled: there is no {MISSING[tool]}.",
-            expected="a C compiler on the path (" + ", ".join(COMPILERS) + ") or in the variable CC, or CMake",
-            received="CC=" + os.environ.get("CC", "") + ", PATH=" + os.environ.get("PATH", ""),
-            remedy="install one, such as gcc; or compile the sources elsewhere (README.md says how)",
-        )
+        f"'{sources.name}' cannot be compiled: there is no {MISSING[tool]}.",
+        expected="a C compiler on the path (" + ", ".join(COMPILERS) + ") or in the variable CC, or CMake",
+        received="CC=" + os.environ.get("CC", "") + ", PATH=" + os.environ.get("PATH", ""),
+        remedy="install one, such as gcc; or compile the sources elsewhere (README.md says how)",
     )
 
 
@@ -129,12 +125,10 @@ def _failed(sources: Sources, what: str, message: str) -> ExportError:
     lines = message.splitlines() or ["no message"]
     kept = [line for line in lines if "error" in line.lower()][:LINES] or lines[:LINES]
     return ExportError(
-        describe(
-            f"'{sources.name}' could not be compiled.",
-            expected=f"{what} without errors",
-            received="\n    ".join(kept),
-            remedy="check the compiler and what is linked; README.md in the package says what is needed",
-        )
+        f"'{sources.name}' could not be compiled.",
+        expected=f"{what} without errors",
+        received="\n    ".join(kept),
+        remedy="check the compiler and what is linked; README.md in the package says what is needed",
     )
 
 

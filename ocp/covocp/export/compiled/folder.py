@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from covocp.base.disk import abandoned, exchange, flush, held
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.export.compiled.building import FOLDER
 
 # What tells that a folder was written here, and may be replaced.
@@ -280,4 +280,4 @@ def _foreign(target: Path) -> list[Path]:
 
 
 def _refused(name: str, expected: str, received: str, remedy: str) -> ExportError:
-    return ExportError(describe(f"'{name}' cannot be written.", expected=expected, received=received, remedy=remedy))
+    return ExportError(f"'{name}' cannot be written.", expected=expected, received=received, remedy=remedy)

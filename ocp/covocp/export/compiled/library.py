@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from covocp.base.errors import ExportError, describe, shown, spelling
+from covocp.base.errors import ExportError, shown, spelling
 from covocp.base.matrices import Array, real_numbers
 from covocp.base.threads import TURN
 from covocp.export.laws.law import CODES, STATUSES, Law, Port, span, stacked_size
@@ -68,12 +68,10 @@ class Library:
                 self._library = ctypes.CDLL(str(copy))
         except OSError as error:
             raise ExportError(
-                describe(
-                    f"The library of '{package}' cannot be loaded.",
-                    expected="a shared library for this machine, and what it is linked with",
-                    received=str(error),
-                    remedy="build() it here",
-                )
+                f"The library of '{package}' cannot be loaded.",
+                expected="a shared library for this machine, and what it is linked with",
+                received=str(error),
+                remedy="build() it here",
             ) from error
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -267,12 +265,10 @@ class Call:
 
     def _unfit(self, received: str, remedy: str, what: str = "") -> ExportError:
         return ExportError(
-            describe(
-                f"The arguments of '{self.law.name}' do not fit" + (f": {what}." if what else "."),
-                expected=", ".join(f"{p.name} {p.shape or '()'}" for p in self.law.arguments) or "none",
-                received=received[:100],
-                remedy=remedy,
-            )
+            f"The arguments of '{self.law.name}' do not fit" + (f": {what}." if what else "."),
+            expected=", ".join(f"{p.name} {p.shape or '()'}" for p in self.law.arguments) or "none",
+            received=received[:100],
+            remedy=remedy,
         )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import MOST, checked, is_whole, positive, text, texts
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.base.threads import methods_one_at_a_time
 from covocp.export.compiled.building import TIMEOUT, Build, Sources, build
 from covocp.export.compiled.library import Laws, Library, laws_of
@@ -315,12 +315,10 @@ class CPackage:
 
     def _wrong(self, what: str, expected: str, received: Any) -> ExportError:
         return ExportError(
-            describe(
-                f"The {what} of the package '{self.name}' {'do' if what in PLURAL else 'does'} not fit.",
-                expected=expected,
-                received=str(received)[:500],
-                remedy=f"correct {what}" if what != "self-test" else "build() again; is the folder complete?",
-            )
+            f"The {what} of the package '{self.name}' {'do' if what in PLURAL else 'does'} not fit.",
+            expected=expected,
+            received=str(received)[:500],
+            remedy=f"correct {what}" if what != "self-test" else "build() again; is the folder complete?",
         )
 
 

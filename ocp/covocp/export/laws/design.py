@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
@@ -73,21 +73,17 @@ def design_of(solution: Solution, limits: Any) -> Design:
     statement = solution.statement
     if statement is None or statement.loop is None:
         raise ExportError(
-            describe(
-                "The controller of this solution cannot be exported: it knows no problem.",
-                expected="a solution with its problem",
-                received=f"'{solution.name}', read from a file",
-                remedy="load(path, problem=...) with the problem that was solved",
-            )
+            "The controller of this solution cannot be exported: it knows no problem.",
+            expected="a solution with its problem",
+            received=f"'{solution.name}', read from a file",
+            remedy="load(path, problem=...) with the problem that was solved",
         )
     if statement.measurement is None:
         raise ExportError(
-            describe(
-                "There is no controller: the problem measures nothing, so the feedback never acts.",
-                expected="a problem with measurement()",
-                received=f"'{solution.name}' without one",
-                remedy="add what is measured, or export the histories by feedback=False",
-            )
+            "There is no controller: the problem measures nothing, so the feedback never acts.",
+            expected="a problem with measurement()",
+            received=f"'{solution.name}' without one",
+            remedy="add what is measured, or export the histories by feedback=False",
         )
     n, m = int(statement.loop.gain.size2_out(0)), int(statement.loop.gain.size1_out(0))
     symbolic: Any = statement.symbolic

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
 from covocp.export.laws.law import Law, Points, Port, flat, shaped, stacked_size
 from covocp.export.text.names import identifier
@@ -37,22 +37,18 @@ def function_laws(
         for name in given:
             if name not in known:
                 raise ExportError(
-                    describe(
-                        f"{what} names '{name}', which is no input or output.",
-                        expected="one of " + ", ".join(sorted(known)),
-                        received=repr(name),
-                        remedy=f"correct {what}=",
-                    )
+                    f"{what} names '{name}', which is no input or output.",
+                    expected="one of " + ", ".join(sorted(known)),
+                    received=repr(name),
+                    remedy=f"correct {what}=",
                 )
     for function in functions:
         if function.name() in names:
             raise ExportError(
-                describe(
-                    f"Two functions are called '{function.name()}'.",
-                    expected="functions with different names",
-                    received=", ".join(f.name() for f in functions),
-                    remedy="make them with different names: casadi.Function('update', ...)",
-                )
+                f"Two functions are called '{function.name()}'.",
+                expected="functions with different names",
+                received=", ".join(f.name() for f in functions),
+                remedy="make them with different names: casadi.Function('update', ...)",
             )
         names.add(function.name())
         laws.append(_law(function, ranges, units, tolerance))
@@ -69,12 +65,10 @@ def _law(function: ca.Function, ranges: Mapping[str, Any], units: Mapping[str, s
         outputs.append(_port(f"{name}_out" if name in taken else name, function.size_out(i), taken, units, name))
     if not stacked_size(tuple(outputs)):
         raise ExportError(
-            describe(
-                f"The function '{function.name()}' returns nothing.",
-                expected="at least one output",
-                received=str(function),
-                remedy="leave it out",
-            )
+            f"The function '{function.name()}' returns nothing.",
+            expected="at least one output",
+            received=str(function),
+            remedy="leave it out",
         )
     given = {
         _name: ranges[function.name_in(i)]
@@ -131,12 +125,10 @@ def _limits(ports: tuple[Port, ...], ranges: Mapping[str, Any]) -> dict[str, tup
             low, high = np.array([1.0]), np.array([0.0])
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
             raise ExportError(
-                describe(
-                    f"The range of '{port.name}' does not fit.",
-                    expected=f"(lower, upper), finite, numbers or of shape {port.shape}",
-                    received=repr(ranges[port.name])[:100],
-                    remedy="correct ranges=",
-                )
+                f"The range of '{port.name}' does not fit.",
+                expected=f"(lower, upper), finite, numbers or of shape {port.shape}",
+                received=repr(ranges[port.name])[:100],
+                remedy="correct ranges=",
             )
         limits[port.name] = (low, high)
     return limits

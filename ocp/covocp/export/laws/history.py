@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
 from covocp.export.laws.law import LARGEST, status_of
 from covocp.solution.solution import Solution
@@ -119,12 +119,10 @@ def history(solution: Solution, precision: str) -> History:
     for what, values in checked:
         if not np.isfinite(values).all():
             raise ExportError(
-                describe(
-                    f"{what.capitalize()} of the solution is NaN or infinite.",
-                    expected="finite values at all nodes",
-                    received=f"'{solution.name}', {solution.status}",
-                    remedy="export a solution that converged",
-                )
+                f"{what.capitalize()} of the solution is NaN or infinite.",
+                expected="finite values at all nodes",
+                received=f"'{solution.name}', {solution.status}",
+                remedy="export a solution that converged",
             )
     times, least = dense.knots * solution.duration, RESOLVED[precision] * solution.duration
     knots, z, first, last = _resolved(times, dense.values, slopes, least)

@@ -25,7 +25,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
@@ -186,12 +186,10 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     count = int(np.floor(tables.duration / period + WHOLE))
     if not 1 <= count <= MOST_SAMPLES:
         raise ExportError(
-            describe(
-                "The period of the controller does not fit the duration.",
-                expected=f"1 to {MOST_SAMPLES} periods within {tables.duration:g} s",
-                received=f"period={period!r}",
-                remedy="choose another period; period=None takes any time between two steps",
-            )
+            "The period of the controller does not fit the duration.",
+            expected=f"1 to {MOST_SAMPLES} periods within {tables.duration:g} s",
+            received=f"period={period!r}",
+            remedy="choose another period; period=None takes any time between two steps",
         )
     t = np.minimum(np.arange(count + 1) * period, tables.duration)
     x, u, e, h, M, H, U, C = _at_samples(design, tables, t)

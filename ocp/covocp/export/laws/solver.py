@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, describe, spelling
+from covocp.base.errors import ExportError, spelling
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.export.compiled.linking import PLUGINS, Linking
@@ -104,24 +104,20 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     """
     if not isinstance(method, str) or method not in PLUGINS:
         raise ExportError(
-            describe(
-                f"The method {method!r} has no C code.",
-                expected="one of " + ", ".join(map(repr, PLUGINS)),
-                received=f"method={method!r}",
-                remedy="'sqpmethod' needs nothing else; the others are linked",
-            )
+            f"The method {method!r} has no C code.",
+            expected="one of " + ", ".join(map(repr, PLUGINS)),
+            received=f"method={method!r}",
+            remedy="'sqpmethod' needs nothing else; the others are linked",
         )
     known = {entry.name for entry in fields(Options)} | {"plugin_options"}
     allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
     for name in options:
         if name not in known:
             raise ExportError(
-                describe(
-                    f"export_c has no option '{name}' for a problem.",
-                    expected="one of " + ", ".join(allowed),
-                    received=f"{name}={options[name]!r}"[:100],
-                    remedy=spelling(name, allowed, "leave it out"),
-                )
+                f"export_c has no option '{name}' for a problem.",
+                expected="one of " + ", ".join(allowed),
+                received=f"{name}={options[name]!r}"[:100],
+                remedy=spelling(name, allowed, "leave it out"),
             )
     task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
     own = dict(options.get("plugin_options") or {})
@@ -132,13 +128,11 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
         if not failure:
             return law, PLUGINS[method]
     raise ExportError(
-        describe(
-            f"The method '{method}' does not solve '{problem.name}' again from its own solution.",
-            expected="a plan near that of the export, for initial values near those of the problem",
-            received=f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints; {failure}",
-            remedy=("another method" if method == "ipopt" else "method='ipopt' (linked)")
-            + ", fewer intervals, or plugin_options such as {'max_iter': 1000}",
-        )
+        f"The method '{method}' does not solve '{problem.name}' again from its own solution.",
+        expected="a plan near that of the export, for initial values near those of the problem",
+        received=f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints; {failure}",
+        remedy=("another method" if method == "ipopt" else "method='ipopt' (linked)")
+        + ", fewer intervals, or plugin_options such as {'max_iter': 1000}",
     )
 
 
@@ -237,12 +231,10 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         solver = ca.nlpsol("nlp", method, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
     except RuntimeError as error:
         raise ExportError(
-            describe(
-                f"The plugin '{method}' refuses the problem or its settings.",
-                expected="a plugin of this CasADi, and options that it has",
-                received=str(error).strip().splitlines()[-1],
-                remedy="correct plugin_options, or take another method",
-            )
+            f"The plugin '{method}' refuses the problem or its settings.",
+            expected="a plugin of this CasADi, and options that it has",
+            received=str(error).strip().splitlines()[-1],
+            remedy="correct plugin_options, or take another method",
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
     guess = ca.MX.sym("guess", nlp.w.shape[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.errors import ExportError, describe, warn_user
+from covocp.base.errors import ExportError, warn_user
 from covocp.export.laws.moves import WHOLE
 from covocp.export.laws.sampled import Samples
 from covocp.solution.flight import Flight, compared
@@ -66,10 +66,8 @@ def check_flight(flight: Flight, largest: float, period: float | None) -> None:
         warn_user(f"With its gains {how} the loop spreads otherwise than the solution predicts: {flight.words}.")
         return
     raise ExportError(
-        describe(
-            f"With its gains {how} this controller does not hold what the solution promises.",
-            expected=f"deviations within a factor of {largest:g} of the predicted ones",
-            received=flight.words,
-            remedy=f"{remedy}; largest_spread= exports it all the same",
-        )
+        f"With its gains {how} this controller does not hold what the solution promises.",
+        expected=f"deviations within a factor of {largest:g} of the predicted ones",
+        received=flight.words,
+        remedy=f"{remedy}; largest_spread= exports it all the same",
     )

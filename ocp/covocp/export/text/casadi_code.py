@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.export.laws.law import Law
 from covocp.export.text.reentrant import reentrant, shares_memory
 
@@ -163,10 +163,8 @@ def _refused(laws: tuple[Law, ...], words: str, where: str = "") -> ExportError:
     own = where.endswith("_core") or where in {law.name for law in laws}
     inside = f", in its function '{where}'" if where and not own else ""
     return ExportError(
-        describe(
-            "This cannot be written as C code: " + ", ".join(f"'{law.name}'" for law in laws) + f"{inside}.",
-            expected="CasADi expressions and functions whose nodes all have C code",
-            received=words,
-            remedy=remedy,
-        )
+        "This cannot be written as C code: " + ", ".join(f"'{law.name}'" for law in laws) + f"{inside}.",
+        expected="CasADi expressions and functions whose nodes all have C code",
+        received=words,
+        remedy=remedy,
     )

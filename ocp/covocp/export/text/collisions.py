@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 from covocp.export.laws.law import Law
 from covocp.export.text.casadi_code import core_name
 from covocp.export.text.header import STRUCTS, struct_name
@@ -47,10 +47,8 @@ def _names(package: str, law: Law) -> Iterator[tuple[str, str]]:
 
 def _twice(package: str, name: str, first: str, second: str) -> ExportError:
     return ExportError(
-        describe(
-            f"Two things of the package '{package}' would be called '{name}' in C.",
-            expected="different names, in capitals too",
-            received=f"{first}; {second}",
-            remedy="rename one of the functions, inputs or outputs, or the package by name=",
-        )
+        f"Two things of the package '{package}' would be called '{name}' in C.",
+        expected="different names, in capitals too",
+        received=f"{first}; {second}",
+        remedy="rename one of the functions, inputs or outputs, or the package by name=",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from covocp.base.errors import ExportError, describe
+from covocp.base.errors import ExportError
 
 LONGEST = 40
 # Of C up to C23, then of C++, whose users include the header.
@@ -55,12 +55,10 @@ def check_name(name: Any) -> str:
     if not reason:
         return str(name)
     raise ExportError(
-        describe(
-            f"{name!r} cannot be the name of a C package: its functions, files and types begin with it.",
-            expected=reason,
-            received=repr(name),
-            remedy="give another one by name=, such as 'lag_controller'",
-        )
+        f"{name!r} cannot be the name of a C package: its functions, files and types begin with it.",
+        expected=reason,
+        received=repr(name),
+        remedy="give another one by name=, such as 'lag_controller'",
     )
 
 
