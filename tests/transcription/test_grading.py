@@ -18,7 +18,7 @@ from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.steps import simpson_interval
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "defaults_expected_cost.py"
+PATH = Path(__file__).parents[2] / "benchmarks" / "measurements" / "expected_cost.py"
 
 
 def benchmark():

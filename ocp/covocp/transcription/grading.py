@@ -25,7 +25,7 @@ from covocp.transcription.starts import own_start
 from covocp.transcription.trajectory import Trajectory
 
 # Change of ln E in a part of an interval: ratio 1.5 of neighbouring parts. Ratio 2 leaves errors of the expected cost
-# of 5e-5 to 1.4e-3, this one of 1e-5 to 3e-4 (benchmarks/defaults_expected_cost.py).
+# of 5e-5 to 1.4e-3, this one of 1e-5 to 3e-4 (benchmarks/measurements/expected_cost.py).
 CHANGE = 0.4
 # An interval is divided where more than this many parts are asked for: where the time scale is below the interval.
 DIVIDED = 1.5

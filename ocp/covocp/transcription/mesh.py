@@ -313,7 +313,7 @@ def _choose_covariance_step(statement: Statement, options: Options) -> Step:
 def _choose_eliminated(statement: Statement, options: Options) -> bool:
     """Whether the matrices are eliminated: always where they can be and no path constraint on a few entries needs them.
 
-    Eliminated is faster for every problem of benchmarks/formulations.py, down to a single scalar variance.
+    Eliminated is faster for every problem of benchmarks/measurements/formulations.py, down to a single scalar variance.
     """
     if not statement.matrices:
         return True
