@@ -5,7 +5,7 @@
   restart with a tolerance of 1e-10 gains nothing, and the value is among those found from other starts.
 - *Random problems* (tests/random_problems.py): restart, both formulations, both methods.
 
-`python benchmarks/measurements/convergence.py [--only plants premature random] [--seeds 200] [--gradient 50] [--starts 200]`
+`convergence.py [--only plants premature random] [--seeds 200] [--gradient 50] [--starts 200]`
 """
 
 from __future__ import annotations
