@@ -111,8 +111,8 @@ def main() -> None:
     if quick:
         return
     conditions = f"""Written by `benchmarks/peers/export.py`: medians of {REPEATS} measurements of one call, at points
-where nothing is wrong. Virtual machine: CasADi's function without what Python adds. Object and stack are those of the whole
-package.
+where nothing is wrong. Virtual machine: CasADi's function without what Python adds. Object and stack are those of the
+whole package.
 
 - commit {git("rev-parse", "--short=12", "HEAD") or "unknown"}, {datetime.date.today().isoformat()}
 - {version("casadi")}, {version("numpy")}, gcc -O2
