@@ -24,9 +24,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, unpack
+from covocp.base.quadrature import GAUSS_NODES, hermite
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.steps import GAUSS_NODES, hermite
 
 # Coefficients of the two-stage Gauss method; the weights of both stages are 1/2.
 GAUSS_MATRIX = ((0.25, 0.25 - np.sqrt(3.0) / 6.0), (0.25 + np.sqrt(3.0) / 6.0, 0.25))

@@ -17,11 +17,12 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, half_indices, unpack
+from covocp.base.quadrature import hermite
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
+from covocp.statement.interval import one_sided
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.rosenbrock import one_sided
-from covocp.transcription.steps import KEPT, hermite, joint_interval, matrices_step, nominal_interval
+from covocp.transcription.steps import KEPT, joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
 # what is positive semidefinite, to the roots of the diagonal at this place.

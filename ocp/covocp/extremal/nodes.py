@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, unpack
 from covocp.extremal.extremal import Extremal
-from covocp.transcription.rosenbrock import one_sided
+from covocp.statement.interval import one_sided
 
 
 def rates_along(extremal: Extremal) -> tuple[Array, Array]:

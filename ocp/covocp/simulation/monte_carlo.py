@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from covocp.base.arguments import checked, one_of
 from covocp.base.arguments import truth as a_truth
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
+from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
@@ -298,13 +298,13 @@ class MonteCarlo:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the runs; see `covocp.simulation.clouds.plot_monte_carlo`."""
-        module = importlib.import_module("covocp.simulation.clouds")
-        importlib.import_module("covocp.plot.figure").check_plot_options(options, module.plot_monte_carlo)
+        module = later("simulation.clouds")
+        later("plot.figure").check_plot_options(options, module.plot_monte_carlo)
         return module.plot_monte_carlo(self, *names, **options)  # type: ignore[no-any-return]
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(importlib.import_module("covocp.simulation.report").summary(self))
+        return str(later("simulation.report").summary(self))
 
     @checked(controls=a_truth)
     def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import CovocpError, ProblemError
+from covocp.base.later import later
 from covocp.base.matrices import (
     Array,
     is_semidefinite,
@@ -489,16 +489,17 @@ class Solution:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.figure.plot_solutions`."""
-        _later("plot").check_plot_options(options)
-        return _later("plot").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
+        figures = later("plot.figure")
+        figures.check_plot_options(options)
+        return figures.plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
 
     def save(self, path: str | Path) -> Path:
         """Write the solution to a .npz or .json file; see `covocp.solution.storage.save`."""
-        return _later("storage").save(self, path)  # type: ignore[no-any-return]
+        return later("solution.storage").save(self, path)  # type: ignore[no-any-return]
 
     def to_xarray(self) -> Any:
         """The solution as an xarray.Dataset; see `covocp.solution.storage.to_xarray`."""
-        return _later("storage").to_xarray(self)
+        return later("solution.storage").to_xarray(self)
 
     def __repr__(self) -> str:
         """One line: what a console shows of a solution that nobody prints is no page of numbers."""
@@ -506,7 +507,7 @@ class Solution:
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(_later("report").summary(self))
+        return str(later("solution.report").summary(self))
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -520,8 +521,3 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
         return dict(terms)
     nominal = {name: loop.cost[name] for name in ("terminal", "running")}
     return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
-
-
-def _later(module: str) -> Any:
-    """A module that is built on solutions; imported when it is used."""
-    return importlib.import_module(f"covocp.{module}")

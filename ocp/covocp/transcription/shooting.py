@@ -7,12 +7,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expression
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
-    early,
     full_interval,
-    interval_symbols,
     joint_interval,
     nominal_interval,
     propagate_step,
@@ -35,23 +35,23 @@ def control_ends(mesh: Mesh, u: Any) -> tuple[Any, Any]:
     return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
 
 
-def common_columns(mesh: Mesh, u: Any, duration: Any, parameters: Any) -> tuple[Any, ...]:
-    """The common arguments of the interval functions, a column for each interval."""
+def interval_columns(mesh: Mesh, u: Expression, duration: Expression, parameters: Expression) -> Interval:
+    """The intervals of a mesh, a column for each."""
     n = mesh.intervals
     start, end = control_ends(mesh, u)
     s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
-    return start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n)
+    return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n))
 
 
 def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
-    common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
+    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
         start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
         advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
     else:
         start, advance = variables.x, nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = _segments(mesh, advance, start, common)
+    ends, fine, cost = _segments(mesh, advance, start, intervals)
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
     gaps = ends[:, last] - start[:, 1:]
@@ -65,7 +65,7 @@ def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
     if not mesh.eliminated or statement.coupled:
         return result | {"e": nodes[nx:, :]}
     e0 = None if variables.e is None else variables.e[:, 0]
-    passage = passages(statement, mesh, result["x"], fine, common, variables.parameters, e0)
+    passage = passages(statement, mesh, result["x"], fine, intervals, variables.parameters, e0)
     if inside:
         result["e_inside"] = passage[1][:, inside]
     return result | {"e": passage[0], "cost": cost + passage[2]}
@@ -77,7 +77,7 @@ def _inside(mesh: Mesh) -> list[int]:
     return [k * m + j * stride - 1 for k in range(n) for j in range(1, mesh.points)]
 
 
-def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def _segments(mesh: Mesh, advance: ca.Function, start: Any, intervals: Interval) -> tuple[Any, Any, Any]:
     """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
     ends: list[Any] = []
     fine: list[Any] = []
@@ -88,7 +88,7 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, .
         function = advance if length == 1 else advance.mapaccum("segment", length)
         function = function.map(count) if count > 1 else function
         span = slice(first_interval, first_interval + count * length)
-        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in common))
+        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in intervals))
         for collected, value in zip((ends, fine, costs), outputs, strict=True):
             collected.append(value)
         first_segment, first_interval = first_segment + count, span.stop
@@ -110,7 +110,7 @@ def matrices_along(
     mesh: Mesh,
     x: Any,
     fine: Any,
-    common: tuple[Any, ...],
+    intervals: Interval,
     parameters: Any,
     e0: Any = None,
     kicks: Any = None,
@@ -122,7 +122,7 @@ def matrices_along(
         mesh: nodes, substeps, covariance step.
         x: states at the nodes, (nx, N + 1).
         fine: states at the ends of all substeps, (nx, N substeps).
-        common: common arguments of the interval functions, a column for each interval.
+        intervals: the intervals, a column for each.
         parameters: of the statement.
         e0: half-vectors at the start; None: the statement's.
         kicks: added to the half-vectors as they pass the nodes, (ne, N + 1): slopes by them are costates. None:
@@ -131,7 +131,7 @@ def matrices_along(
     Returns:
         Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
     """
-    e, _, cost = passages(statement, mesh, x, fine, common, parameters, e0, kicks)
+    e, _, cost = passages(statement, mesh, x, fine, intervals, parameters, e0, kicks)
     return e, cost
 
 
@@ -140,7 +140,7 @@ def passages(
     mesh: Mesh,
     x: Any,
     fine: Any,
-    common: tuple[Any, ...],
+    intervals: Interval,
     parameters: Any,
     e0: Any = None,
     kicks: Any = None,
@@ -150,30 +150,30 @@ def passages(
     e0 = statement.boundary(parameters)[2] if e0 is None else e0
     starts = x[:, :n]
     if mesh.step == "rk4" and not statement.behind:
-        ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, common)
+        ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     before = starts
     if m > 1:
         before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
         before = ca.reshape(before, statement.nx, n * m)
-    columns = (before, fine, *substep_columns(common, m, n))
+    columns = (before, fine, *intervals.substeps(m))
     first = e0[statement.entries(statement.ahead)]
     passed = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
     if statement.matrix_end is not None:
-        last = statement.matrix_end(x[:, -1], common[4][:, -1], parameters)
+        last = statement.matrix_end(x[:, -1], intervals.duration[:, -1], parameters)
         other = _backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind))
         entries = np.argsort(statement.entries(statement.ahead) + statement.entries(statement.behind)).tolist()
         passed = tuple(ca.vertcat(a, b)[entries, :] for a, b in zip(passed, other, strict=True))
     e, begins, halves = passed
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
-    return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *common))
+    return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))
 
 
 def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:
     """Running cost of each interval where it depends on the matrices; of a closed loop by parts in the first half."""
     n, m = mesh.intervals, mesh.substeps
-    half = int(np.sum(early(mesh.nodes[:-1], np.diff(mesh.nodes)))) if statement.behind else 0
+    half = int(np.sum(mesh.nodes[:-1] + np.diff(mesh.nodes) / 2 < 0.5)) if statement.behind else 0
     costs = []
     for span, by_parts in ((range(half), True), (range(half, n), False)):
         if len(span):
@@ -254,49 +254,27 @@ def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int
 def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """States and half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
     x0, e0, duration, p = start
-    common = common_columns(mesh, u, duration, p)
+    intervals = interval_columns(mesh, u, duration, p)
     if statement.coupled:
         interval = full_interval(statement, mesh.substeps, mesh.step)
-        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
+        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *intervals)
         nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
         return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
     nominal = nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *common)
+    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *intervals)
     x = ca.horzcat(x0, ends)
     if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0)
     return x, e, cost + matrix_cost
 
 
-def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
-    """The common arguments for each substep, a column each."""
-    if m == 1:
-        return common
-    start, end, s, ds, duration, parameters = common
-
-    def interleave(columns: list[Any]) -> Any:
-        return ca.reshape(ca.vertcat(*columns), columns[0].shape[0], n * m)
-
-    at = [start + (j / m) * (end - start) for j in range(m + 1)]
-    return (
-        interleave(at[:m]),
-        interleave(at[1:]),
-        interleave([s + (j / m) * ds for j in range(m)]),
-        interleave([ds / m] * m),
-        interleave([duration] * m),
-        interleave([parameters] * m),
-    )
-
-
-def _runge_kutta_along(
-    statement: Statement, mesh: Mesh, e0: Any, starts: Any, common: tuple[Any, ...]
-) -> tuple[Any, ...]:
+def _runge_kutta_along(statement: Statement, mesh: Mesh, e0: Any, starts: Any, intervals: Interval) -> tuple[Any, ...]:
     """The rk4 covariance step in sequence, restarted at the nominal of each node: at the ends, the substeps, cost."""
     interval = joint_interval(statement, mesh.substeps)
     symbolic: Any = statement.symbolic
     x, e = symbolic.sym("x", statement.nx), symbolic.sym("e", statement.ne)
-    rest = interval_symbols(statement, symbolic)
+    rest = Interval.symbols(statement)
     end, inner, cost = interval(ca.vertcat(x, e), *rest)
     step = ca.Function("matrix_step", [e, x, *rest], [end[statement.nx :], inner[statement.nx :, :], cost])
-    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *common))
+    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *intervals))

@@ -13,7 +13,7 @@ from covocp.base.matrices import Array
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import common_columns, shoot, substep_columns
+from covocp.transcription.shooting import interval_columns, shoot
 
 
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
@@ -174,12 +174,11 @@ def _inside_rows(
         rows.append(_bound_rows("bounds_inside", statement, scales, nodes["x_inside"][statement.bounded_states, :]))
     path = statement.path
     if path.size:
-        start, _, s, *_ = substep_columns(
-            common_columns(mesh, variables.u, variables.duration, variables.parameters), mesh.points, n
-        )
         at = [k * mesh.points + j for k in range(n) for j in range(1, mesh.points)]
+        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+        points = intervals.substeps(mesh.points).columns(at)
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
-        places = (nodes["x_inside"], start[:, at], e, variables.duration * s[:, at])
+        places = (nodes["x_inside"], points.start, e, variables.duration * points.s)
         rows.append(
             Rows(
                 kind="path_inside",

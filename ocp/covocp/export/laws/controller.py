@@ -23,13 +23,13 @@ import numpy as np
 
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.base.matrices import Array
+from covocp.base.quadrature import GAUSS_NODES
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.trajectory import times
 from covocp.statement.statement import Statement, entry_names
-from covocp.transcription.steps import GAUSS_NODES
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8

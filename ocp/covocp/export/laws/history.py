@@ -14,9 +14,9 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
+from covocp.base.quadrature import hermite
 from covocp.export.laws.law import LARGEST, status_of
 from covocp.solution.solution import Solution
-from covocp.transcription.steps import hermite
 
 # Times this far outside, relative to the duration, count as inside: sums of steps end there.
 MARGINS = {"double": 1e-9, "single": 1e-6}

@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.quadrature import GAUSS_NODES
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
-from covocp.transcription.steps import GAUSS_NODES
 
 # Times that differ by less than this share of a period are the same.
 WHOLE = 1e-9
