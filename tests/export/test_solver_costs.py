@@ -57,8 +57,9 @@ def moved(problem, starts):
     """The problem with other initial values of states."""
     for argument, value in starts.items():
         name = argument.removeprefix("initial_")
-        index = next(i for i, state in enumerate(problem.states) if state.name == name)
-        problem.states[index] = replace(problem.states[index], initial=ca.MX(value))
+        own = problem.declarations
+        states = tuple(replace(s, initial=ca.MX(value)) if s.name == name else s for s in own.states)
+        problem = co.Problem.of(replace(own, states=states))
     return problem
 
 
@@ -72,7 +73,7 @@ def test_costs_are_those_of_the_converged_optimum(case):
         plan = planner(**given)
         assert planner.status == "OK"
         problem = moved(make(), given)
-        guess = {control.name: plan[control.name] for control in problem.controls}  # of two mirror images this one
+        guess = {control.name: plan[control.name] for control in problem.declarations.controls}  # of two mirror images this one
         nodes = plan["time"].ravel() / plan["time"].ravel()[-1]  # a mesh graded for the start of the export stays so
         solution = co.solve(problem, substeps=2, grid=nodes, guess=guess, progress=False, plugin_options=TIGHT)
         assert plan["cost"] == pytest.approx(solution.cost, rel=SAME, abs=0.0)

@@ -43,7 +43,7 @@ def rms(loop):
 
 def values(problem, expression, x, u):
     """An expression of the problem's symbols along histories of state and control."""
-    symbols = [entry.symbol for entry in problem.states]
+    symbols = [entry.symbol for entry in problem.declarations.states]
     function = ca.Function("f", [*symbols, problem.controls[0].symbol], [expression])
     return function(*(ca.DM(row).T for row in x.T), ca.DM(np.ravel(u)).T).full().ravel()
 
@@ -150,7 +150,7 @@ def test_data_reach_the_statement(data):
     np.testing.assert_allclose(end, lower(np.diag([*weights, 0.0, 0.0, 0.0])), rtol=1e-4)
     assert (statement.duration.guess, statement.duration.free) == (900.0, False)
     np.testing.assert_array_equal(np.ravel(statement.control_bounds), [-0.2, 0.7])
-    assert [entry.unit for entry in problem.states] == ["ft", "rad", "ft/s", "rad", "ln(slug/ft^3)"]
+    assert [entry.unit for entry in problem.declarations.states] == ["ft", "rad", "ft/s", "rad", "ln(slug/ft^3)"]
 
 
 def test_without_regularization_only_the_covariances_cost():

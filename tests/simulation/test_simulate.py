@@ -1,5 +1,7 @@
 """Simulations against closed forms, linear theory where it is exact, and section 9 of the specification (6.12)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from loops import GRADED, linear_quadratic, open_loop, setting_of, steered
@@ -274,9 +276,9 @@ def test_bounds_of_the_problem_as_limits_and_as_a_measure():
 
 def test_states_that_leave_their_bounds_are_counted():
     problem = linear_quadratic()
-    problem.states[0] = problem.states[0].__class__(
-        **{**vars(problem.states[0]), "lower": np.array([-0.5, -np.inf]), "upper": np.array([1.5, np.inf])}
-    )
+    own = problem.declarations
+    bounded = replace(own.states[0], lower=np.array([-0.5, -np.inf]), upper=np.array([1.5, np.inf]))
+    problem = co.Problem.of(replace(own, states=(bounded, *own.states[1:])))
     sample = simulate(co.solve(problem, intervals=40, progress=False), 1000, 1, step=0.02, **OPTIONS)
     assert 0.1 < sample.outside_share["r[0]"] < 1.0
     assert "r[0]" in str(sample)

@@ -99,11 +99,12 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
         SolveError: the deterministic problem was not solved.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
-    if problem.expected is None or problem.expected.gain is not None:
+    expected = problem.declarations.expected
+    if expected is None or expected.gain is not None:
         raise ProblemError(
             "worth() compares the classical with the combined design.",
             expected="a problem with minimize_expected() and the best gain",
-            received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
+            received=f"'{problem.name}' with " + ("a constrained gain" if expected else "minimize()"),
             remedy="compare solutions by their costs instead",
         )
     if nominal is None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import casadi as ca
 
-from covocp.base.checks import is_symbolic
+from covocp.base.checks import caller, check_name, is_symbolic
 from covocp.base.errors import ProblemError
 from covocp.base.threads import methods_one_at_a_time
-from covocp.problem.declarations import Matrix, State, Unknown
+from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
 
 Entry = State | Unknown
 
@@ -20,6 +20,31 @@ def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
     return tuple(
         entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
     )
+
+
+def with_estimation(declarations: Declarations, initial: Any = None) -> Declarations:
+    """The declarations with the Kalman-Bucy covariance E of the augmented state, the last of the matrices.
+
+    Args:
+        declarations: of a problem.
+        initial: covariance at the start; None: from the variances of states and unknowns.
+
+    Raises:
+        ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
+    """
+    entries = declarations.augmented
+    labels = augmented_names(entries)
+    if not labels:
+        raise ProblemError(
+            "There is nothing to estimate.",
+            expected="states and unknowns declared before estimation_covariance()",
+            received="none",
+            remedy="call estimation_covariance() after the last state() and unknown()",
+        )
+    check_name("E", list(declarations.named))
+    initial = ca.diagcat(*(entry.variance for entry in entries)) if initial is None else initial
+    options = {"initial": initial, "lower": 0.0, "covariance": True, "estimation": True}
+    return declarations.adding(matrices=declare_matrix("E", labels=labels, where=caller(), **options))
 
 
 @methods_one_at_a_time

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -61,7 +61,7 @@ def inverse_density(density: Any, blocks: list[tuple[Any, Any]], invert: Callabl
     return ca.diagcat(*(invert(noise) if stated is None else stated for noise, stated in blocks))
 
 
-def check_readings(measurements: list[Measurement], matrices: list[Matrix]) -> None:
+def check_readings(measurements: Sequence[Measurement], matrices: Sequence[Matrix]) -> None:
     """An instrument reads the actual system: what it shows, and its noise, know no covariance."""
     names = {entry.symbol.__hash__(): entry.name for entry in matrices}
     for measurement in measurements:

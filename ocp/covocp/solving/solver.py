@@ -31,7 +31,7 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
-from covocp.problem.expected_cost import deterministic
+from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
@@ -144,7 +144,7 @@ class Solver:
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
-        solved = self.statement if nominal == "combined" else deterministic(problem).statement()
+        solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))

@@ -15,6 +15,7 @@ from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
+    from covocp.problem.declarations import Declarations
 
 # A guess with fewer rows than this share of the nodes is a row of waypoints.
 WAYPOINTS = 0.5
@@ -22,12 +23,11 @@ WAYPOINTS = 0.5
 
 def mention_forgotten(problem: Problem) -> None:
     """Warn of what is probably forgotten in a problem that is to be solved or evaluated; once for each statement."""
-    if problem._mentioned:
+    if problem.doubts_told:
         return
-    problem._mentioned = True
-    _mention_nothing_learnt(problem)
-    _mention_unused_measurements(problem)
-    _mention_spread_noise(problem)
+    problem.doubts_told = True
+    for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise):
+        mention(problem.declarations)
 
 
 def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
@@ -55,7 +55,7 @@ def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
             )
 
 
-def _mention_nothing_learnt(problem: Problem) -> None:
+def _mention_nothing_learnt(problem: Declarations) -> None:
     """A cost or a condition of the variance of an unknown that no measurement depends on: it never changes."""
     E = next((matrix for matrix in problem.matrices if matrix.estimation), None)
     if E is None or not problem.unknowns:
@@ -89,7 +89,7 @@ def _mention_nothing_learnt(problem: Problem) -> None:
             return
 
 
-def _seen(problem: Problem) -> set[int]:
+def _seen(problem: Declarations) -> set[int]:
     """Hashes of the symbols that measurements depend on, at once or through the rates of states."""
     rates = {s.symbol.__hash__(): problem.rates[s.name].rate for s in problem.states if s.name in problem.rates}
     seen: set[int] = set()
@@ -119,7 +119,7 @@ def _block_diagonal(initial: Any, unseen: set[int], rows: Any, columns: Any) -> 
     )
 
 
-def _mention_unused_measurements(problem: Problem) -> None:
+def _mention_unused_measurements(problem: Declarations) -> None:
     """Measurements without a covariance of errors, an expected cost or a matrix of the user's own."""
     if problem.measurements and problem.expected is None and not problem.matrices:
         names = ", ".join(f"'{m.name}'" for m in problem.measurements)
@@ -130,7 +130,7 @@ def _mention_unused_measurements(problem: Problem) -> None:
         )
 
 
-def _mention_spread_noise(problem: Problem) -> None:
+def _mention_spread_noise(problem: Declarations) -> None:
     """One noise density for all rows of a state of which some row is the rate of another: position and velocity."""
     for state in problem.states:
         entry = problem.rates.get(state.name)

@@ -153,7 +153,7 @@ def _task(problem: Problem, options: dict[str, Any]) -> _Task:
     """Reference solution and transcription."""
     made = replannable(problem)
     solution = Solver(made.fixed, **options).solve(progress=False)
-    statement = made.problem.statement()
+    statement = made.statement
     mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
     scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
     if mesh.eliminated and statement.matrices:
@@ -258,7 +258,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     return Law(
         name="solve",
         kind="solver",
-        about=ABOUT if task.made.fixed.expected is None else (*ABOUT, NOMINAL),
+        about=ABOUT if task.made.fixed.declarations.expected is None else (*ABOUT, NOMINAL),
         core=core,
         inputs=ports,
         outputs=(*(port for port, _ in outputs), Port(name="status")),
