@@ -44,7 +44,7 @@ def rms(loop):
 def values(problem, expression, x, u):
     """An expression of the problem's symbols along histories of state and control."""
     symbols = [entry.symbol for entry in problem.declarations.states]
-    function = ca.Function("f", [*symbols, problem.controls[0].symbol], [expression])
+    function = ca.Function("f", [*symbols, problem.declarations.controls[0].symbol], [expression])
     return function(*(ca.DM(row).T for row in x.T), ca.DM(np.ravel(u)).T).full().ravel()
 
 
@@ -170,7 +170,7 @@ def test_duration_may_be_free():
 
 def test_loads_of_the_reference():
     problem, loop = mars_entry.problem(), reference()
-    assert mars_entry.reference() == {problem.controls[0].name: 0.5}
+    assert mars_entry.reference() == {problem.declarations.controls[0].name: 0.5}
     rho, v = np.exp(loop.x[:, 4]), loop.x[:, 2]
     load = values(problem, mars_entry.load_factor(problem), loop.x, loop.u)
     np.testing.assert_allclose(load, 0.5 * 1.023 * rho * v**2 * np.sqrt(1.25) / 32.174, rtol=1e-12)

@@ -260,9 +260,8 @@ def test_limits_of_the_actual_control(oscillator):
 
 def test_bounds_of_the_problem_as_limits_and_as_a_measure():
     problem = linear_quadratic()
-    problem.controls[0] = problem.controls[0].__class__(
-        **{**vars(problem.controls[0]), "lower": np.full(2, -0.8), "upper": np.full(2, 0.8)}
-    )
+    limited = replace(problem.declarations.controls[0], lower=np.full(2, -0.8), upper=np.full(2, 0.8))
+    problem = co.Problem.of(replace(problem.declarations, controls=(limited,)))
     solution = co.solve(problem, intervals=40, progress=False)
     free = simulate(solution, 500, 1, step=0.02, **OPTIONS)
     bound = simulate(solution, 500, 1, step=0.02, limits="bounds", **OPTIONS)
