@@ -9,7 +9,7 @@ designs = {
     "combined": co.solve(problem, intervals=183),  # 5 s
     "constant": co.evaluate(problem, nominal=mars_entry.reference(), intervals=183),
 }
-h, theta, v, gamma, _ = (state.symbol for state in problem.declarations.states)
+h, theta, v, gamma, _ = (state.symbol for state in problem.states)
 load_factor, heat_rate = mars_entry.load_factor(problem), mars_entry.heat_rate(problem)
 radius = mars_entry.DATA["recommended"].radius  # ft
 

@@ -99,7 +99,7 @@ def test_first_order_change_is_the_slope_along_the_direction(problem, nominal):
     """By differences of the evaluated cost; along a given nominal its deterministic slope is part of it."""
     given = None
     if nominal is not None:
-        given = {c.name: lambda s, n=c.size: np.tile(nominal(s)[:, None], (1, n)) for c in problem.declarations.controls}
+        given = {c.name: lambda s, n=c.size: np.tile(nominal(s)[:, None], (1, n)) for c in problem.controls}
     found = co.worth(problem, nominal=given, intervals=20, substeps=2)
     h = 1e-3 if found.first_order > 1e-6 else 1.0
     slope = (along(problem, found, -h) - along(problem, found, h)) / (2 * h) / found.classical.cost

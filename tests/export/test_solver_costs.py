@@ -73,7 +73,7 @@ def test_costs_are_those_of_the_converged_optimum(case):
         plan = planner(**given)
         assert planner.status == "OK"
         problem = moved(make(), given)
-        guess = {control.name: plan[control.name] for control in problem.declarations.controls}  # of two mirror images this one
+        guess = {control.name: plan[control.name] for control in problem.controls}  # of two mirror images this one
         nodes = plan["time"].ravel() / plan["time"].ravel()[-1]  # a mesh graded for the start of the export stays so
         solution = co.solve(problem, substeps=2, grid=nodes, guess=guess, progress=False, plugin_options=TIGHT)
         assert plan["cost"] == pytest.approx(solution.cost, rel=SAME, abs=0.0)

@@ -99,6 +99,21 @@ class Problem:
         """Its name."""
         return self._declarations.name
 
+    @property
+    def states(self) -> tuple[State, ...]:
+        """The states that are declared, each with its `name`, `symbol` and `size`; so the other groups."""
+        return self._declarations.states
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """The controls that are declared."""
+        return self._declarations.controls
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The unknowns that are declared."""
+        return self._declarations.unknowns
+
     def __repr__(self) -> str:
         """What is declared, by name."""
         groups = ((kind, getattr(self._declarations, kind)) for kind in ("states", "unknowns", "controls", "matrices"))
