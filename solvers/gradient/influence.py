@@ -33,6 +33,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import simpson_weight
 from covocp.extremal.hamiltonian import backward_interval, forward_costates, hamiltonian
@@ -260,7 +261,7 @@ def quadrature_interval(statement: Statement, pairs: int, influences: int, *, ma
 def _columnwise(first: ca.Function, others: ca.Function) -> Callable[..., list[Any]]:
     """(columns, z, u, s, T, p) -> outputs side by side: of `first` for the first column, of `others` for the rest."""
 
-    def apply(columns: Any, *arguments: Any) -> list[Any]:
+    def apply(columns: Expr, *arguments: Any) -> list[Any]:
         split = ca.horzsplit(columns)
         outputs = [(others if k else first).call([*arguments, column]) for k, column in enumerate(split)]
         return [ca.horzcat(*values) for values in zip(*outputs, strict=True)]
@@ -348,7 +349,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
-def _given(sweeps: Sweeps, points: Any, common: tuple[Any, ...]) -> tuple[Array, Array]:
+def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...]) -> tuple[Array, Array]:
     """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
     shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
     if sweeps.given is None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.curvature import held_jacobian, mass_matrix
@@ -82,7 +83,7 @@ class Worth:
 
 
 @one_at_a_time
-def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **options: Any) -> Worth:
+def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **options: Any) -> Worth:
     """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
 
     Args:

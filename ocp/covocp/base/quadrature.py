@@ -8,14 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expression
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import linear_solve
 
 # Nodes of the two-stage Gauss method, shares of a step, both of weight 1/2.
 GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
 
 
-def classical_step(rate: Callable[[Any, float], Any], value: Any, h: Expression, first: Any = None) -> Any:
+def classical_step(rate: Callable[[Any, float], Any], value: Expr, h: Expr, first: Expr = None) -> Any:
     """One step of the classical Runge-Kutta method.
 
     Args:
@@ -31,7 +31,7 @@ def classical_step(rate: Callable[[Any, float], Any], value: Any, h: Expression,
     return value + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def hermite(start: Any, end: Any, slope_start: Any, slope_end: Any, c: Any) -> Any:
+def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr) -> Any:
     """Cubic Hermite polynomial at c in [0, 1]; slopes per unit of c."""
     return (
         (1 + 2 * c) * (1 - c) ** 2 * start
@@ -46,7 +46,7 @@ def simpson_weight(j: int, count: int) -> float:
     return (1 if j in (0, count) else 4 if j % 2 else 2) / (3 * count)
 
 
-def gauss_matrix(points: Any, size: int, solver: str) -> Expression:
+def gauss_matrix(points: Expr, size: int, solver: str) -> Expr:
     """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
 
     With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a

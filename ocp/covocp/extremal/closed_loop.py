@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite
@@ -171,7 +172,7 @@ def loop_substeps(extremal: Extremal) -> int:
     x, u, e, t, duration, p = extremal.columns()
     size = len(st.augmented)
 
-    def each(value: Any) -> Array:
+    def each(value: Expr) -> Array:
         numbers = np.asarray(value.full())
         return numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
 
@@ -249,7 +250,7 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     return ca.Function("joint_step", outer, [value])
 
 
-def _filter(statement: Statement, x: Any, u: Any, E: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:
     """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
     if statement.measurement is None:
         return E[:, :0], E[:0, :]

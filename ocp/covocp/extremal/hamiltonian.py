@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expression
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.extremal import Extremal
@@ -173,7 +173,7 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 
-def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Any) -> tuple[Array, Array, float]:
+def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Expr) -> tuple[Array, Array, float]:
     """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
@@ -298,7 +298,7 @@ def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = T
     pair = Interval.symbols(statement)
     slope = state_slope(statement, cost=cost, matrices=matrices)
 
-    def rate(costate: Expression, c: float) -> Expression:
+    def rate(costate: Expr, c: float) -> Expr:
         z, full = points[round(2 * (1 - c))], _with(costate, behind, given[round(2 * (1 - c))])
         return slope(*pair.at(1 - c, z[:nx], z[nx:]), full[:nx], full[nx:])
 
@@ -311,7 +311,7 @@ def _behind(statement: Statement) -> list[int]:
     return [statement.nx + k for k in statement.entries(statement.behind)]
 
 
-def _with(column: Any, entries: list[int], values: Any) -> Any:
+def _with(column: Expr, entries: list[int], values: Expr) -> Any:
     """A column with some entries replaced."""
     if not entries:
         return column
@@ -336,7 +336,7 @@ def forward_costates(statement: Statement, pairs: int) -> ca.Function:
     slope = state_slope(statement)
     value, points = start, [start]
 
-    def rate(pair: int, costate: Expression, c: float) -> Expression:
+    def rate(pair: int, costate: Expr, c: float) -> Expr:
         full, point = _with(ca.MX.zeros(nx + statement.ne), behind, costate), round(2 * (pair + c))
         place = interval.at(point / (2 * pairs), z[:nx, point], z[nx:, point])
         return -slope(*place, full[:nx], full[nx:])[behind]

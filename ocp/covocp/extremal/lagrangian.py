@@ -12,6 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
@@ -117,7 +118,7 @@ def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
     values = _interval_slopes(st, mesh)(z[:-1].T, *common)
     n, count = z.shape[1], mesh.intervals
 
-    def each(value: Any) -> Array:
+    def each(value: Expr) -> Array:
         numbers = np.asarray(value.full())
         return numbers.reshape(n, count, -1).transpose(1, 0, 2)
 

@@ -32,6 +32,7 @@ from covocp.base.checks import (
     scale_column,
 )
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
@@ -99,20 +100,19 @@ class Problem:
         """Its name."""
         return self._declarations.name
 
-    @property
-    def states(self) -> tuple[State, ...]:
-        """The states that are declared, each with its `name`, `symbol` and `size`; so the other groups."""
-        return self._declarations.states
-
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        """The controls that are declared."""
-        return self._declarations.controls
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """The unknowns that are declared."""
-        return self._declarations.unknowns
+    # What is declared can be read by its groups.
+    states = property(lambda self: self._declarations.states)
+    unknowns = property(lambda self: self._declarations.unknowns)
+    parameters = property(lambda self: self._declarations.parameters)
+    controls = property(lambda self: self._declarations.controls)
+    matrices = property(lambda self: self._declarations.matrices)
+    rates = property(lambda self: self._declarations.rates)
+    measurements = property(lambda self: self._declarations.measurements)
+    constraints = property(lambda self: self._declarations.constraints)
+    cost = property(lambda self: self._declarations.cost)
+    expected = property(lambda self: self._declarations.expected)
+    expansion = property(lambda self: self._declarations.expansion)
+    free_duration = property(lambda self: self._declarations.free_duration)
 
     def __repr__(self) -> str:
         """What is declared, by name."""
@@ -136,13 +136,13 @@ class Problem:
         name: str,
         shape: int = 1,
         *,
-        initial: Any,
-        final: Any = None,
-        lower: Any = -np.inf,
-        upper: Any = np.inf,
+        initial: Given,
+        final: Given = None,
+        lower: Given = -np.inf,
+        upper: Given = np.inf,
         guess: Guess = None,
-        scale: Any = None,
-        variance: Any = None,
+        scale: Given = None,
+        variance: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a nominal vector state.
@@ -188,7 +188,7 @@ class Problem:
         return declaration.symbol
 
     @checked(unit=text)
-    def unknown(self, name: str, mean: Any, variance: Any, *, unit: str = "") -> ca.MX:
+    def unknown(self, name: str, mean: Given, variance: Given, *, unit: str = "") -> ca.MX:
         """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
 
         Args:
@@ -217,7 +217,7 @@ class Problem:
         return declaration.symbol
 
     @checked(unit=text)
-    def parameter(self, name: str, value: Any, *, unit: str = "") -> ca.MX:
+    def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
         """Declare a known number (or vector) that may change from solve to solve without rebuilding.
 
         Raises:
@@ -241,10 +241,10 @@ class Problem:
         name: str,
         shape: int = 1,
         *,
-        lower: Any = -np.inf,
-        upper: Any = np.inf,
+        lower: Given = -np.inf,
+        upper: Given = np.inf,
         guess: Guess = 0.0,
-        scale: Any = None,
+        scale: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a control vector with its bounds, guess and scale (as for states), and unit for the axes of plots.
@@ -278,10 +278,10 @@ class Problem:
         name: str,
         size: int,
         *,
-        initial: Any,
-        final: Any = None,
+        initial: Given,
+        final: Given = None,
         lower: float | None = None,
-        guess: Any = None,
+        guess: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a general symmetric matrix state, stored as its half-vector.
@@ -323,7 +323,7 @@ class Problem:
         self._change(self._declarations.adding(matrices=declaration))
         return declaration.matrix
 
-    def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
+    def estimation_covariance(self, initial: Given = None) -> EstimationCovariance:
         """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
 
         Its rate is F E + E F' + Q - E M' U^-1 M E, with F and M the Jacobians of dynamics and measurements along the
@@ -341,7 +341,7 @@ class Problem:
         self._change(with_estimation(self._declarations, initial))
         return EstimationCovariance(self._declarations.augmented, self._declarations.matrices[-1])
 
-    def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
+    def dynamics(self, symbol: Given, rate: Given, noise: Given = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
 
         Args:
@@ -385,7 +385,7 @@ class Problem:
 
     @checked(unit=text)
     def measurement(
-        self, name: str, expression: Any, noise: Any = None, *, information: Any = None, unit: str = ""
+        self, name: str, expression: Given, noise: Given = None, *, information: Given = None, unit: str = ""
     ) -> None:
         """Add a continuous measurement m = expression + v with white noise v.
 
@@ -406,7 +406,7 @@ class Problem:
         entry = Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
         self._change(self._declarations.adding(measurements=entry))
 
-    def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
+    def minimize(self, running: Given = 0.0, terminal: Given = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].
 
         Args:
@@ -425,11 +425,11 @@ class Problem:
 
     def minimize_expected(
         self,
-        running: Any = 0.0,
-        terminal: Any = 0.0,
+        running: Given = 0.0,
+        terminal: Given = 0.0,
         *,
-        terminal_weight: Any = None,
-        control_weight: Any = None,
+        terminal_weight: Given = None,
+        control_weight: Given = None,
         gain: Gain | None = None,
     ) -> None:
         """State the expected cost <terminal + integral of running> of the actual system under linear feedback.
@@ -455,7 +455,13 @@ class Problem:
         self._change(replace(own, expected=expected))
 
     def subject_to(
-        self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None
+        self,
+        expression: Given,
+        *,
+        lower: Given = -np.inf,
+        upper: Given = 0.0,
+        at: Place = "path",
+        name: str | None = None,
     ) -> None:
         """Require lower <= expression <= upper.
 
@@ -502,7 +508,7 @@ class Problem:
             self._statement = statement_of(self._declarations)
         return self._statement
 
-    def _declare(self, name: str, size: Any) -> int:
+    def _declare(self, name: str, size: Given) -> int:
         """Check that the name is new and the size sensible."""
         check_name(name, list(self._declarations.named))
         return check_size(name, size)

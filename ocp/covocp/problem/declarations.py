@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.arguments import check_argument, truth
 from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length, unpack_symbolic
 
 Guess = float | Array | Callable[[Array], Any] | None
@@ -143,10 +144,10 @@ def declare_matrix(
     labels: tuple[str, ...],
     where: str,
     unit: str = "",
-    initial: Any = None,
-    final: Any = None,
+    initial: Given = None,
+    final: Given = None,
     lower: float | None = None,
-    guess: Any = None,
+    guess: Given = None,
     covariance: bool = False,
     estimation: bool = False,
     backward: Backward | None = None,

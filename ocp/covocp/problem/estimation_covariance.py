@@ -9,6 +9,7 @@ import casadi as ca
 
 from covocp.base.checks import caller, check_name, is_symbolic
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
 
@@ -22,7 +23,7 @@ def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
     )
 
 
-def with_estimation(declarations: Declarations, initial: Any = None) -> Declarations:
+def with_estimation(declarations: Declarations, initial: Given = None) -> Declarations:
     """The declarations with the Kalman-Bucy covariance E of the augmented state, the last of the matrices.
 
     Args:
@@ -70,7 +71,7 @@ class EstimationCovariance:
         """Names of the rows."""
         return self._declaration.labels
 
-    def __getitem__(self, key: Any) -> ca.MX:
+    def __getitem__(self, key: Given) -> ca.MX:
         """Covariance between two symbols or names, shape (size of a, size of b).
 
         Raises:
@@ -90,7 +91,7 @@ class EstimationCovariance:
         rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
         return rows @ self.matrix @ columns.T
 
-    def _rows(self, key: Any) -> Any:
+    def _rows(self, key: Given) -> Any:
         """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
         if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
             row = self.labels.index(key)

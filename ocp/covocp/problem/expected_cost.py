@@ -33,6 +33,7 @@ import numpy as np
 
 from covocp.base.checks import as_expression, as_number, caller, density_matrix, find_name
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.problem.declarations import (
@@ -58,7 +59,7 @@ FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
 
 
 def expected_cost(
-    problem: Declarations, running: Any, terminal: Any, terminal_weight: Any, control_weight: Any, gain: Gain | None
+    problem: Declarations, running: Expr, terminal: Expr, terminal_weight: Expr, control_weight: Expr, gain: Gain | None
 ) -> Expected:
     """Check and keep what `Problem.minimize_expected` was given."""
     if gain is not None and not isinstance(gain, Gain):
@@ -93,7 +94,7 @@ def check_first_cost(problem: Declarations, call: str) -> None:
         )
 
 
-def _by_name(what: str, weights: Any, entries: Sequence[Any]) -> Any:
+def _by_name(what: str, weights: Expr, entries: Sequence[Any]) -> Any:
     """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
     if not isinstance(weights, Mapping):
         return weights
@@ -267,12 +268,12 @@ def _check_free_names(problem: Declarations) -> None:
             )
 
 
-def _trace(a: Any, b: Any) -> Any:
+def _trace(a: Expr, b: Expr) -> Any:
     """tr(a b)."""
     return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
 
 
-def _inverse(density: Any) -> Any:
+def _inverse(density: Expr) -> Any:
     """`inverse`, in scalar operations where it is a full matrix of expressions: CasADi solves those numerically."""
     if density.is_constant() or density.sparsity().is_diag():
         return inverse(density)
@@ -293,7 +294,7 @@ def _with_feedback(problem: Declarations, expansion: Expansion) -> tuple[Declara
 
 
 def _with_free_gain(
-    problem: Declarations, expansion: Expansion, gain: Gain, information: Any
+    problem: Declarations, expansion: Expansion, gain: Gain, information: Expr
 ) -> tuple[Declarations, Any, Expansion]:
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
     labels = augmented_names([*problem.states, *problem.unknowns])

@@ -13,6 +13,7 @@ import numpy as np
 
 from covocp.base.checks import check_dynamics
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
@@ -234,7 +235,7 @@ def _state_rates(problem: Declarations, stacked: Stacked) -> Any:
     return ca.vertcat(*stacked.substitute(*(problem.rates[state.name].rate for state in problem.states)))
 
 
-def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Any) -> tuple[Any, tuple[Any, ...], Any]:
+def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple[Any, tuple[Any, ...], Any]:
     """Rates of all half-vectors, their Riccati forms where they have one, and the measurement."""
     e = stacked.inputs[2]
     measurement = _measurement(problem, stacked)
@@ -261,7 +262,7 @@ def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Any) -> tuple[
     return ca.vertcat(empty, *values), tuple(forms), function
 
 
-def _augmented_jacobian(stacked: Stacked, expression: Any) -> Any:
+def _augmented_jacobian(stacked: Stacked, expression: Expr) -> Any:
     """Jacobian with respect to the augmented state (states, then unknowns)."""
     x, p = stacked.inputs[0], stacked.inputs[5]
     by_state = ca.jacobian(expression, x)[:, : stacked.estimated]
@@ -278,7 +279,7 @@ def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any
     return value, _augmented_jacobian(stacked, value), density
 
 
-def _kalman_form(problem: Declarations, stacked: Stacked, rates: Any, measurement: Any) -> tuple[Any, Any, Any]:
+def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measurement: Expr) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
     size = stacked.estimated + stacked.unknowns
     constants = ca.DM.zeros(stacked.unknowns, 1)
@@ -444,7 +445,7 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Condition
     )
 
 
-def _bounds(entries: Any) -> tuple[Any, Any]:
+def _bounds(entries: Expr) -> tuple[Any, Any]:
     """Stacked lower and upper bounds."""
     lower = np.concatenate([np.zeros(0), *(entry.lower for entry in entries)])
     upper = np.concatenate([np.zeros(0), *(entry.upper for entry in entries)])
@@ -463,7 +464,7 @@ def _diagonal_bounds(entry: Matrix) -> Any:
 def _expression_builder(problem: Declarations, stacked: Stacked) -> Callable[[Any], ca.Function]:
     """What turns a user's expression into a function of the six stacked inputs."""
 
-    def build(expression: Any) -> ca.Function:
+    def build(expression: Expr) -> ca.Function:
         return stacked.function("expression", stacked.substitute(expression))
 
     return build

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.problem.builder import Problem
 from covocp.problem.declarations import Declarations
@@ -97,7 +98,7 @@ def design_system(solution: Solution) -> System:
     )
 
 
-def actual_system(design: System, truth: Any) -> System:
+def actual_system(design: System, truth: Given) -> System:
     """The system that is simulated.
 
     Args:

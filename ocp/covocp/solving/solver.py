@@ -23,6 +23,7 @@ from covocp.base.errors import (
     warn_user,
     without_warnings,
 )
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
@@ -77,7 +78,7 @@ def method_options(method: str) -> dict[str, Any]:
     return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
 
 
-def check_problem(problem: Any) -> None:
+def check_problem(problem: Given) -> None:
     """What is solved or compared must be a problem.
 
     Raises:
@@ -156,7 +157,7 @@ class Solver:
         self,
         parameters: Mapping[str, Any] | None = None,
         *,
-        guess: Any = None,
+        guess: Given = None,
         progress: bool = True,
         allow_failure: bool = False,
         starts: int = STARTS,
@@ -426,7 +427,7 @@ def solve(
     method: str = "ipopt",
     *,
     intervals: int = 100,
-    guess: Any = None,
+    guess: Given = None,
     nominal: str = "combined",
     progress: bool = True,
     allow_failure: bool = False,

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import warn_user
+from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
 from covocp.statement.names import chosen_entry
 from covocp.transcription.mesh import Options
@@ -102,7 +103,7 @@ def _seen(problem: Declarations) -> set[int]:
     return seen
 
 
-def _correlated(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+def _correlated(initial: Given, unseen: set[int], rows: Given, columns: Given) -> bool:
     """Whether the first covariance joins what is not measured with the rest, or may do so."""
     if initial is None or ca.symvar(initial):
         return initial is not None and initial.nnz() > 0 and not _block_diagonal(initial, unseen, rows, columns)
@@ -110,7 +111,7 @@ def _correlated(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool
     return any(v != 0 and (i in unseen) != (j in unseen) for v, i, j in zip(values, rows, columns, strict=True))
 
 
-def _block_diagonal(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+def _block_diagonal(initial: Given, unseen: set[int], rows: Given, columns: Given) -> bool:
     """Whether a symbolic first covariance has no entries between two groups of rows."""
     sparsity = (initial if isinstance(initial, ca.MX) else ca.sparsify(initial)).sparsity()
     present = set(sparsity.row())
@@ -148,7 +149,7 @@ def _mention_spread_noise(problem: Declarations) -> None:
             )
 
 
-def _is_another(rate: Any, symbol: Any, row: int) -> bool:
+def _is_another(rate: Given, symbol: Given, row: int) -> bool:
     """Whether a rate is just another entry of the same state."""
     found = chosen_entry(rate, symbol)
     return found >= 0 and found != row

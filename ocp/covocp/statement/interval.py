@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from covocp.base.expressions import Expression
+from covocp.base.expressions import Expr
 from covocp.statement.statement import Statement
 
 # Share of an interval by which its ends are moved inside where the model is told the time, see `one_sided`.
@@ -32,12 +32,12 @@ class Interval(NamedTuple):
         parameters: of the statement.
     """
 
-    start: Expression
-    end: Expression
-    s: Expression
-    ds: Expression
-    duration: Expression
-    parameters: Expression
+    start: Expr
+    end: Expr
+    s: Expr
+    ds: Expr
+    duration: Expr
+    parameters: Expr
 
     @classmethod
     def symbols(cls, statement: Statement, kind: Any = None) -> Interval:
@@ -47,23 +47,23 @@ class Interval(NamedTuple):
         return cls(*(kind.sym(name, size) for name, size in sizes.items()))
 
     @property
-    def h(self) -> Expression:
+    def h(self) -> Expr:
         """Its length [s]."""
         return self.duration * self.ds
 
-    def control(self, c: Expression) -> Expression:
+    def control(self, c: Expr) -> Expr:
         """The control at a share of it."""
         return self.start + c * (self.end - self.start)
 
-    def place(self, c: float) -> Expression:
+    def place(self, c: float) -> Expr:
         """The normalised time at a share of it, its ends as limits from inside."""
         return self.s + one_sided(c) * self.ds
 
-    def time(self, c: float) -> Expression:
+    def time(self, c: float) -> Expr:
         """The time [s] at a share of it."""
         return self.duration * self.place(c)
 
-    def at(self, c: float, x: Expression, e: Expression | None = None) -> tuple[Expression, ...]:
+    def at(self, c: float, x: Expr, e: Expr | None = None) -> tuple[Expr, ...]:
         """The arguments of the model at a share of it: (x, u, t, T, p), or with half-vectors (x, u, e, t, T, p)."""
         middle = () if e is None else (e,)
         return (x, self.control(c), *middle, self.time(c), self.duration, self.parameters)
@@ -77,7 +77,7 @@ class Interval(NamedTuple):
         """The same, passed backward."""
         return self._replace(start=self.end, end=self.start, s=self.s + self.ds, ds=-self.ds)
 
-    def columns(self, chosen: Any) -> Interval:
+    def columns(self, chosen: Expr) -> Interval:
         """Some of its columns."""
         return Interval(*(entry[:, chosen] for entry in self))
 
@@ -90,7 +90,7 @@ class Interval(NamedTuple):
         return Interval(*(ca.reshape(ca.vertcat(*each), each[0].shape[0], n * count) for each in entries))
 
 
-def model_symbols(statement: Statement, kind: Any = None) -> list[Expression]:
+def model_symbols(statement: Statement, kind: Any = None) -> list[Expr]:
     """Symbols of the arguments of the model: state, control, half-vectors, time, duration, parameters."""
     kind = statement.symbolic if kind is None else kind
     sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)

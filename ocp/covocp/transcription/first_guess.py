@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, pack, real_numbers, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Block, Statement
@@ -45,7 +46,7 @@ def controls_guess(statement: Statement, nodes: Array, control: str, sign: float
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1)
 
 
-def is_plain(guess: Any) -> bool:
+def is_plain(guess: Given) -> bool:
     """Whether a guess is one number, which says little: it may be steered and bent."""
     return not callable(guess) and np.ndim(0.0 if guess is None else guess) == 0
 
@@ -62,7 +63,7 @@ def control_scale(statement: Statement, block: Block, values: Array) -> Array:
     return np.where(scale > 0, scale, 1.0)
 
 
-def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
+def evaluate_guess(block: Block, guess: Given, at: Array) -> Array:
     """A guess (number, array over the nodes, function of s) as an array (len(at), size).
 
     Raises:
@@ -131,7 +132,7 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
     return np.where(np.isnan(x0), default, x0), e0
 
 
-def matrix_guess(block: Block, guess: Any) -> Array:
+def matrix_guess(block: Block, guess: Given) -> Array:
     """Half-vector of the guess of a matrix; a number means that multiple of the identity.
 
     Raises:

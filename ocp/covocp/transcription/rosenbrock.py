@@ -17,6 +17,7 @@ from typing import Any
 
 import casadi as ca
 
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.statement.interval import Interval, one_sided
 from covocp.statement.statement import Statement
@@ -89,7 +90,7 @@ def implicit_step(statement: Statement, fractions: tuple[float, ...]) -> ca.Func
     return ca.Function("implicit_step", [x, *interval], [end, ca.horzcat(kind(nx, 0), *inside)])
 
 
-def _solver(matrix: Any, scalar: bool) -> Any:
+def _solver(matrix: Expr, scalar: bool) -> Any:
     """right -> matrix^-1 right: factorised once where it is written out, else by what C code has too."""
     if not scalar:
         return lambda right: linear_solve(matrix, right, COMPILED_SOLVER)

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expression
+from covocp.base.expressions import Expr
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -25,17 +25,17 @@ from covocp.transcription.steps import (
 NUMERIC_RUN = 10
 
 
-def repeat(column: Any, count: int) -> Any:
+def repeat(column: Expr, count: int) -> Any:
     """A column repeated; one without entries stays without."""
     return ca.repmat(column, 1, count) if column.shape[0] else ca.DM(0, count)
 
 
-def control_ends(mesh: Mesh, u: Any) -> tuple[Any, Any]:
+def control_ends(mesh: Mesh, u: Expr) -> tuple[Any, Any]:
     """Controls at the starts and the ends of the intervals, a column each."""
     return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
 
 
-def interval_columns(mesh: Mesh, u: Expression, duration: Expression, parameters: Expression) -> Interval:
+def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> Interval:
     """The intervals of a mesh, a column for each."""
     n = mesh.intervals
     start, end = control_ends(mesh, u)
@@ -43,7 +43,7 @@ def interval_columns(mesh: Mesh, u: Expression, duration: Expression, parameters
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n))
 
 
-def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
+def shoot(statement: Statement, mesh: Mesh, variables: Expr) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
@@ -77,7 +77,7 @@ def _inside(mesh: Mesh) -> list[int]:
     return [k * m + j * stride - 1 for k in range(n) for j in range(1, mesh.points)]
 
 
-def _segments(mesh: Mesh, advance: ca.Function, start: Any, intervals: Interval) -> tuple[Any, Any, Any]:
+def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval) -> tuple[Any, Any, Any]:
     """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
     ends: list[Any] = []
     fine: list[Any] = []
@@ -95,7 +95,7 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Any, intervals: Interval)
     return ca.horzcat(*ends), ca.horzcat(*fine), ca.horzcat(*costs)
 
 
-def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
+def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
     """Values at all nodes: variables where segments start and at the end, computed ones between."""
     if len(mesh.segments) == mesh.intervals:
         return start  # each node starts a segment
@@ -108,12 +108,12 @@ def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
 def matrices_along(
     statement: Statement,
     mesh: Mesh,
-    x: Any,
-    fine: Any,
+    x: Expr,
+    fine: Expr,
     intervals: Interval,
-    parameters: Any,
-    e0: Any = None,
-    kicks: Any = None,
+    parameters: Expr,
+    e0: Expr = None,
+    kicks: Expr = None,
 ) -> tuple[Any, Any]:
     """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
 
@@ -138,12 +138,12 @@ def matrices_along(
 def passages(
     statement: Statement,
     mesh: Mesh,
-    x: Any,
-    fine: Any,
+    x: Expr,
+    fine: Expr,
     intervals: Interval,
-    parameters: Any,
-    e0: Any = None,
-    kicks: Any = None,
+    parameters: Expr,
+    e0: Expr = None,
+    kicks: Expr = None,
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
     n, m = mesh.intervals, mesh.substeps
@@ -154,8 +154,8 @@ def passages(
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     before = starts
     if m > 1:
-        before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
-        before = ca.reshape(before, statement.nx, n * m)
+        inside: Expr = ca.reshape(fine, statement.nx * m, n)
+        before = ca.reshape(ca.vertcat(starts, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
     columns = (before, fine, *intervals.substeps(m))
     first = e0[statement.entries(statement.ahead)]
     passed = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
@@ -184,12 +184,12 @@ def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> 
     return ca.horzcat(*costs)
 
 
-def _of(kicks: Any, statement: Statement, positions: tuple[int, ...]) -> Any:
+def _of(kicks: Expr, statement: Statement, positions: tuple[int, ...]) -> Any:
     """The rows of the kicks that belong to some of the matrices."""
     return None if kicks is None else kicks[statement.entries(positions), :]
 
 
-def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+def _forward(statement: Statement, mesh: Mesh, first: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
     """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
     n, m = mesh.intervals, mesh.substeps
     later = None
@@ -200,7 +200,7 @@ def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, .
     return nodes, nodes[:, :n], arrived
 
 
-def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+def _backward(statement: Statement, mesh: Mesh, last: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
     """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
     n, m = mesh.intervals, mesh.substeps
     before, after, start, end, s, ds, duration, parameters = columns
@@ -214,7 +214,7 @@ def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, .
 
 
 def _sequence(
-    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Any, columns: tuple[Any, ...], kicks: Any
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Expr, columns: tuple[Any, ...], kicks: Expr
 ) -> tuple[Any, Any]:
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
@@ -237,7 +237,7 @@ def _sequence(
     return before, passed
 
 
-def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int) -> Any:
+def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> Any:
     """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
     if not isinstance(arguments[0], ca.DM):
         return step.mapaccum("propagate", count)(first, *arguments)
@@ -251,7 +251,7 @@ def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int
     return ca.horzcat(*passed)
 
 
-def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """States and half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
     x0, e0, duration, p = start
     intervals = interval_columns(mesh, u, duration, p)
@@ -269,7 +269,9 @@ def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, 
     return x, e, cost + matrix_cost
 
 
-def _runge_kutta_along(statement: Statement, mesh: Mesh, e0: Any, starts: Any, intervals: Interval) -> tuple[Any, ...]:
+def _runge_kutta_along(
+    statement: Statement, mesh: Mesh, e0: Expr, starts: Expr, intervals: Interval
+) -> tuple[Any, ...]:
     """The rk4 covariance step in sequence, restarted at the nominal of each node: at the ends, the substeps, cost."""
     interval = joint_interval(statement, mesh.substeps)
     symbolic: Any = statement.symbolic

@@ -28,7 +28,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expression
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, hermite, simpson_weight
@@ -66,7 +66,7 @@ def nominal_interval(statement: Statement, substeps: int, step: Step) -> ca.Func
         raise ValueError("a coupled problem has no separate nominal")
     x, interval = symbolic.sym("x", statement.nx), Interval.symbols(statement)
 
-    def rate(part: Interval, value: Expression, c: float) -> Expression:
+    def rate(part: Interval, value: Expr, c: float) -> Expr:
         return ca.vertcat(*nominal(*part.at(c, value[:-1])))
 
     states, cost = _classical_steps(rate, ca.vertcat(x, 0), interval, substeps)
@@ -86,7 +86,7 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
     z, interval = symbolic.sym("z", nx + statement.ne), Interval.symbols(statement)
     first = early(interval)
 
-    def rate(part: Interval, value: Expression, c: float) -> Expression:
+    def rate(part: Interval, value: Expr, c: float) -> Expr:
         point = part.at(c, value[:nx], value[nx:-1])
         moved, grown, cost = statement.rates(*point)
         if statement.behind:
@@ -102,14 +102,14 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
 
 
 def _classical_steps(
-    rate: Callable[[Interval, Expression, float], Expression], start: Expression, interval: Interval, substeps: int
-) -> tuple[Expression, Expression]:
+    rate: Callable[[Interval, Expr, float], Expr], start: Expr, interval: Interval, substeps: int
+) -> tuple[Expr, Expr]:
     """Classical Runge-Kutta over the parts of an interval: values at their ends, and the last entry, the cost."""
     values = [start]
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
         values.append(classical_step(partial(rate, part), values[-1], interval.h / substeps))
-    stacked: Expression = ca.horzcat(*values[1:])
+    stacked: Expr = ca.horzcat(*values[1:])
     return stacked[:-1, :], stacked[-1, -1]
 
 
@@ -146,7 +146,7 @@ def _gauss_points(statement: Statement, index: int, step: Step) -> ca.Function:
     return ca.Function("gauss_points", [xa, xb, *interval], points, _slopes(statement, 2))
 
 
-def _hermite_points(statement: Statement, xa: Expression, xb: Expression, interval: Interval) -> Expression:
+def _hermite_points(statement: Statement, xa: Expr, xb: Expr, interval: Interval) -> Expr:
     """The nominal at the Gauss points of a step, by a cubic Hermite polynomial between its ends."""
     fa, fb = (interval.h * _slope(statement, *interval.at(c, x)) for c, x in ((0.0, xa), (1.0, xb)))
     return ca.horzcat(*(hermite(xa, xb, fa, fb, c) for c in GAUSS_NODES))
@@ -161,7 +161,7 @@ def _strang_parts(statement: Statement, index: int) -> ca.Function:
     xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
     interval = Interval.symbols(statement)
 
-    def rate(value: Expression, c: float) -> Expression:
+    def rate(value: Expr, c: float) -> Expr:
         x, transition = value[: statement.nx], ca.reshape(value[statement.nx :], size, size)
         moved, drift = _slope(statement, *interval.at(c, x)), form(*interval.at(c, x))[0]
         return ca.vertcat(moved, ca.vec(drift @ transition))
@@ -180,14 +180,14 @@ def _form(statement: Statement, index: int) -> ca.Function:
     return form
 
 
-def _slope(statement: Statement, *point: Expression) -> Expression:
+def _slope(statement: Statement, *point: Expr) -> Expr:
     """Rate of the nominal at (x, u, t, T, p)."""
     if statement.nominal is None:
         raise ValueError("a coupled problem has no separate nominal")
     return statement.nominal(*point)[0]
 
 
-def _gauss_step(matrix: Any, half: Any, size: int, solver: str) -> Any:
+def _gauss_step(matrix: Expr, half: Expr, size: int, solver: str) -> Any:
     """Half-vector of E+ = (D21 + D22 E)(D11 + D12 E)^-1, symmetrised."""
     covariance = unpack_symbolic(half, size)
     below = matrix[size:, :size] + matrix[size:, size:] @ covariance
@@ -195,7 +195,7 @@ def _gauss_step(matrix: Any, half: Any, size: int, solver: str) -> Any:
     return pack_symbolic(linear_solve(above.T, below.T, solver))
 
 
-def _strang_step(parts: Any, half: Any, size: int, solver: str) -> Any:
+def _strang_step(parts: Expr, half: Expr, size: int, solver: str) -> Any:
     """Half-vector after update, noise, transition, noise, update."""
     transition, noise_a, information_a, noise_b, information_b = ca.horzsplit(parts, size)
     covariance = _updated(unpack_symbolic(half, size), information_a, solver) + noise_a
@@ -203,7 +203,7 @@ def _strang_step(parts: Any, half: Any, size: int, solver: str) -> Any:
     return pack_symbolic(_updated(covariance, information_b, solver))
 
 
-def _updated(covariance: Any, information: Any, solver: str) -> Any:
+def _updated(covariance: Expr, information: Expr, solver: str) -> Any:
     """(E^-1 + W)^-1 in Joseph's form."""
     size = covariance.shape[0]
     product = covariance @ information
@@ -277,7 +277,7 @@ def _by_parts(statement: Statement) -> Callable[..., tuple[Any, Any]]:
     return lambda *six: tuple(function(*six))
 
 
-def early(interval: Interval) -> Expression:
+def early(interval: Interval) -> Expr:
     """Whether an interval lies in the first half of the time, where the cost of a closed loop is taken by parts."""
     return interval.s + interval.ds / 2 < 0.5
 

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_length, pack, unpack
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
@@ -127,7 +128,7 @@ def _with_start(
     return _started(problem.adding(parameters=own), "states", position, ca.vertcat(*rows))
 
 
-def _started(problem: Declarations, group: str, position: int, initial: Any) -> Declarations:
+def _started(problem: Declarations, group: str, position: int, initial: Expr) -> Declarations:
     """The declarations with another initial value of one entry of a group."""
     found = list(getattr(problem, group))
     found[position] = replace(found[position], initial=initial)
@@ -162,7 +163,7 @@ def stacked(entries: tuple[Entry, ...], values: dict[str, Any], names: tuple[str
     return result
 
 
-def _half(column: Any, size: int) -> Any:
+def _half(column: Expr, size: int) -> Any:
     """Half-vector of a flat symmetric matrix, numbers or an expression; its symmetric part."""
     if isinstance(column, np.ndarray):
         return pack(column.reshape(size, size))
