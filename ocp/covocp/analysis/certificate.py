@@ -29,6 +29,7 @@ from covocp.analysis.reduction import Reduction, resolved
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import check_kind
 from covocp.base.matrices import unpack
+from covocp.base.pages import lines_as_html
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.extremal import Extremal
@@ -94,6 +95,10 @@ class Certificate:
             f"Lambda^-1 against E_bb(T) {self.consistency:.2g}"
         )
         return f"{self.verdict}: {self.reason}; {numbers}"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same sentence."""
+        return lines_as_html(str(self))
 
 
 @one_at_a_time

@@ -16,9 +16,9 @@ from typing import Any, NoReturn
 import covocp as co
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, spelling
 from covocp.base.files import check_target
+from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
-from covocp.solution.report import WIDTH
 from covocp.solution.storage import SUFFIXES as FILES
 from covocp.solving.solver import STARTS, method_options
 from covocp.transcription.mesh import Options

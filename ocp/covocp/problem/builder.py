@@ -32,6 +32,7 @@ from covocp.base.checks import (
 )
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import pack_symbolic
+from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
 from covocp.problem.declarations import (
@@ -51,6 +52,7 @@ from covocp.problem.declarations import (
     Unknown,
     declare_matrix,
 )
+from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, augmented_names
 from covocp.problem.expected_cost import check_first_cost, derive, expected_cost
 from covocp.problem.freeze import freeze
@@ -99,6 +101,14 @@ class Problem:
         parts = zip(("states", "unknowns", "controls", "matrices"), groups, strict=True)
         listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in parts if group)
         return f"Problem('{self.name}'{listed})"
+
+    def __str__(self) -> str:
+        """What print shows: symbols with their data, and the equations in their names."""
+        return as_text(sections(self))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same tables."""
+        return as_html(sections(self))
 
     @property
     def time(self) -> ca.MX:

@@ -13,6 +13,7 @@ from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
+from covocp.base.pages import WARNING
 from covocp.plot.figure import (
     BAND,
     BOUND,
@@ -22,7 +23,6 @@ from covocp.plot.figure import (
     RESOLUTION,
     STYLE,
     SUFFIXES,
-    WARNING,
     _figure,
     _folded,
     _grid,

@@ -14,6 +14,7 @@ from covocp.base.arguments import truth as a_truth
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
+from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
 from covocp.simulation.counts import Count, count
@@ -305,6 +306,11 @@ class MonteCarlo:
     def __str__(self) -> str:
         """The summary that print shows."""
         return str(importlib.import_module("covocp.simulation.report").summary(self))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same summary, and the figure."""
+        figure = importlib.import_module("covocp.plot.embedding").embedded(self.plot)
+        return as_html(importlib.import_module("covocp.simulation.report").sections(self), figure)
 
     @checked(controls=a_truth)
     def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:

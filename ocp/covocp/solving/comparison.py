@@ -13,9 +13,9 @@ import numpy as np
 
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
+from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
-from covocp.solution.report import number, render_table, wrapped
 from covocp.solution.solution import Solution
 from covocp.solving.solver import METHODS, Solver, check_problem, method_options
 from covocp.transcription.mesh import Options
@@ -125,17 +125,29 @@ class Comparison:
 
     def __str__(self) -> str:
         """The table that print shows."""
+        return as_text(self._sections())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same table, and the figure."""
+        from covocp.plot.embedding import embedded
+
+        return as_html(self._sections(), embedded(self.plot) if self.solutions else "")
+
+    def _sections(self) -> list[Section]:
+        """The name, the table, why runs failed, and what the columns mean."""
         columns = ["method", "cost", "gap", "slope", "costates", "end", "eigenvalue", "iterations", "seconds"]
         rows = [[row.label, *_entries(row, self.best)] for row in self.rows]
-        notes = [wrapped(f"{row.label}: {row.reason}") for row in self.rows if row.reason]
-        legend = wrapped(
+        legend = (
             "gap: relative to the least cost of a converged run; slope: largest slope of the Lagrangian by a control; "
             "costates: multipliers against backward integration; end: largest miss of a terminal condition; "
-            "eigenvalue: smallest one of the covariances",
-            indent="",
+            "eigenvalue: smallest one of the covariances"
         )
-        parts = [self.name, render_table(columns, rows), "\n".join(notes), legend]
-        return "\n\n".join(part for part in parts if part)
+        return [
+            [Sentence(self.name)] if self.name else [],
+            [Table(columns=columns, rows=rows)],
+            [Sentence(f"{row.label}: {row.reason}", warning=True) for row in self.rows if row.reason],
+            [Sentence(legend, "")],
+        ]
 
 
 @one_at_a_time
