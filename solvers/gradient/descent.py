@@ -22,6 +22,7 @@ import numpy as np
 from scipy import sparse
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.memory import Metric
 from covocp.transcription.mesh import Mesh
 
@@ -39,6 +40,8 @@ class Step:
     ell: Array
     active: Array
     gram: Array
+
+    __repr__ = short_repr
 
 
 def control_metric(mesh: Mesh, duration: float, weights: Array) -> Any:

@@ -31,6 +31,7 @@ from covocp.base.checks import check_kind
 from covocp.base.matrices import unpack
 from covocp.base.pages import lines_as_html
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -79,6 +80,8 @@ class Certificate:
     consistency: float | None = None
     gap: float | None = None
     mesh_gap: float | None = None
+
+    __repr__ = short_repr
 
     @property
     def certified(self) -> bool:

@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, unpack
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import GAUSS_NODES, hermite
@@ -53,6 +54,8 @@ class Parts:
     measured: Any
     density: Any
     running: Any
+
+    __repr__ = short_repr
 
 
 def parts(statement: Statement, parameters: Array) -> Parts:
@@ -98,6 +101,8 @@ class Samples:
     state: Array
     density: Array
     running: tuple[Array, Array, Array]
+
+    __repr__ = short_repr
 
 
 def sample(given: Parts, times: Array) -> Samples:
@@ -154,6 +159,8 @@ class Step:
     x: Array
     S: Array
     filtered: Array
+
+    __repr__ = short_repr
 
 
 class Reduction:

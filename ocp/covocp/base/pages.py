@@ -44,9 +44,7 @@ class Table:
         table = Rich(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=any(self.columns))
         for i, column in enumerate(self.columns):
             left = i in self.words
-            table.add_column(
-                Text(column), justify="left" if left else "right", overflow="fold", no_wrap=not left
-            )
+            table.add_column(Text(column), justify="left" if left else "right", overflow="fold", no_wrap=not left)
         for row in self.rows:
             table.add_row(*(Text(entry) for entry in row))
         stream = io.StringIO()

@@ -19,7 +19,7 @@ FEW = 4
 def short_repr(thing: Any) -> str:
     """One line of at most 120 characters for a dataclass: `__repr__ = short_repr` in its body.
 
-    Fields at their defaults are left out, arrays are their shapes, other dataclasses their names; the fields at the end
+    Fields at their defaults are left out, arrays are their shapes (of a few numbers: the numbers), other dataclasses their names; the fields at the end
     are left out where all of them are too long for a line.
 
     Args:
@@ -62,6 +62,8 @@ def _field(value: Any) -> str:
 
 def _value(value: Any) -> str:
     if isinstance(value, np.ndarray):
+        if 0 < value.size <= FEW:
+            return str(np.array2string(value, separator=", ", formatter={"float_kind": lambda v: f"{v:.6g}"}))
         return f"array({', '.join(map(str, value.shape))}{',' if value.ndim == 1 else ''})"
     if isinstance(value, (ca.DM, ca.SX, ca.MX)):
         return f"{type(value).__name__}({value.shape[0]}, {value.shape[1]})"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
 from covocp.base.errors import warn_user
+from covocp.base.short_repr import short_repr
 from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
@@ -57,6 +58,8 @@ class Convergence:
     largest: float
     largest_transformed: float
 
+    __repr__ = short_repr
+
     @property
     def converges(self) -> bool:
         """Whether it converges at all the states."""
@@ -76,6 +79,8 @@ class Choice:
     k: Array
     l: Array
     misfit: float
+
+    __repr__ = short_repr
 
 
 def radius(A0: Any, direction: Any, B: Any, Q: Any, R: Any) -> float:

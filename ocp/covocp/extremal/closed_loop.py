@@ -23,6 +23,7 @@ import numpy as np
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.riccati_rates import inverse
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
 from covocp.statement.statement import Loop, Statement
@@ -48,6 +49,8 @@ class Statistics:
     density: ca.Function
     parameters: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedLoop:
@@ -71,6 +74,8 @@ class ClosedLoop:
     cost: Mapping[str, float]
     other_cost: float | None
     conservation: float | None
+
+    __repr__ = short_repr
 
     @property
     def X(self) -> Array:

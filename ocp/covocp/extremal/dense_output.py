@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, half_indices, unpack
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
 from covocp.statement.statement import Block, Statement
@@ -59,6 +60,8 @@ class Dense:
     values: Array
     first: Array
     last: Array
+
+    __repr__ = short_repr
 
     def at(self, s: Array) -> Array:
         """x and e stacked at some normalised times, (K, nx + ne)."""
@@ -144,6 +147,8 @@ class _Steps:
     seen: Array
     size: Array
     pairs: Any
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal, coarse: Dense, rows: list[int], states: Dense | None) -> _Steps:
@@ -306,6 +311,8 @@ class _Pieces:
     high: Array
     first: Array
     last: Array
+
+    __repr__ = short_repr
 
     def chosen(self, which: Any) -> _Pieces:
         """Some of them."""

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, interval_columns, prolongation, refined
 from covocp.statement.statement import Statement
@@ -35,6 +36,8 @@ class Costates:
 
     state: Array
     matrices: Array
+
+    __repr__ = short_repr
 
 
 def hamiltonian(

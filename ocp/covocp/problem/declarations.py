@@ -12,6 +12,7 @@ import numpy as np
 from covocp.base.arguments import check_argument, truth
 from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
 from covocp.base.matrices import Array, half_length, unpack_symbolic
+from covocp.base.short_repr import short_repr
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
@@ -64,6 +65,8 @@ class State:
     variance: ca.MX
     estimated: bool = True
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unknown:
@@ -77,6 +80,8 @@ class Unknown:
     mean: Array
     variance: ca.MX
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
@@ -88,6 +93,8 @@ class Parameter:
     where: str
     unit: str
     value: Array
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,6 +110,8 @@ class Control:
     upper: Array
     guess: Guess
     scale: Array | None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,6 +133,8 @@ class Matrix:
     labels: tuple[str, ...]
     backward: Backward | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Backward:
@@ -135,6 +146,8 @@ class Backward:
 
     end: ca.MX
     form: tuple[ca.MX, ca.MX, ca.MX]
+
+    __repr__ = short_repr
 
 
 def declare_matrix(
@@ -192,6 +205,8 @@ class Dynamics:
     where: str
     one_density: bool = False
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
@@ -208,6 +223,8 @@ class Measurement:
     where: str
     information: ca.MX | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
@@ -219,6 +236,8 @@ class Constraint:
     upper: Array
     at: Place
     where: str
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,6 +258,8 @@ class Gain:
     upper: Any = np.inf
     guess: Any = None
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Refuse what is no truth value; the arrays are checked with the problem that they belong to."""
         check_argument("Gain()", "constant", truth, self.constant)
@@ -258,6 +279,8 @@ class Expected:
     control_weight: Any
     gain: Gain | None
     where: str
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -280,3 +303,5 @@ class Expansion:
     gain: ca.MX
     alternative: ca.MX | None = None
     product: ca.MX | None = None
+
+    __repr__ = short_repr

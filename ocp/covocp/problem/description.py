@@ -102,7 +102,10 @@ def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
     for measurement in problem.measurements:
         yield ("measurement", measurement.name), measurement.expression
         stated = measurement.information is not None
-        yield ("information" if stated else "noise", measurement.name), measurement.information if stated else measurement.noise
+        yield (
+            ("information" if stated else "noise", measurement.name),
+            measurement.information if stated else measurement.noise,
+        )
     cost = (problem.expected.running, problem.expected.terminal) if problem.expected is not None else problem.cost
     if cost is not None:
         yield ("running", ""), cost[0]
@@ -151,7 +154,9 @@ def _ranges(lower: Array, upper: Array) -> list[str]:
         if np.isfinite(low) and np.isfinite(high):
             result.append(f"{number(low)} .. {number(high)}")
         else:
-            result.append(f">= {number(low)}" if np.isfinite(low) else f"<= {number(high)}" if np.isfinite(high) else "")
+            result.append(
+                f">= {number(low)}" if np.isfinite(low) else f"<= {number(high)}" if np.isfinite(high) else ""
+            )
     return result
 
 
@@ -202,13 +207,14 @@ def _matrices(problem: Problem, written: _Written) -> Section:
             for kind, value in (("initial", q.initial), ("final", q.final))
         ]
         diagonal = [i == j for i, j in zip(*half_indices(q.size), strict=True)]
-        lower = [number(q.lower) if q.lower is not None and on else "" for on in diagonal]
+        lower = [number(q.lower) if q.lower is not None and on and not q.estimation else "" for on in diagonal]
         own = [list(row) for row in zip(names, [q.unit] * len(names), *ends, lower, strict=True)]
         beside = {tuple(row[2:]) for row, on in zip(own, diagonal, strict=True) if not on}
         if len(own) > MOST_ENTRIES or beside <= {("0", "", ""), ("0", "0", ""), ("free", "", "")}:
             own = [row for row, on in zip(own, diagonal, strict=True) if on]
         rows += _shortened(own)
-    return _table(["covariance or matrix", "unit", "at 0", "at T", "lower bound"], rows)
+    kinds = dict.fromkeys("covariance" if q.covariance else "matrix" for q in problem.matrices)
+    return _table([" or ".join(kinds), "unit", "at 0", "at T", "lower bound"], rows)
 
 
 def _rates(problem: Problem, written: _Written) -> Section:

@@ -13,6 +13,9 @@ MOST_OPERATIONS = 150
 # Characters from which on an expression that is used several times has a name, and any expression has.
 REPEATED, LONG = 12, 240
 
+# The word of what a function that is called returns.
+OUTPUT = "(returned)"
+
 # How tightly an operation binds: its operands need brackets where they bind less tightly.
 LOOSE, SUM, PRODUCT, SIGN, POWER, ATOM = range(6)
 INFIX: dict[int, tuple[str, int]] = {
@@ -72,7 +75,8 @@ def formulas(expressions: Sequence[Any], symbols: Sequence[Any], names: Sequence
     known = _written(scalar, joint) if joint is not None else Formulas(entries=(), definitions=())
     rest = iter(known.entries)
     entries = [
-        next(rest) if part is not None else (_as_printed(e),) * e.numel() for e, part in zip(expressions, parts, strict=True)
+        next(rest) if part is not None else (_as_printed(e),) * e.numel()
+        for e, part in zip(expressions, parts, strict=True)
     ]
     return Formulas(entries=tuple(entries), definitions=known.definitions)
 
@@ -87,21 +91,20 @@ def _size(count: int, names: Sequence[str]) -> str:
     return f"({count} operations on {', '.join(names) or 'numbers'})"
 
 
-def _expanded(expressions: Sequence[Any], symbols: Sequence[Any], names: Sequence[Sequence[str]]) -> ca.Function | None:
-    """The entries of all expressions as a function of scalars; None where there is no such form."""
+def _expanded(expressions: Sequence[Any], symbols: Sequence[Any], names: Sequence[Sequence[str]]) -> Any:
+    """The entries of all expressions as a column of scalar expressions; None where there is no such form."""
     try:
         function = ca.Function("formulas", list(symbols), [ca.densify(e) for e in expressions])
         columns = [ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(name) for name in own)) for own in names]
         values = function.call(columns, True, False)
     except RuntimeError:
         return None
-    return ca.Function("formulas", columns, [ca.vertcat(ca.SX(0, 1), *(ca.vec(ca.densify(v)) for v in values))])
+    return ca.vertcat(ca.SX(0, 1), *(ca.vec(ca.densify(value)) for value in values))
 
 
-def _written(expressions: Sequence[Any], function: ca.Function) -> Formulas:
-    """The formulas of the entries of a function of scalars."""
-    graph = _Graph.of(function)
-    texts, definitions = graph.formulas()
+def _written(expressions: Sequence[Any], column: Any) -> Formulas:
+    """The formulas of a column of scalar expressions, the entries of all expressions."""
+    texts, definitions = _Graph.of(column).formulas()
     rest = iter(texts)
     return Formulas(
         entries=tuple(tuple(next(rest) for _ in range(e.numel())) for e in expressions), definitions=tuple(definitions)
@@ -110,31 +113,28 @@ def _written(expressions: Sequence[Any], function: ca.Function) -> Formulas:
 
 @dataclass
 class _Graph:
-    """Operations in an order in which each uses earlier ones only; (operation, operands, word of a leaf)."""
+    """Operations in an order in which each uses earlier ones only: operation, operands, and the word of some."""
 
     nodes: list[tuple[int, tuple[int, ...], str]] = field(default_factory=list)
     outputs: list[int] = field(default_factory=list)
 
     @staticmethod
-    def of(function: ca.Function) -> _Graph:
-        """The graph of a function of scalars; its work vector is used again and again, its nodes are not."""
-        graph, work = _Graph(), dict[int, int]()
-        leaves = [[str(entry) for entry in ca.vertsplit(symbol)] if symbol.numel() else [] for symbol in function.sx_in()]
-        outputs = dict[int, int]()
-        for k in range(function.n_instructions()):
-            operation, inputs = function.instruction_id(k), function.instruction_input(k)
-            place = function.instruction_output(k)
-            if operation == ca.OP_OUTPUT:
-                outputs[place[1]] = work[inputs[0]]
-                continue
-            if operation == ca.OP_INPUT:
-                graph.nodes.append((operation, (), leaves[inputs[0]][inputs[1]]))
-            elif operation == ca.OP_CONST:
-                graph.nodes.append((operation, (), f"{function.instruction_constant(k):.8g}"))
-            else:
-                graph.nodes.append((operation, tuple(work[i] for i in inputs), ""))
-            work[place[0]] = len(graph.nodes) - 1
-        graph.outputs = [outputs[i] for i in range(len(outputs))]
+    def of(column: Any) -> _Graph:
+        """The graph of the entries of a column; what they share is in it once."""
+        graph, known = _Graph(), dict[int, int]()
+        for i in range(column.numel()):
+            waiting = [column[i]]
+            while waiting:
+                node = waiting[-1]
+                operands = [] if node.is_leaf() else [node.dep(k) for k in range(node.n_dep())]
+                if missing := [operand for operand in operands if operand.element_hash() not in known]:
+                    waiting += missing
+                    continue
+                waiting.pop()
+                if node.element_hash() not in known:
+                    known[node.element_hash()] = len(graph.nodes)
+                    graph.nodes.append((node.op(), tuple(known[q.element_hash()] for q in operands), _word(node)))
+            graph.outputs.append(known[column[i].element_hash()])
         return graph
 
     def formulas(self) -> tuple[list[str], list[tuple[str, str]]]:
@@ -170,13 +170,15 @@ class _Graph:
         return found
 
     def _symbols(self, nodes: set[int]) -> list[str]:
-        return [self.nodes[k][2] for k in sorted(nodes) if self.nodes[k][0] == ca.OP_INPUT]
+        return [self.nodes[k][2] for k in sorted(nodes) if self.nodes[k][0] == ca.OP_PARAMETER]
 
     def _formula(self, k: int, texts: dict[int, tuple[str, int]]) -> tuple[str, int]:
         """A node in terms of the texts of its operands, and how tightly it binds."""
-        operation, operands, leaf = self.nodes[k]
+        operation, operands, word = self.nodes[k]
+        if word == OUTPUT:
+            return texts[operands[0]]
         if not operands:
-            return leaf, SIGN if leaf.startswith("-") else ATOM
+            return word, SIGN if word.startswith("-") else ATOM
         if operation in INFIX:
             return _infix(operation, texts[operands[0]], texts[operands[1]])
         first = texts[operands[0]]
@@ -190,8 +192,19 @@ class _Graph:
             return f"1/{_bracketed(first, POWER)}", PRODUCT
         if operation == ca.OP_NOT:
             return f"not {_bracketed(first, ATOM)}", LOOSE
-        name = FUNCTIONS.get(operation, f"operation_{operation}")
+        name = word or FUNCTIONS.get(operation, f"operation_{operation}")
         return f"{name}({', '.join(texts[operand][0] for operand in operands)})", ATOM
+
+
+def _word(node: Any) -> str:
+    """The name of a symbol, the digits of a number, the name of a function that is called; else nothing."""
+    if node.is_symbolic():
+        return str(node.name())
+    if node.is_constant():
+        return f"{float(node):.8g}"
+    if node.is_call():
+        return str(node.which_function().name())
+    return OUTPUT if node.is_output() else ""
 
 
 def _infix(operation: int, left: tuple[str, int], right: tuple[str, int]) -> tuple[str, int]:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import special
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.prediction import Prediction
 from covocp.simulation.run_parts import Run, part
@@ -54,6 +55,8 @@ class Rows:
     rows: tuple[Row, ...]
     function: ca.Function
     left_out: Mapping[str, str]
+
+    __repr__ = short_repr
 
     def at(self, *places: Place) -> list[int]:
         """Positions of the rows of some places."""

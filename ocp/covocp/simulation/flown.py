@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.request import wrong_argument
 from covocp.simulation.schedule import WHOLE, Grid
@@ -36,6 +37,8 @@ class Flown:
     period: float
     times: Array
     estimates: bool
+
+    __repr__ = short_repr
 
 
 def flown_law(law: Any, period: Any, design: System, duration: float) -> Flown | None:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
 from covocp.base.errors import CovocpError, ProblemError, shown
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
@@ -48,6 +49,8 @@ class Filter:
     size: int
     H: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class LawSimulation:
@@ -68,6 +71,8 @@ class LawSimulation:
     filter_state: Array
     cost: Array
     diverged: NDArray[np.bool_]
+
+    __repr__ = short_repr
 
 
 def _of_state_and_control(value: Any) -> str:
@@ -238,6 +243,8 @@ class _Loop:
     observer: Filter | None
     running: ca.Function | None
     size: int
+
+    __repr__ = short_repr
 
     @property
     def measured(self) -> int:

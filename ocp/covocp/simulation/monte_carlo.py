@@ -15,6 +15,7 @@ from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.pages import as_html
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
 from covocp.simulation.counts import Count, count
@@ -127,6 +128,8 @@ class MonteCarlo:
     blocks: tuple[Block, ...]
     augmented: tuple[str, ...]
     symbols: Mapping[str, Any] = field(repr=False)
+
+    __repr__ = short_repr
 
     @property
     def runs(self) -> int:

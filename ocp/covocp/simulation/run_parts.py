@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_length
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.flown import Flown
 from covocp.simulation.schedule import Coefficients, Estimator
@@ -32,6 +33,8 @@ class Limits:
     least: Array
     most: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setting:
@@ -48,6 +51,8 @@ class Setting:
     limits: Limits
     domain: Array
     flown: Flown | None = None
+
+    __repr__ = short_repr
 
     @property
     def costs(self) -> bool:
@@ -72,6 +77,8 @@ class Run:
     spans: Mapping[str, slice]
     noisy: list[int]
     watched: int
+
+    __repr__ = short_repr
 
     @property
     def parts_of_noise(self) -> list[int]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch
 
 # Probability within 3 standard deviations of a normal law.
@@ -34,6 +35,8 @@ class Moments:
     product: Array
     cube: Array
     fourth: Array
+
+    __repr__ = short_repr
 
 
 def moments_of(batches: Sequence[Batch]) -> Moments:

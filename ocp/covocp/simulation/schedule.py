@@ -15,6 +15,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.base.riccati_rates import inverse
+from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
@@ -36,6 +37,8 @@ class Grid:
 
     t: Array
     interval: Any
+
+    __repr__ = short_repr
 
     @property
     def steps(self) -> int:
@@ -105,6 +108,8 @@ class Nominal:
     e: Array
     t: Array
 
+    __repr__ = short_repr
+
     def columns(self, duration: float, parameters: Array) -> tuple[Any, ...]:
         """Arguments (state, control, matrices, time, duration, parameters), a column for each time."""
         count = self.t.size
@@ -148,6 +153,8 @@ class Coefficients:
 
     function: ca.Function
     shapes: dict[str, tuple[int, int]]
+
+    __repr__ = short_repr
 
     @property
     def rows(self) -> int:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import special
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 # Widths are multiples of this, so that no column falls into the remainder of a vector loop.
 LANES = 64
@@ -101,6 +102,8 @@ class Columns:
     inputs: tuple[Array, ...]
     outputs: tuple[Array, ...]
     evaluate: Callable[[], None]
+
+    __repr__ = short_repr
 
 
 def padded(count: int) -> int:

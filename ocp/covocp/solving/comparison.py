@@ -14,6 +14,7 @@ import numpy as np
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
 from covocp.solution.solution import Solution
@@ -48,6 +49,8 @@ class Row:
     reason: str
     seconds: float
 
+    __repr__ = short_repr
+
 
 @methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +64,8 @@ class Comparison:
 
     name: str
     rows: tuple[Row, ...]
+
+    __repr__ = short_repr
 
     @property
     def solutions(self) -> Mapping[str, Solution]:

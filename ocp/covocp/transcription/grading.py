@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.matrices import Array, unpack
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts, stiffness
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
@@ -121,6 +122,8 @@ class _Steepness:
     times: Array
     rates: Array
     poles: Array
+
+    __repr__ = short_repr
 
     def parts(self) -> Array:
         """Integral of rate / CHANGE from the end to each of the times."""

@@ -11,6 +11,7 @@ from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import Step
 
@@ -46,6 +47,8 @@ class Graded:
     added: tuple[int, int]
     stiffness: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -60,6 +63,8 @@ class Options:
     covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
     step: Literal["auto", "rk4", "rodas"] = "auto"
     points: int | Literal["auto"] = "auto"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -124,6 +129,8 @@ class Mesh:
     step: Step
     linear_solver: str = LINEAR_SOLVER
     points: int = 1
+
+    __repr__ = short_repr
 
     @property
     def intervals(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import LARGEST, status_of
 from covocp.solution.solution import Solution
 from covocp.transcription.steps import hermite
@@ -32,6 +33,8 @@ class Nominal:
     u: Any
     e: Any
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Clock:
@@ -43,6 +46,8 @@ class Clock:
     time: Any
     within: Any
     conditions: list[tuple[Any, str]]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,6 +74,8 @@ class History:
     u: Array
     states: int
     margin: float
+
+    __repr__ = short_repr
 
     @property
     def duration(self) -> float:

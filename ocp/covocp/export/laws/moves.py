@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 from covocp.transcription.steps import GAUSS_NODES
@@ -50,6 +51,8 @@ class Moves:
     weight: Array
     sizes: tuple[int, int, int]
     first: Any
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(design: Design, tables: History, t: Array) -> Moves:
@@ -129,6 +132,8 @@ class _Point:
     N: Array
     B: Array
     u: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def at(design: Design, tables: History, t: Array, h: Array) -> _Point:

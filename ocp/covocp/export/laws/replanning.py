@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_length, pack, unpack
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
@@ -36,6 +37,8 @@ class Entry:
     value: Array
     deviation: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replannable:
@@ -50,6 +53,8 @@ class Replannable:
     problem: Problem
     fixed: Problem
     entries: tuple[Entry, ...]
+
+    __repr__ = short_repr
 
 
 def replannable(problem: Problem) -> Replannable:
