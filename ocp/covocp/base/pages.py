@@ -15,7 +15,7 @@ WIDTH = 100
 # Colour of a sentence that warns, that of warnings in figures too.
 WARNING = "#A8002D"
 # Styles of Jupyter and of others set all cells right and stretch tables: what is told here wins.
-LEFT, RIGHT = "text-align:left;vertical-align:top", "text-align:right;vertical-align:top"
+LEFT, RIGHT = (f"text-align:{side};vertical-align:top;padding:0.1em 0.6em" for side in ("left", "right"))
 TABLE = "border-collapse:collapse;width:auto;margin:0.6em 0"
 
 

@@ -19,8 +19,8 @@ FEW = 4
 def short_repr(thing: Any) -> str:
     """One line of at most 120 characters for a dataclass: `__repr__ = short_repr` in its body.
 
-    Fields at their defaults are left out, arrays are their shapes (of a few numbers: the numbers), other dataclasses their names; the fields at the end
-    are left out where all of them are too long for a line.
+    Fields at their defaults are left out, arrays of more than a few numbers are their shapes, other dataclasses their
+    names; the fields at the end are left out where all of them are too long for a line.
 
     Args:
         thing: an object of a dataclass.

@@ -128,7 +128,7 @@ class _Graph:
                 node = waiting[-1]
                 operands = [] if node.is_leaf() else [node.dep(k) for k in range(node.n_dep())]
                 if missing := [operand for operand in operands if operand.element_hash() not in known]:
-                    waiting += missing
+                    waiting += reversed(missing)
                     continue
                 waiting.pop()
                 if node.element_hash() not in known:
