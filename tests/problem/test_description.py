@@ -69,6 +69,17 @@ def test_bounds_ends_noise_and_constraints():
         assert line in shown, line
 
 
+def test_the_weights_of_an_expected_cost():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=0.0, final=[1.0, None], variance=1.0), ocp.control("u")
+    w = ocp.parameter("w", 3.0)
+    ocp.dynamics(x, ca.vertcat(x[1], u))
+    ocp.minimize_expected(running=u**2, terminal_weight={x[0]: 2 * w}, gain=co.Gain(constant=True))
+    shown = lines(str(ocp))
+    for line in ("integral of u**2", "weight of a miss x 2*w, 0", "gain of the feedback Gain(constant=True)"):
+        assert line in shown, line
+
+
 def test_a_problem_without_anything_is_shown():
     assert "problem without a name: duration 2 s" in str(co.Problem(2.0))
 

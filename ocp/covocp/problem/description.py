@@ -110,6 +110,9 @@ def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
     if cost is not None:
         yield ("running", ""), cost[0]
         yield ("terminal", ""), cost[1]
+    for what, weight in _weights(problem):
+        if isinstance(weight, dict):
+            yield from (((what, name), value) for name, value in weight.items())
     for constraint in problem.constraints:
         yield ("constraint", constraint.name), constraint.expression
 
@@ -259,6 +262,14 @@ def _measurements(problem: Problem, written: _Written) -> Section:
     return _table(["measurement", "unit", "", "noise density", "inverse density"], rows, code=(2,))
 
 
+def _weights(problem: Problem) -> list[tuple[str, Any]]:
+    """The weights of an expected cost, by symbol or as they were given."""
+    expected = problem.expected
+    if expected is None:
+        return []
+    return [("weight of a miss", expected.terminal_weight), ("control weight", expected.control_weight)]
+
+
 def _cost(problem: Problem, written: _Written) -> Section:
     if ("running", "") not in written.entries:
         return [Sentence("no cost yet: minimize() or minimize_expected()")]
@@ -267,10 +278,11 @@ def _cost(problem: Problem, written: _Written) -> Section:
     expected = problem.expected
     if expected is None:
         return _table(["minimise", ""], rows, code=(1,))
-    for weight, what in ((expected.terminal_weight, "weight of a miss"), (expected.control_weight, "control weight")):
-        if weight is not None:
-            named = weight.items() if isinstance(weight, dict) else [("", weight)]
-            rows += [[f"{what} {name}".rstrip(), " ".join(str(value).split())] for name, value in named]
+    for what, weight in _weights(problem):
+        if isinstance(weight, dict):
+            rows += [[f"{what} {name}", ", ".join(q or "0" for q in written.diagonal(what, name))] for name in weight]
+        elif weight is not None:
+            rows.append([what, " ".join(str(weight).split())])
     if expected.gain is not None:
         rows.append(["gain of the feedback", repr(expected.gain)])
     return _table(["minimise the expected", ""], rows, code=(1,))
