@@ -36,6 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 from covocp.blocks import riccati
 
 Array = npt.NDArray[np.float64]
@@ -77,6 +78,8 @@ class Scenario:
     W: Array
     V: Array
     duration: float
+
+    __repr__ = short_repr
     """[s]"""
 
 

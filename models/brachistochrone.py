@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.optimize import brentq
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -44,6 +45,8 @@ class Exact:
     v: Array
     """[m/s]"""
     theta: Array
+
+    __repr__ = short_repr
     """From the vertical [rad]."""
 
 

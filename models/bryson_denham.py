@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -29,6 +30,8 @@ class Exact:
     v: Array
     u: Array
     cost: float
+
+    __repr__ = short_repr
 
 
 def problem(limit: float = 1 / 9) -> co.Problem:

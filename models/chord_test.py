@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -35,6 +36,8 @@ class Exact:
     p: Array
     """Costate of x; that of E is 1."""
     cost: float
+
+    __repr__ = short_repr
 
 
 def problem() -> co.Problem:

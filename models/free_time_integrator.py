@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +39,8 @@ class Exact:
     ell: float
     """Multiplier of x(T) = 1, equal to p(T)."""
     cost: float
+
+    __repr__ = short_repr
 
 
 def problem(time_weight: float = 1.0) -> co.Problem:

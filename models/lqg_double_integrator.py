@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -53,6 +54,8 @@ class Sampled:
     state_weight: Array
     control_weight: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Exact:
@@ -75,6 +78,8 @@ class Exact:
     cost: float
     """Expected cost."""
     nominal_cost: float
+
+    __repr__ = short_repr
     """What it would be without noise and with an exact initial estimate."""
 
 

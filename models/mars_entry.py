@@ -49,6 +49,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -135,6 +136,8 @@ class Atmosphere:
     density: Array
     """[slug/ft^3]"""
     scale_height: Array
+
+    __repr__ = short_repr
     """H [ft]: d ln(rho)/dh = -1/H."""
 
     def density_at(self, altitude: npt.ArrayLike) -> Array:

@@ -24,6 +24,7 @@ from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -49,6 +50,8 @@ class Exact:
     energy: float
     """Integral of u^2/2."""
     arc: float
+
+    __repr__ = short_repr
     """The time t1 at which x leaves zero."""
 
 

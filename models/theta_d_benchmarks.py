@@ -33,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 from covocp.blocks import riccati
 
 Array = npt.NDArray[np.float64]
@@ -51,6 +52,8 @@ class System:
     Q: Array
     R: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Exact:
@@ -59,6 +62,8 @@ class Exact:
     cost: Array
     """V, (samples,)."""
     control: Array
+
+    __repr__ = short_repr
     """(samples, m)"""
 
 

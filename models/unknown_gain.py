@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -43,6 +44,8 @@ class Exact:
     ell: float
     """Multiplier of x(T), equal to p(T)."""
     cost: float
+
+    __repr__ = short_repr
 
 
 def problem(

@@ -50,6 +50,7 @@ import numpy.typing as npt
 from numpy.polynomial import legendre
 
 import covocp as co
+from covocp.base.short_repr import short_repr
 
 Array = npt.NDArray[np.float64]
 
@@ -82,6 +83,8 @@ class Exact:
     hamiltonian: float
     cost: float
     energy: float
+
+    __repr__ = short_repr
     """Integral of u^2/2."""
 
 

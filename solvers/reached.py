@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
+from covocp.base.short_repr import short_repr
 from covocp.transcription.first_guess import choose_scales, magnitudes
 from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.trajectory import Trajectory
@@ -38,6 +39,8 @@ class Point:
     status: str
     iterations: int
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
@@ -46,6 +49,8 @@ class Start:
     w: Array
     lam_x: Array | None = None
     lam_g: Array | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +62,8 @@ class Round:
     where: Evaluated
     residuals: Residuals | None
     converged: bool
+
+    __repr__ = short_repr
 
     @property
     def worst(self) -> float:

@@ -23,6 +23,7 @@ from scipy import sparse
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.memory import Metric
 from covocp.transcription.mesh import Mesh
 
@@ -40,6 +41,8 @@ class Step:
     ell: Array
     active: Array
     gram: Array
+
+    __repr__ = short_repr
 
 
 def control_metric(mesh: Mesh, duration: float, weights: Array) -> Any:

@@ -36,6 +36,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import simpson_weight
+from covocp.base.short_repr import short_repr
 from covocp.extremal.hamiltonian import backward_interval, forward_costates, hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import Interval
@@ -67,6 +68,8 @@ class Terminal:
     matrices: bool
     function: ca.Function
 
+    __repr__ = short_repr
+
     def targets(self, statement: Statement, parameters: Array) -> Array:
         """What the conditions must be."""
         _, final, _, matrices = statement.boundary_values(parameters)
@@ -95,6 +98,8 @@ class Sweeps:
     curvature: ca.Function
     terms: ca.Function
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -106,6 +111,8 @@ class Run:
     running: float
     terminal: float
     miss: Array
+
+    __repr__ = short_repr
 
     @property
     def cost(self) -> float:
@@ -134,6 +141,8 @@ class Slopes:
     start: Array
     columns: Array
     middles: tuple[Array, ...]
+
+    __repr__ = short_repr
 
 
 def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:

@@ -14,6 +14,7 @@ from scipy import sparse
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.residuals import VANISHING, Residuals
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
 from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
 from covocp.solvers.gradient.influence import (
@@ -54,6 +55,8 @@ class Iterate:
     run: Run
     penalty: Penalty
 
+    __repr__ = short_repr
+
     @property
     def cost(self) -> float:
         """J with the penalties."""
@@ -71,6 +74,8 @@ class Linear:
     rows: Array
     sizes: Array
     slopes: Slopes
+
+    __repr__ = short_repr
 
     @property
     def finite(self) -> bool:
@@ -96,6 +101,8 @@ class Measures:
     slope: float
     miss: float
     transversality: float
+
+    __repr__ = short_repr
 
     @staticmethod
     def unknown(linear: Linear) -> Measures:
@@ -143,6 +150,8 @@ class Space:
     fixed_metric: Array
     miss_scale: Array
     extra: Array
+
+    __repr__ = short_repr
 
     @property
     def conditions(self) -> int:

@@ -37,6 +37,7 @@ from covocp.base.errors import OutsideDomainError, ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal, Guess, Outcome
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
@@ -266,6 +267,8 @@ class Iteration:
     actual_cost: float
     predicted_miss: Array
     actual_miss: Array
+
+    __repr__ = short_repr
 
 
 def one_iteration(

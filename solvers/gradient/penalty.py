@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.influence import Run, controls_at_nodes
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -50,6 +51,8 @@ class Group:
     shares: Array
     function: ca.Function
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Penalty:
@@ -64,6 +67,8 @@ class Penalty:
     room: tuple[Array, ...]
     curvature: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
@@ -72,6 +77,8 @@ class Weights:
     weights: tuple[Array, ...]
     shifts: tuple[Array, ...]
     scales: tuple[Array, ...]
+
+    __repr__ = short_repr
 
 
 def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:

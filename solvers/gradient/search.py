@@ -16,6 +16,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
+from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.descent import Step, solve_gram, solve_step, solve_tangent, unreachable
 from covocp.solvers.gradient.iterate import Iterate, Linear, Measures, Space
 from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
@@ -64,6 +65,8 @@ class Settings:
     violation_tolerance: float
     max_iterations: int
 
+    __repr__ = short_repr
+
     @property
     def adaptive(self) -> bool:
         """Whether w follows predicted and actual changes."""
@@ -83,6 +86,8 @@ class _Control:
     iterations: int = 0
     nearest: tuple[float, int] = (np.inf, 0)
     history: list[dict[str, float]] = field(default_factory=list)
+
+    __repr__ = short_repr
 
 
 class Search:

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, STRICT, open_lag, package
+from notebooks import Page
 
 import covocp as co
 from covocp.export import export_c
@@ -34,6 +35,14 @@ def test_the_files_of_a_package(tmp_path, monkeypatch):
         assert "1970-01-02" in text
         assert f"covocp {mark['covocp']}" in text
     assert mark["covocp"] in (metadata.version("covocp") if _installed() else "(not installed)")
+
+
+def test_a_notebook_shows_the_lines_of_print(tmp_path):
+    made = export_c(LAW, tmp_path / "a & b", name="thing")
+    page = Page(made._repr_html_())
+    assert " ".join(page.words) == " ".join(str(made).split())
+    assert str(made.directory) in " ".join(page.words)
+    assert page.tags == ["div", *["p"] * len(str(made).splitlines())]
 
 
 def _installed():

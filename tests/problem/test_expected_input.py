@@ -255,7 +255,7 @@ def test_deterministic_nominal_needs_an_expected_cost():
 def test_deterministic_nominal_needs_the_best_gain(constant):
     d = Declared()
     d.expect(gain=co.Gain(constant=constant, structure=[[1, 0]]))
-    refused(lambda: co.solve(d.ocp, nominal="deterministic"), "best gain", "constant", "combined")
+    refused(lambda: co.solve(d.ocp, nominal="deterministic"), "best gain", "structure=[[1, 0]]", "combined")
 
 
 def test_deterministic_nominal_needs_a_deterministic_cost():

@@ -7,9 +7,10 @@ import pytest
 from problems import constrained_gain, solve
 
 import covocp as co
+from covocp.base.pages import Table
 from covocp.extremal.optimality import Optimality
 from covocp.models import free_time_integrator, mars_entry, mass_chain, unknown_lag
-from covocp.solution.report import RESIDUALS, render_table, summary
+from covocp.solution.report import RESIDUALS, summary
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,8 @@ def test_mesh_and_effort(lag):
 
 
 def test_tables_keep_words_that_look_like_markup():
-    assert render_table(["[bold]a", "b"], [["x[0]", "1"], ["[red]", "2"]]).splitlines() == [
+    table = Table(columns=["[bold]a", "b"], rows=[["x[0]", "1"], ["[red]", "2"]])
+    assert table.text().splitlines() == [
         "[bold]a  b",
         "x[0]     1",
         "[red]    2",

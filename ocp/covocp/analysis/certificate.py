@@ -29,7 +29,9 @@ from covocp.analysis.reduction import Reduction, resolved
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import check_kind
 from covocp.base.matrices import unpack
+from covocp.base.pages import lines_as_html
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -79,6 +81,8 @@ class Certificate:
     gap: float | None = None
     mesh_gap: float | None = None
 
+    __repr__ = short_repr
+
     @property
     def certified(self) -> bool:
         """Whether the solution is a global minimum up to the gap."""
@@ -94,6 +98,10 @@ class Certificate:
             f"Lambda^-1 against E_bb(T) {self.consistency:.2g}"
         )
         return f"{self.verdict}: {self.reason}; {numbers}"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same sentence."""
+        return lines_as_html(str(self))
 
 
 @one_at_a_time

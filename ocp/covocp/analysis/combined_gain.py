@@ -22,6 +22,7 @@ from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.pages import Section, Sentence, Table, as_html, as_text
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.curvature import held_jacobian, mass_matrix
 from covocp.extremal.extremal import Extremal
@@ -71,15 +72,22 @@ class Worth:
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return "\n".join(
-            (
-                f"{self.classical.name or 'problem without a name'}: {self.verdict}",
-                f"expected cost of the classical design   {self.classical.cost:.8g}",
-                f"first-order change along the gradient   {100 * self.first_order:.3g} % of it",
-                f"decrease found along the gradient       {100 * self.gain:.3g} % of it"
-                + (f", at {self.step:g} of the full step" if self.gain > 0 else ""),
-            )
-        )
+        return as_text(self._sections())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same summary."""
+        return as_html(self._sections())
+
+    def _sections(self) -> list[Section]:
+        """The verdict, and the numbers behind it."""
+        found = f", at {self.step:g} of the full step" if self.gain > 0 else ""
+        rows = [
+            ["expected cost of the classical design", f"{self.classical.cost:.8g}"],
+            ["first-order change along the gradient", f"{100 * self.first_order:.3g} % of it"],
+            ["decrease found along the gradient", f"{100 * self.gain:.3g} % of it{found}"],
+        ]
+        verdict = Sentence(f"{self.classical.name or 'problem without a name'}: {self.verdict}")
+        return [[verdict, Table(columns=["", ""], rows=rows, words=(0, 1))]]
 
 
 @one_at_a_time

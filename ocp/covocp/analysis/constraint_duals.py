@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from covocp.analysis.conditions import condition
 from covocp.analysis.stages import Stages
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Conditions
 
@@ -36,6 +37,8 @@ class Duals:
     by_w: Array
     slack: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Points:
@@ -44,6 +47,8 @@ class _Points:
     z: Array
     times: Array
     lengths: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal, stages: Stages, zeta: Array) -> _Points:

@@ -20,6 +20,7 @@ from covocp.analysis.reduction import Reduction
 from covocp.analysis.stages import Stages
 from covocp.base.krylov import Krylov, krylov
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.mesh import Mesh
 
@@ -61,6 +62,8 @@ class Bound:
     own_slope: Array
     slack: float
     held: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def at(extremal: Extremal, mesh: Mesh, w: Array) -> Bound:

@@ -26,6 +26,7 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.base.quadrature import GAUSS_NODES, hermite
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 
@@ -54,6 +55,8 @@ class Parts:
     measured: Any
     density: Any
     running: Any
+
+    __repr__ = short_repr
 
 
 def parts(statement: Statement, parameters: Array) -> Parts:
@@ -99,6 +102,8 @@ class Samples:
     state: Array
     density: Array
     running: tuple[Array, Array, Array]
+
+    __repr__ = short_repr
 
 
 def sample(given: Parts, times: Array) -> Samples:
@@ -155,6 +160,8 @@ class Step:
     x: Array
     S: Array
     filtered: Array
+
+    __repr__ = short_repr
 
 
 class Reduction:

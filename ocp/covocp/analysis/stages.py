@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.analysis.reduction import Reduction
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,8 @@ class Stages:
     running: Array
     energy: Array
     roots: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(reduction: Reduction) -> Stages:

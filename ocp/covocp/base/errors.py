@@ -162,7 +162,8 @@ def shown(value: object, length: int = 100, form: Callable[[object], str] = repr
 def kind_and_name(value: object) -> str:
     """Type and name of something, or its beginning where it has no name: one line."""
     name = getattr(value, "name", None)
-    text = f"'{name}'" if isinstance(name, str) and name else shown(value, 60, str)
+    # What could have a name and has none may print as a page: its representation is a line.
+    text = f"'{name}'" if isinstance(name, str) and name else shown(value, 60, repr if isinstance(name, str) else str)
     return f"{type(value).__name__}: {text}"
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 LEAST_STEPS = 8
 # A step whose remainder is below this share of the largest Ritz value has found an invariant subspace.
@@ -31,6 +32,8 @@ class Krylov:
     asymmetry: float
     diagonal: Array
     beside: Array
+
+    __repr__ = short_repr
 
     def inverse_form(self, shift: float, length: float, smallest: float) -> float:
         """Upper bound of r' (operator + shift)^-1 r for the start r of this length; `smallest`: below all eigenvalues.

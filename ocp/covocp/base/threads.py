@@ -60,6 +60,9 @@ class _Turn:
             self.__enter__()
 
 
+# Special methods that may call CasADi: making, indexing and showing.
+SHOWN = ("__init__", "__getitem__", "__str__", "__repr__", "_repr_html_")
+
 TURN = _Turn()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=TURN.after_fork)
@@ -79,7 +82,7 @@ def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
 def methods_one_at_a_time(cls: C) -> C:
     """The class with methods and properties that wait for their turn (printing included, other special ones not)."""
     for name, value in list(vars(cls).items()):
-        if name.startswith("_") and name not in ("__init__", "__getitem__", "__str__", "__repr__"):
+        if name.startswith("_") and name not in SHOWN:
             continue
         if isinstance(value, FunctionType):
             setattr(cls, name, one_at_a_time(value))

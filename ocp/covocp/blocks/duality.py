@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, overload
 
 from covocp.base.arguments import a, check_argument
+from covocp.base.short_repr import short_repr
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import matrix, square
 
@@ -35,6 +36,8 @@ class Control:
     control_weight: Any
     cross: Any = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimation:
@@ -53,6 +56,8 @@ class Estimation:
     noise: Any
     measurement_noise: Any
     cross: Any = None
+
+    __repr__ = short_repr
 
 
 # Name in a control problem, name in an estimation problem, whether the matrix is transposed.

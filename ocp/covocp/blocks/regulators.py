@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.short_repr import short_repr
 from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
@@ -38,6 +39,8 @@ class Regulator:
     cost: Array
     eigenvalues: Modes
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GaussianRegulator:
@@ -55,6 +58,8 @@ class GaussianRegulator:
     average_cost: float
     eigenvalues: Modes
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceInput:
@@ -67,6 +72,8 @@ class ReferenceInput:
 
     state: Array
     control: Array
+
+    __repr__ = short_repr
 
     def law(self, gain: Expr) -> Array:
         """Feedforward N of u = -gain x + N r, which is u = control r - gain (x - state r), shape (m, p)."""
@@ -86,6 +93,8 @@ class Augmented:
     A: Any
     B: Any
     reference: Any
+
+    __repr__ = short_repr
 
 
 @checked(discrete=truth)

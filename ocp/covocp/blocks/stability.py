@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.short_repr import short_repr
 from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
 from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 
@@ -34,6 +35,8 @@ class LyapunovCertificate:
     decrease: Array
     proves: bool
     reason: str
+
+    __repr__ = short_repr
 
 
 @checked(discrete=truth)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.expressions import Expr
+from covocp.base.short_repr import short_repr
 from covocp.blocks.algebraic import Words, frozen, sorted_modes, stabilising, weights
 from covocp.blocks.duality import Estimation, dual
 from covocp.blocks.updates import joseph_form
@@ -47,6 +48,8 @@ class Filter:
     posterior: Array
     gain: Array
     eigenvalues: NDArray[np.complex128]
+
+    __repr__ = short_repr
 
 
 @checked(discrete=truth)

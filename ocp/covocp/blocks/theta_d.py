@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
 from covocp.base.expressions import Expr
+from covocp.base.short_repr import short_repr
 from covocp.blocks import theta_d_series as series
 from covocp.blocks import values
 from covocp.blocks.factorisation import as_rows, dependence, integral_states
@@ -64,6 +65,8 @@ class Expansion:
     gain: ca.Function
     perturbations: ca.Function
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Options:
@@ -71,6 +74,8 @@ class _Options:
     k: Any
     l: Any
     form: Any
+
+    __repr__ = short_repr
 
 
 def regulator(

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, half_length, pack, pack_symbolic, unpack, unpack_symbolic
+from covocp.base.short_repr import short_repr
 from covocp.blocks import values
 from covocp.blocks.algebraic import Words, lyapunov, stabilising, weights
 from covocp.blocks.factorisation import random_states
@@ -64,6 +65,8 @@ class Start:
     feedback: Array
     root: Array
     inverse: Array
+
+    __repr__ = short_repr
 
     def corrected(self, right: Array) -> Array:
         """The symmetric T with T A_c + A_c' T = right, (n, n)."""

@@ -17,6 +17,7 @@ from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
 from covocp.base.errors import warn_user
 from covocp.base.expressions import Expr
+from covocp.base.short_repr import short_repr
 from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
@@ -58,6 +59,8 @@ class Convergence:
     largest: float
     largest_transformed: float
 
+    __repr__ = short_repr
+
     @property
     def converges(self) -> bool:
         """Whether it converges at all the states."""
@@ -77,6 +80,8 @@ class Choice:
     k: Array
     l: Array
     misfit: float
+
+    __repr__ = short_repr
 
 
 def radius(A0: Expr, direction: Expr, B: Expr, Q: Expr, R: Expr) -> float:

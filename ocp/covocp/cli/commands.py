@@ -17,9 +17,10 @@ import covocp as co
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, spelling
 from covocp.base.expressions import Given
 from covocp.base.files import check_target
+from covocp.base.later import later
+from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
-from covocp.solution.report import WIDTH
 from covocp.solution.storage import SUFFIXES as FILES
 from covocp.solving.solver import STARTS, method_options
 from covocp.transcription.mesh import Options
@@ -243,8 +244,6 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.Namespace, known: Known) -> int:
     """Solve the problems of one figure, those that no other figure has solved, and draw it."""
-    from covocp.plot.figure import plot_solutions
-
     worst, labels, solutions = 0, [], []
     for label, problem, *nominal in figure.pop("designs"):
         key = (id(problem), repr(nominal))
@@ -256,19 +255,19 @@ def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.
             labels.append(label)
             solutions.append(solution)
     if solutions:
-        plot_solutions(solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure)
+        later("plot.figure").plot_solutions(
+            solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure
+        )
         _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
     return worst
 
 
 def _export(arguments: argparse.Namespace) -> int:
     """covocp export MODEL DIR."""
-    from covocp.export import export_c
-    from covocp.export.exporting import check_settings
-
+    exporting = later("export.exporting")
     settings: dict[str, Any] = {"name": arguments.name, "precision": arguments.precision}
     settings |= {"overwrite": arguments.overwrite, "period": arguments.period}
-    check_settings(arguments.directory, **settings)
+    exporting.check_settings(arguments.directory, **settings)
     what = find_model(arguments.model).build(arguments.set)
     code = 0
     if arguments.solver:
@@ -281,7 +280,7 @@ def _export(arguments: argparse.Namespace) -> int:
     for name in ("limits", "largest_spread"):  # to a solver too, which says that it has no such option
         if getattr(arguments, name) is not None:
             settings[name] = getattr(arguments, name)
-    package = export_c(what, arguments.directory, **settings)
+    package = exporting.export_c(what, arguments.directory, **settings)
     check = package.check(samples=arguments.samples)
     if not arguments.quiet:
         print(package)

@@ -15,6 +15,7 @@ import casadi as ca
 from covocp.base.arguments import checked, mapping, optional, positive, truth
 from covocp.base.errors import ExportError, spelling, warn_user
 from covocp.base.expressions import Given
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.export.compiled.building import Sources
 from covocp.export.compiled.folder import check_folder, check_names, package_files, write_folder
@@ -55,6 +56,8 @@ class Content:
     laws: tuple[Law, ...]
     title: str
     linking: Linking | None = None
+
+    __repr__ = short_repr
 
 
 @one_at_a_time

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 
 # A bound holds a value where the multiplier, as a share of the largest of its kind, is above the distance from the
@@ -40,6 +41,8 @@ class Held:
     strict: NDArray[np.bool_]
     controls: Array
     touching: Array
+
+    __repr__ = short_repr
 
     def bare(self, extremal: Extremal) -> Extremal:
         """The extremal with the multipliers of what holds it alone: those of other bounds are what a barrier leaves."""

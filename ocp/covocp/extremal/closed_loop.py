@@ -25,6 +25,7 @@ from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite
 from covocp.base.riccati_rates import inverse
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
 from covocp.statement.interval import Interval, one_sided
@@ -49,6 +50,8 @@ class Statistics:
     density: ca.Function
     parameters: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedLoop:
@@ -72,6 +75,8 @@ class ClosedLoop:
     cost: Mapping[str, float]
     other_cost: float | None
     conservation: float | None
+
+    __repr__ = short_repr
 
     @property
     def X(self) -> Array:

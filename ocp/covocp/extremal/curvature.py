@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from covocp.base.krylov import krylov
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.active_constraints import held_by
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -62,6 +63,8 @@ class Curvature:
     error: float
     direction: Array
     start: Array
+
+    __repr__ = short_repr
 
     @property
     def verdict(self) -> Verdict:
@@ -181,6 +184,8 @@ class _Reduced:
     product: Callable[[Array], Array]
     strict: Array
     loose: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal) -> _Reduced | None:

@@ -19,6 +19,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, half_indices, unpack
 from covocp.base.quadrature import hermite
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
 from covocp.statement.interval import one_sided
@@ -61,6 +62,8 @@ class Dense:
     values: Array
     first: Array
     last: Array
+
+    __repr__ = short_repr
 
     def at(self, s: Array) -> Array:
         """x and e stacked at some normalised times, (K, nx + ne)."""
@@ -146,6 +149,8 @@ class _Steps:
     seen: Array
     size: Array
     pairs: Any
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(extremal: Extremal, coarse: Dense, rows: list[int], states: Dense | None) -> _Steps:
@@ -308,6 +313,8 @@ class _Pieces:
     high: Array
     first: Array
     last: Array
+
+    __repr__ = short_repr
 
     def chosen(self, which: Expr) -> _Pieces:
         """Some of them."""

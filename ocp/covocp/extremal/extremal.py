@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -30,6 +31,8 @@ class Extremal:
     trajectory: Trajectory
     parameters: Array
     multipliers: Multipliers
+
+    __repr__ = short_repr
 
     @property
     def time(self) -> Array:
@@ -81,6 +84,8 @@ class Outcome:
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
 
+    __repr__ = short_repr
+
 
 class Prepared(Protocol):
     """What `prepare` of a method's module returns: the problem made ready, solved as often as wanted."""
@@ -110,3 +115,5 @@ class Guess:
     costates: tuple[Array, Array] | None = None
     warm: bool = False
     tentative: bool = False
+
+    __repr__ = short_repr

@@ -21,6 +21,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import classical_step, hermite
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.statement.interval import Interval, model_symbols
@@ -37,6 +38,8 @@ class Costates:
 
     state: Array
     matrices: Array
+
+    __repr__ = short_repr
 
 
 def hamiltonian(

@@ -23,6 +23,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack_symbolic
 from covocp.base.riccati_rates import inverse
+from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Statement
@@ -44,6 +45,8 @@ class MeanEffect:
     mean: Array
     estimate: Array
     cost: float
+
+    __repr__ = short_repr
 
 
 def remembered(stats: Mapping[str, Any]) -> MeanEffect | None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 # Growth of a change over the horizon, in units of the states, from which on the feedback is part of it.
 LARGEST_GROWTH = 1e3
@@ -39,6 +40,8 @@ class Tangents:
     free: NDArray[np.bool_]
     start: tuple[int, ...]
     gain: Array | None
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(
@@ -115,6 +118,8 @@ class Between:
     before: Array
     after: Array
     constant: bool
+
+    __repr__ = short_repr
 
     def forward(self, z: Array, u: Array) -> tuple[Array, Array]:
         """Changes of the points (N p + 1, n, m) and of the controls there from those of nodes and controls."""

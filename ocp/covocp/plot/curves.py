@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
@@ -47,6 +48,8 @@ class Curve:
     steps: bool = False
     target: float | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Ellipse:
@@ -55,6 +58,8 @@ class Ellipse:
     centre: Array
     covariance: Array
     order: int
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +87,8 @@ class Panel:
     path: bool = False
     equal: bool = False
     ellipses: tuple[Ellipse, ...] = ()
+
+    __repr__ = short_repr
 
 
 class Drawn:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,7 @@ from covocp.base.arguments import checked, either, optional, positives, sequence
 from covocp.base.errors import ProblemError, no_option
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
+from covocp.base.pages import WARNING
 from covocp.plot.curves import Panel
 from covocp.plot.legends import fold_title, place_legend
 from covocp.plot.panels import abscissa_label, choose_panels
@@ -30,7 +33,6 @@ SUFFIXES = (".png", ".pdf", ".svg")
 # sky blue, black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1.2)))
-WARNING = "#A8002D"
 BOUND: dict[str, Any] = {"color": "#666666", "linewidth": 0.8, "linestyle": (0, (4, 3))}
 TARGET: dict[str, Any] = {
     "marker": "o",
@@ -54,6 +56,8 @@ HEAD = 0.6  # inches for title and legend
 RESOLUTION = 200  # dots an inch
 # Backends of matplotlib that show nothing by themselves.
 SILENT = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
+# Whether figures may become pyplot's, which then has one more open and another that is current.
+_FOR_PYPLOT = ContextVar("for_pyplot", default=True)
 STYLE: Any = {
     "font.size": 8.5,
     "axes.titlesize": 8.5,
@@ -220,9 +224,9 @@ def _figure(size: tuple[float, float]) -> Figure:
     from matplotlib.figure import Figure
 
     pyplot = sys.modules.get("matplotlib.pyplot")
-    if pyplot is None and hasattr(sys, "ps1"):
+    if pyplot is None and hasattr(sys, "ps1") and _FOR_PYPLOT.get():
         import matplotlib.pyplot as pyplot
-    if pyplot is not None:
+    if pyplot is not None and _FOR_PYPLOT.get():
         backend = pyplot.get_backend().lower()
         if backend not in SILENT and "inline" not in backend:
             shown: Figure = pyplot.figure(figsize=size, layout="constrained")
@@ -230,6 +234,16 @@ def _figure(size: tuple[float, float]) -> Figure:
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+@contextmanager
+def apart_from_pyplot() -> Iterator[None]:
+    """Within this no figure becomes pyplot's, whatever the backend."""
+    token = _FOR_PYPLOT.set(False)
+    try:
+        yield
+    finally:
+        _FOR_PYPLOT.reset(token)
 
 
 def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: str | None) -> None:

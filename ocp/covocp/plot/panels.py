@@ -12,6 +12,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
+from covocp.base.short_repr import short_repr
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
@@ -30,12 +31,16 @@ class Quantity:
     word: str
     of: Any = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Together:
     """Keys that share a panel."""
 
     keys: tuple[Any, ...]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +49,8 @@ class Labelled:
 
     label: str
     key: Any
+
+    __repr__ = short_repr
 
 
 def choose_panels(

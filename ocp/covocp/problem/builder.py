@@ -34,6 +34,7 @@ from covocp.base.checks import (
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
+from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
 from covocp.problem.declarations import (
@@ -51,6 +52,7 @@ from covocp.problem.declarations import (
     Unknown,
     declare_matrix,
 )
+from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
 from covocp.problem.measurement_information import stated_noise
@@ -119,6 +121,14 @@ class Problem:
         groups = ((kind, getattr(self._declarations, kind)) for kind in ("states", "unknowns", "controls", "matrices"))
         listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in groups if group)
         return f"Problem('{self.name}'{listed})"
+
+    def __str__(self) -> str:
+        """What print shows: symbols with their data, and the equations in their names."""
+        return as_text(sections(self))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same tables."""
+        return as_html(sections(self))
 
     @property
     def time(self) -> ca.MX:

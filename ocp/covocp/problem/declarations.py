@@ -13,6 +13,7 @@ from covocp.base.arguments import check_argument, truth
 from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length, unpack_symbolic
+from covocp.base.short_repr import short_repr
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
@@ -65,6 +66,8 @@ class State:
     variance: ca.MX
     estimated: bool = True
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unknown:
@@ -78,6 +81,8 @@ class Unknown:
     mean: Array
     variance: ca.MX
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
@@ -89,6 +94,8 @@ class Parameter:
     where: str
     unit: str
     value: Array
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,6 +111,8 @@ class Control:
     upper: Array
     guess: Guess
     scale: Array | None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,6 +134,8 @@ class Matrix:
     labels: tuple[str, ...]
     backward: Backward | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Backward:
@@ -136,6 +147,8 @@ class Backward:
 
     end: ca.MX
     form: tuple[ca.MX, ca.MX, ca.MX]
+
+    __repr__ = short_repr
 
 
 def declare_matrix(
@@ -193,6 +206,8 @@ class Dynamics:
     where: str
     one_density: bool = False
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
@@ -209,6 +224,8 @@ class Measurement:
     where: str
     information: ca.MX | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
@@ -220,6 +237,8 @@ class Constraint:
     upper: Array
     at: Place
     where: str
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,6 +259,8 @@ class Gain:
     upper: Any = np.inf
     guess: Any = None
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Refuse what is no truth value; the arrays are checked with the problem that they belong to."""
         check_argument("Gain()", "constant", truth, self.constant)
@@ -259,6 +280,8 @@ class Expected:
     control_weight: Any
     gain: Gain | None
     where: str
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -281,6 +304,8 @@ class Expansion:
     gain: ca.MX
     alternative: ca.MX | None = None
     product: ca.MX | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -306,6 +331,8 @@ class Declarations:
     cost: tuple[ca.MX, ca.MX] | None = None
     expected: Expected | None = None
     expansion: Expansion | None = None
+
+    __repr__ = short_repr
 
     @property
     def named(self) -> tuple[Any, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import casadi as ca
 import numpy as np
@@ -13,10 +13,8 @@ from covocp.base.matrices import Array, unpack
 from covocp.blocks.bucy import time_step
 from covocp.blocks.extended import bucy_slopes, corrected_by, propagated
 from covocp.blocks.updates import Form, Missing
-
-if TYPE_CHECKING:
-    from covocp.problem.builder import Problem
-    from covocp.statement.statement import Statement
+from covocp.problem.builder import Problem
+from covocp.statement.statement import Statement
 
 
 @overload
@@ -140,8 +138,6 @@ class _System:
 
 
 def _statement(problem: Problem) -> Statement:
-    from covocp.problem.builder import Problem
-
     check_kind(problem, Problem, "give the problem itself, not its solution")
     return problem.statement()
 

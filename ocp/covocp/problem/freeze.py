@@ -16,6 +16,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
+from covocp.base.short_repr import short_repr
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.estimation_covariance import augmented_names
 from covocp.problem.measurement_information import check_readings, inverse_density
@@ -31,6 +32,8 @@ class Stacked:
     unknowns: int
     substitute: Callable[..., list[Any]]
     symbolic: type
+
+    __repr__ = short_repr
 
     def function(self, name: str, expressions: list[Any], *, without: tuple[str, ...] = ()) -> ca.Function:
         """A function of the stacked vectors, with named inputs."""

@@ -17,6 +17,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
+from covocp.base.short_repr import short_repr
 from covocp.problem.builder import Problem
 from covocp.problem.declarations import Declarations
 from covocp.problem.estimation_covariance import with_estimation
@@ -43,6 +44,8 @@ class System:
     states: int
     fed_back: int
     linear: ca.Function
+
+    __repr__ = short_repr
 
     @property
     def size(self) -> int:

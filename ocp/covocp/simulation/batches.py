@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.flown import own_copy, stepped
 from covocp.simulation.plan import Plan
 from covocp.simulation.vectorised import LANES, padded, vectorise
@@ -61,6 +62,8 @@ class Batch:
     cube: Array
     fourth: Array
     paths: Array
+
+    __repr__ = short_repr
 
     @property
     def runs(self) -> int:

@@ -14,6 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
+from covocp.base.pages import WARNING
 from covocp.plot.figure import (
     BAND,
     BOUND,
@@ -23,7 +24,6 @@ from covocp.plot.figure import (
     RESOLUTION,
     STYLE,
     SUFFIXES,
-    WARNING,
     _figure,
     _folded,
     _grid,

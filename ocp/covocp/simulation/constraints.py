@@ -18,6 +18,7 @@ from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.prediction import Prediction
 from covocp.simulation.run_parts import Run, part
@@ -55,6 +56,8 @@ class Rows:
     rows: tuple[Row, ...]
     function: ca.Function
     left_out: Mapping[str, str]
+
+    __repr__ = short_repr
 
     def at(self, *places: Place) -> list[int]:
         """Positions of the rows of some places."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.request import wrong_argument
 from covocp.simulation.schedule import WHOLE, Grid
@@ -37,6 +38,8 @@ class Flown:
     period: float
     times: Array
     estimates: bool
+
+    __repr__ = short_repr
 
 
 def flown_law(law: Given, period: Given, design: System, duration: float) -> Flown | None:

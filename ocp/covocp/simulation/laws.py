@@ -18,6 +18,7 @@ from covocp.base.arguments import a, a_function, checked, optional, positive, wh
 from covocp.base.errors import CovocpError, ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
@@ -49,6 +50,8 @@ class Filter:
     size: int
     H: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class LawSimulation:
@@ -69,6 +72,8 @@ class LawSimulation:
     filter_state: Array
     cost: Array
     diverged: NDArray[np.bool_]
+
+    __repr__ = short_repr
 
 
 def _of_state_and_control(value: Given) -> str:
@@ -239,6 +244,8 @@ class _Loop:
     observer: Filter | None
     running: ca.Function | None
     size: int
+
+    __repr__ = short_repr
 
     @property
     def measured(self) -> int:

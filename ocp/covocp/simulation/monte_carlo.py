@@ -15,6 +15,8 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
+from covocp.base.pages import as_html
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
 from covocp.simulation.counts import Count, count
@@ -127,6 +129,8 @@ class MonteCarlo:
     blocks: tuple[Block, ...]
     augmented: tuple[str, ...]
     symbols: Mapping[str, Any] = field(repr=False)
+
+    __repr__ = short_repr
 
     @property
     def runs(self) -> int:
@@ -306,6 +310,11 @@ class MonteCarlo:
     def __str__(self) -> str:
         """The summary that print shows."""
         return str(later("simulation.report").summary(self))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same summary, and the figure."""
+        figure = later("plot.embedding").embedded(self.plot)
+        return as_html(later("simulation.report").sections(self), figure)
 
     @checked(controls=a_truth)
     def rows(self, key: Given, *, controls: bool = True) -> tuple[slice, Block]:

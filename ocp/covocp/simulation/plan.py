@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.constraints import Place, counted_rows
 from covocp.simulation.flown import Flown, sample_indices
 from covocp.simulation.run_parts import Setting, factor, run_symbols
@@ -60,6 +61,8 @@ class Plan:
     flown: Flown | None
     samples: Any
     watched: tuple[Place, ...]
+
+    __repr__ = short_repr
 
     @property
     def estimates(self) -> bool:

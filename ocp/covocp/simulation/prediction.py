@@ -24,6 +24,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
 from covocp.solution.solution import Solution
@@ -47,6 +48,8 @@ class Prediction:
     covariance: Array
     rates: Array
     step_rates: Array
+
+    __repr__ = short_repr
 
     @property
     def size(self) -> int:

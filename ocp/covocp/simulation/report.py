@@ -1,4 +1,4 @@
-"""What print shows of a simulation: a table at the end and sentences."""
+"""What print and a notebook show of a simulation: a table at the end and sentences."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.simulation.verdict import Entry
-from covocp.solution.report import number, render_table, wrapped
 
 if TYPE_CHECKING:
     from covocp.simulation.monte_carlo import MonteCarlo
@@ -18,46 +18,50 @@ LISTED = 5
 
 
 def summary(sample: MonteCarlo) -> str:
-    """A simulation in words and tables of plain text, at most 100 columns wide."""
-    parts = [
+    """A simulation in words and tables of plain text, at most 100 columns wide: its `sections`."""
+    return as_text(sections(sample))
+
+
+def sections(sample: MonteCarlo) -> list[Section]:
+    """A simulation in sentences and tables: what was simulated, and sample against prediction with its verdict."""
+    return [
         _head(sample),
         _entries(sample, "deviation at T", sample.verdict.deviations, sample.design),
         _entries(sample, "error of the filter at T", sample.verdict.errors, sample.design_error),
         _cost(sample),
         _violations(sample),
         _shares(sample),
-        wrapped(f"{sample.verdict}{_expectations(sample)}", ""),
+        [Sentence(f"{sample.verdict}{_expectations(sample)}", "", warning=not sample.verdict.holds)],
     ]
-    return "\n\n".join(part for part in parts if part)
 
 
-def _head(sample: MonteCarlo) -> str:
+def _head(sample: MonteCarlo) -> Section:
     name = sample.name or "problem without a name"
     what = f"{sample.filter} filter" + (" and feedback" if sample.fed_back else ", no feedback (open-loop control)")
     if sample.filter == "law":
         what = f"a law stepped every {sample.period:.6g} s"
-    lines = [f"{name}: {sample.runs} runs of the actual system, seed {sample.seed}, {what}"]
+    lines: list[Part] = [Sentence(f"{name}: {sample.runs} runs of the actual system, seed {sample.seed}, {what}")]
     if sample.truth:
-        lines.append(f"truth: {sample.truth}")
+        lines.append(Sentence(f"truth: {sample.truth}"))
     step = sample.step
     length = (
         f"{step.longest:.6g} s"
         if np.isclose(step.shortest, step.longest)
         else (f"{step.shortest:.3g} to {step.longest:.3g} s")
     )
-    lines.append(f"step: {length}, {step.reason}")
+    lines.append(Sentence(f"step: {length}, {step.reason}"))
+    wrong = [f"FAILED: {failure}" for failure in sample.failed[:LISTED]]
     if sample.interrupted:
-        lines.append(f"INTERRUPTED: {sample.runs} of {sample.requested} runs were simulated")
-    lines += [f"FAILED: {failure}" for failure in sample.failed[:LISTED]]
+        wrong.insert(0, f"INTERRUPTED: {sample.runs} of {sample.requested} runs were simulated")
     if len(sample.failed) > LISTED:
-        lines.append(f"FAILED: {len(sample.failed) - LISTED} other tasks")
-    return "\n".join(wrapped(line) for line in lines)
+        wrong.append(f"FAILED: {len(sample.failed) - LISTED} other tasks")
+    return [*lines, *(Sentence(line, warning=True) for line in wrong)]
 
 
-def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design: Array) -> str:
+def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design: Array) -> Section:
     """One row for each component; the design's own expectation where the truth is another system."""
     if not entries:
-        return ""
+        return []
     columns = [title, "predicted", "sample", "band", "ratio", "mean", "robust", ""]
     rows = []
     for i, entry in enumerate(entries):
@@ -77,7 +81,7 @@ def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design:
             rows[-1].insert(1, number(expected, 4))
     if sample.truth:
         columns.insert(1, "design")
-    return render_table(columns, rows, words=(0, len(columns) - 1))
+    return [Table(columns=columns, rows=rows, words=(0, len(columns) - 1))]
 
 
 def _expectations(sample: MonteCarlo) -> str:
@@ -93,25 +97,25 @@ def _expectations(sample: MonteCarlo) -> str:
     return f" The design expects another spread: {'; '.join(missed)}." if missed else ""
 
 
-def _cost(sample: MonteCarlo) -> str:
+def _cost(sample: MonteCarlo) -> Section:
     if not np.isfinite(sample.cost):
-        return ""
+        return []
     text = f"mean cost {number(sample.cost, 6)} (standard error {number(sample.cost_error, 2)})"
     if np.isfinite(sample.predicted_cost):
         text += f", predicted {number(sample.predicted_cost, 6)}"
     if sample.truth and np.isfinite(sample.design_cost):
         text += f", by the design {number(sample.design_cost, 6)}"
     gone = int(np.count_nonzero(~sample.stayed))
-    return wrapped(text + (f"; without the {gone} runs that left the domain" if gone else ""))
+    return [Sentence(text + (f"; without the {gone} runs that left the domain" if gone else ""))]
 
 
-def _violations(sample: MonteCarlo) -> str:
+def _violations(sample: MonteCarlo) -> Section:
     """Who violates the constraints of the problem; bounds that no run leaves are left out."""
     shown = [entry for entry in sample.violations.values() if entry.runs or not entry.bound]
     left_out = sample.inequalities.left_out.items()
-    text = [wrapped(f"Not counted: {', '.join(f'{name} ({why})' for name, why in left_out)}.", "")] if left_out else []
+    text = [Sentence(f"Not counted: {', '.join(f'{name} ({why})' for name, why in left_out)}.", "")] if left_out else []
     if not shown:
-        return "\n".join(text)
+        return text
     columns = ["runs that violate", "at", "at any time", "at T", "promised", "most at once", "at t [s]", "promised", ""]
     rows = []
     for entry in shown:
@@ -119,12 +123,12 @@ def _violations(sample: MonteCarlo) -> str:
         end = ["-", "-"] if entry.place == "initial" else [_share(entry.end_share), _share(entry.promised_end)]
         rows.append([entry.name, kind, _share(entry.share), *end, _share(entry.most), number(entry.most_time, 4)])
         rows[-1] += [_share(entry.promised_most), "" if entry.as_promised else "OUTSIDE"]
-    table = render_table(columns, rows, words=(0, 1, len(columns) - 1))
+    table = Table(columns=columns, rows=rows, words=(0, 1, len(columns) - 1))
     note = (
         "Promised: by the predicted covariances, for normal deviations and to first order; OUTSIDE: beyond the band of "
         f"{100 * sample.level:.4g} % about the share of the runs at the end (at the start)."
     )
-    return "\n".join([table, wrapped(note, ""), *text])
+    return [table, Sentence(note, ""), *text]
 
 
 def _share(value: float) -> str:
@@ -132,7 +136,7 @@ def _share(value: float) -> str:
     return "-" if np.isnan(value) else f"{100 * value:.3g} %"
 
 
-def _shares(sample: MonteCarlo) -> str:
+def _shares(sample: MonteCarlo) -> Section:
     """Who left what, and what the columns mean."""
     factor = "inside the domain" if sample.left_share == 0 else "that stayed inside the domain"
     lines = [
@@ -152,4 +156,4 @@ def _shares(sample: MonteCarlo) -> str:
             f"{100 * sample.asked_share:.3g} % of the runs asked for more control than there is ({most:.3g} % at one "
             f"instant); {kept}."
         )
-    return "\n".join(wrapped(line, "") for line in lines)
+    return [Sentence(line, "") for line in lines]

@@ -8,6 +8,7 @@ from typing import Any
 from covocp.base.arguments import MOST, is_whole, positive
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.base.short_repr import short_repr
 from covocp.simulation.schedule import Filter
 from covocp.simulation.vectorised import padded
 
@@ -26,6 +27,8 @@ class Request:
     level: float
     filter: Filter
     step: float | None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Refuse what means nothing."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
+from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.flown import Flown
 from covocp.simulation.schedule import Coefficients, Estimator
@@ -33,6 +34,8 @@ class Limits:
     least: Array
     most: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setting:
@@ -49,6 +52,8 @@ class Setting:
     limits: Limits
     domain: Array
     flown: Flown | None = None
+
+    __repr__ = short_repr
 
     @property
     def costs(self) -> bool:
@@ -73,6 +78,8 @@ class Run:
     spans: Mapping[str, slice]
     noisy: list[int]
     watched: int
+
+    __repr__ = short_repr
 
     @property
     def parts_of_noise(self) -> list[int]:

@@ -16,6 +16,7 @@ from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch
 
 # Probability within 3 standard deviations of a normal law.
@@ -35,6 +36,8 @@ class Moments:
     product: Array
     cube: Array
     fourth: Array
+
+    __repr__ = short_repr
 
 
 def moments_of(batches: Sequence[Batch]) -> Moments:

@@ -16,6 +16,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.base.riccati_rates import inverse
+from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
@@ -37,6 +38,8 @@ class Grid:
 
     t: Array
     interval: Any
+
+    __repr__ = short_repr
 
     @property
     def steps(self) -> int:
@@ -106,6 +109,8 @@ class Nominal:
     e: Array
     t: Array
 
+    __repr__ = short_repr
+
     def columns(self, duration: float, parameters: Array) -> tuple[Any, ...]:
         """Arguments (state, control, matrices, time, duration, parameters), a column for each time."""
         count = self.t.size
@@ -149,6 +154,8 @@ class Coefficients:
 
     function: ca.Function
     shapes: dict[str, tuple[int, int]]
+
+    __repr__ = short_repr
 
     @property
     def rows(self) -> int:

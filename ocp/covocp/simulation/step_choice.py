@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, run_batch
 from covocp.simulation.plan import make_plan
 from covocp.simulation.run_parts import Setting
@@ -46,6 +47,8 @@ class StepChoice:
     settled: bool
     given: bool = False
     shortened: bool = False
+
+    __repr__ = short_repr
 
     @property
     def longest(self) -> float:

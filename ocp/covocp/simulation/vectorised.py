@@ -19,6 +19,7 @@ from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 # Widths are multiples of this, so that no column falls into the remainder of a vector loop.
 LANES = 64
@@ -102,6 +103,8 @@ class Columns:
     inputs: tuple[Array, ...]
     outputs: tuple[Array, ...]
     evaluate: Callable[[], None]
+
+    __repr__ = short_repr
 
 
 def padded(count: int) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation
 
 if TYPE_CHECKING:
@@ -76,6 +77,8 @@ class Verdict:
     too_long: str = ""
     unpredicted: tuple[str, ...] = ()
     broken: tuple[tuple[str, float, float], ...] = ()
+
+    __repr__ = short_repr
 
     @property
     def decisive(self) -> tuple[Entry, ...]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from covocp.base.errors import ProblemError
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import TURN
 from covocp.simulation.batches import Batch, StoppedError, run_batch
 from covocp.simulation.flown import LawFailedError
@@ -37,6 +38,8 @@ class Harvest:
     batches: tuple[Batch, ...]
     failures: tuple[Failure, ...]
     interrupted: bool
+
+    __repr__ = short_repr
 
 
 def simulate_batches(

@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import INPUTS, Block, Statement
 from covocp.transcription.trajectory import Trajectory
 
@@ -65,6 +66,8 @@ class Fingerprint:
     values: Mapping[str, Array]
     switches: Array
     tables: tuple[str, ...]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)

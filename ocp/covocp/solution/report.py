@@ -1,9 +1,7 @@
-"""What print(solution) shows."""
+"""What print(solution) shows, and a notebook."""
 
 from __future__ import annotations
 
-import io
-import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +9,7 @@ import numpy as np
 from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
+from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.extremal.path_limits import NOTED
 from covocp.statement.statement import Block, entry_names
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
 
     from covocp.solution.solution import Solution
 
-WIDTH = 100
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 LARGEST_MATRIX = 6
 # Feedback gains of more entries than this are not shown.
@@ -83,21 +81,26 @@ WORRIES: dict[str, tuple[float, str]] = {
 
 
 def summary(solution: Solution) -> str:
-    """A solution in words and tables of plain text, at most 100 columns wide.
+    """A solution in words and tables of plain text, at most 100 columns wide: its `sections`."""
+    return as_text(sections(solution))
+
+
+def sections(solution: Solution) -> list[Section]:
+    """A solution in sentences and tables.
 
     Args:
-        solution: converged or not; the first line says which.
+        solution: converged or not; the first sentence says which.
 
     Returns:
-        The text: status, violations, cost by term, values at the end, what the closed loop does, residuals of
-        optimality, mesh and effort.
+        Status, violations, cost by term, values at the end, what the closed loop does, residuals of optimality, mesh
+        and effort.
     """
     closed = solution.loop is not None
 
     def shown(block: Block) -> bool:  # the covariances of a closed loop are in its tables
         return not closed or not (block.estimation or block.backward)
 
-    parts = [
+    return [
         _head(solution),
         _violations(solution.violations),
         _costs(solution),
@@ -111,77 +114,39 @@ def summary(solution: Solution) -> str:
         _between_nodes(solution),
         _effort(solution),
     ]
-    return "\n\n".join(part for part in parts if part)
 
 
-def render_table(columns: list[str], rows: list[list[str]], *, words: tuple[int, ...] = (0,)) -> str:
-    """A table as plain text.
-
-    Args:
-        columns: headings.
-        rows: entries, one list a row.
-        words: columns that are set left; the others hold numbers and are set right.
-
-    Returns:
-        Lines without trailing blanks, at most 100 columns wide; long words are folded.
-    """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for i, column in enumerate(columns):
-        table.add_column(
-            Text(column), justify="left" if i in words else "right", overflow="fold", no_wrap=i not in words
-        )
-    for row in rows:
-        table.add_row(*(Text(entry) for entry in row))
-    stream = io.StringIO()
-    Console(file=stream, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False).print(table)
-    return "\n".join(line.rstrip() for line in stream.getvalue().rstrip("\n").splitlines())
+def _head(solution: Solution) -> Section:
+    text = f"{solution.name or 'problem without a name'}: {solution.message} ({solution.method})"
+    return [Sentence(text if solution.converged else f"NOT CONVERGED: {text}", warning=not solution.converged)]
 
 
-def number(value: float | None, digits: int = 8) -> str:
-    """A number for a table; "-" where there is none."""
-    return "-" if value is None or np.isnan(value) else f"{value:.{digits}g}"
-
-
-def wrapped(text: str, indent: str = "  ") -> str:
-    """A paragraph of at most 100 columns, later lines indented."""
-    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_long_words=True)
-
-
-def _head(solution: Solution) -> str:
-    name = solution.name or "problem without a name"
-    if solution.converged:
-        return wrapped(f"{name}: {solution.message} ({solution.method})")
-    return wrapped(f"NOT CONVERGED: {name}: {solution.message} ({solution.method})")
-
-
-def _violations(violations: Mapping[str, float]) -> str:
-    if not violations:
-        return ""
+def _violations(violations: Mapping[str, float]) -> Section:
     ordered = sorted(violations.items(), key=lambda item: -item[1])
-    return render_table(["violated constraint", "by"], [[name, number(value, 4)] for name, value in ordered])
+    return _table(["violated constraint", "by"], [[name, number(value, 4)] for name, value in ordered])
 
 
-def _costs(solution: Solution) -> str:
+def _table(columns: list[str], rows: list[list[str]]) -> Section:
+    """A section of one table; an empty one where there are no rows."""
+    return [Table(columns=columns, rows=rows)] if rows else []
+
+
+def _costs(solution: Solution) -> Section:
     terms = [[name, number(value)] for name, value in solution.cost_terms.items()]
-    text = render_table(["cost", ""], [*terms, ["total", number(solution.cost)]])
-    words = []
+    parts: list[Part] = [Table(columns=["cost", ""], rows=[*terms, ["total", number(solution.cost)]])]
     if solution.loop is not None and DEVIATIONS in solution.cost_terms:
         ended, on_the_way = (number(solution.loop.cost[f"{DEVIATIONS} {where}"], 6) for where in PLACES)
-        words.append(f"deviations: {ended} at the end, {on_the_way} on the way")
-        words += _left_out(solution)
+        parts.append(Sentence(f"deviations: {ended} at the end, {on_the_way} on the way"))
+        parts += _left_out(solution)
     if solution.optimised:
-        words += _gained(solution)
+        parts += _gained(solution)
     missing = solution.stats.get("classical_missing")
     if missing:
-        words.append(wrapped(f"There is no classical design to compare with: {missing}", ""))
-    return "\n".join([text, *words])
+        parts.append(Sentence(f"There is no classical design to compare with: {missing}", ""))
+    return parts
 
 
-def _left_out(solution: Solution) -> list[str]:
+def _left_out(solution: Solution) -> Section:
     """What the curvature of rates and measurements adds, which the linear covariance equations do not have."""
     effect = solution.mean_effect
     if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
@@ -193,7 +158,7 @@ def _left_out(solution: Solution) -> list[str]:
         moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
     worst = int(np.argmax(moved))
     return [
-        wrapped(
+        Sentence(
             f"not in the cost: rates and measurements bend, which adds {effect.cost:+.2g}{share} through the mean "
             f"of the deviations; at the end that of {names[worst]} is {effect.mean[-1, worst]:+.2g}, "
             f"{moved[worst]:.2g} of its root mean square"
@@ -201,26 +166,26 @@ def _left_out(solution: Solution) -> list[str]:
     ]
 
 
-def _gained(solution: Solution) -> list[str]:
+def _gained(solution: Solution) -> Section:
     """What the combined design gains over the classical one, and whether the mesh can tell."""
     classical = solution.stats.get("classical_cost")
     if not classical:
         return []
     text = f"classical design: {number(classical)}"
     if solution.stats.get("classical_same"):
-        return [f"{text}, the same to roundoff"]
+        return [Sentence(f"{text}, the same to roundoff")]
     gain = 1.0 - solution.cost / classical
     text += f", of which {100 * gain:.3g} % are gained"
     if NO_GAIN < abs(gain) < solution.mesh_error:
         text += f": less than the error of the mesh, {100 * solution.mesh_error:.2g} %; more intervals can tell"
-    return [wrapped(text)]
+    return [Sentence(text)]
 
 
-def _states(solution: Solution) -> str:
+def _states(solution: Solution) -> Section:
     """Terminal values with targets, multipliers and, where nothing is fed back, standard deviations."""
     blocks = tuple(b for b in solution.blocks if b.kind == "state")
     if not blocks:
-        return ""
+        return []
     target = solution.targets
     bound = ~np.isnan(target) if solution.optimised else np.zeros(target.size, dtype=bool)
     columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
@@ -237,10 +202,10 @@ def _states(solution: Solution) -> str:
         columns.append("standard deviation")
         deviations = np.concatenate([np.atleast_1d(solution.deviation(b.name)[-1]) for b in blocks])
         rows = [[*row, number(value)] for row, value in zip(rows, deviations, strict=True)]
-    return render_table(columns, rows)
+    return _table(columns, rows)
 
 
-def _unknowns(solution: Solution) -> str:
+def _unknowns(solution: Solution) -> Section:
     """Unknown constants: mean, standard deviation of their estimate at the start and at the end."""
     rows = []
     for b in solution.blocks:
@@ -254,7 +219,7 @@ def _unknowns(solution: Solution) -> str:
             deviations = solution.deviation(b.name).reshape(-1, b.size)
         entries = zip(entry_names((b,)), means, deviations[0], deviations[-1], strict=True)
         rows += [[name, number(mean), number(first), number(last)] for name, mean, first, last in entries]
-    return render_table(["unknown", "mean", "deviation at 0", "deviation at T"], rows) if rows else ""
+    return _table(["unknown", "mean", "deviation at 0", "deviation at T"], rows)
 
 
 def _rows(solution: Solution, name: str) -> list[int]:
@@ -267,11 +232,11 @@ def _roots(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)))
 
 
-def _deviations(solution: Solution) -> str:
+def _deviations(solution: Solution) -> Section:
     """What the actual states of a closed loop do at the end, and how much of it the filter does not know."""
     loop = solution.loop
     if loop is None:
-        return ""
+        return []
     total, error = _roots(loop.X), _roots(loop.E)
     states = [i for b in solution.blocks if b.kind == "state" for i in _rows(solution, b.name)]
     rows = [
@@ -285,19 +250,19 @@ def _deviations(solution: Solution) -> str:
         for i in states
     ]
     columns = ["closed loop, root mean squares", "at 0", "at T", "error of the estimate", "of the variance"]
-    return render_table(columns, rows) if rows else ""
+    return _table(columns, rows)
 
 
-def _feedback(solution: Solution) -> str:
+def _feedback(solution: Solution) -> Section:
     """What the feedback asks of the controls, and how far the nominal stays from their bounds in units of it."""
     loop = solution.loop
     if loop is None or not loop.gain.shape[1]:
-        return ""
+        return []
     if not loop.Xhat.any():
         reason = (
             "nothing is measured" if solution.filter_gain is None else "what is measured tells nothing of the state"
         )
-        return wrapped(f"{reason}, so nothing is fed back: the actual control is the nominal one", "")
+        return [Sentence(f"{reason}, so nothing is fed back: the actual control is the nominal one", "")]
     spread = np.sqrt(np.maximum(np.einsum("kui,kij,kuj->ku", loop.gain, loop.Xhat, loop.gain), 0.0))
     names = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
     room = _room(solution, spread)
@@ -307,7 +272,7 @@ def _feedback(solution: Solution) -> str:
         rows.append([name, number(spread[k, i], 6), number(solution.t[k], 4), number(spread[-1, i], 6)])
         rows[-1] += [] if room is None else [number(room[i], 3)]
     columns = ["feedback, root mean squares", "largest", "at t [s]", "at T"]
-    return render_table(columns + ([] if room is None else ["nearest bound, in rms"]), rows)
+    return _table(columns + ([] if room is None else ["nearest bound, in rms"]), rows)
 
 
 def _room(solution: Solution, spread: Array) -> Array | None:
@@ -326,15 +291,15 @@ def _room(solution: Solution, spread: Array) -> Array | None:
     return np.where(np.isfinite(least), np.maximum(least, 0.0), np.nan)
 
 
-def _gains(solution: Solution) -> str:
+def _gains(solution: Solution) -> Section:
     """A few numbers of each entry of the feedback gain; nothing where there are many."""
     if solution.loop is None or not solution.loop.Xhat.any():  # the estimate stays zero, whatever the gain
-        return ""
+        return []
     gain = solution.loop.gain
     controls = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
     entries = [(u, i) for u in range(gain.shape[1]) for i in range(gain.shape[2])]
     if not entries or len(entries) > MOST_GAINS:
-        return ""
+        return []
     middle = int(np.argmin(np.abs(solution.mesh.nodes - 0.5)))
     rows = []
     for u, i in entries:
@@ -343,8 +308,8 @@ def _gains(solution: Solution) -> str:
         chosen = [number(history[j], 5) for j in (0, middle, -1, k)]
         rows.append([f"{controls[u]}, {solution.augmented[i]}", *chosen, number(solution.t[k], 4)])
     if np.ptp(gain, axis=0).max() <= NO_FEEDBACK * np.abs(gain).max():
-        return render_table(["gain C, constant", ""], [row[:2] for row in rows])
-    return render_table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)
+        return _table(["gain C, constant", ""], [row[:2] for row in rows])
+    return _table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)
 
 
 def _estimated(solution: Solution) -> bool:
@@ -352,19 +317,19 @@ def _estimated(solution: Solution) -> bool:
     return any(b.estimation for b in solution.blocks)
 
 
-def _matrix(solution: Solution, block: Block) -> str:
+def _matrix(solution: Solution, block: Block) -> Section:
     """A matrix at the end: its lower triangle, or its diagonal where it is large; multipliers of fixed entries."""
     final, labels = solution.values[block.name][-1], block.labels
     kind = "covariance" if block.covariance else "matrix"
     if block.size > LARGEST_MATRIX:
         rows = [[label, number(final[i, i])] for i, label in enumerate(labels)]
-        text = render_table([f"{kind} {block.name} at T, diagonal", ""], rows)
+        columns = [f"{kind} {block.name} at T, diagonal", ""]
     elif block.size == 1:
-        text = render_table([f"{kind} {block.name} at T", number(final[0, 0])], [])
+        columns, rows = [f"{kind} {block.name} at T", number(final[0, 0])], []
     else:
         rows = [[label, *(number(v, 6) for v in final[i, : i + 1])] for i, label in enumerate(labels)]
         rows = [row + [""] * (block.size + 1 - len(row)) for row in rows]
-        text = render_table([f"{kind} {block.name} at T", *labels], rows)
+        columns = [f"{kind} {block.name} at T", *labels]
     multipliers = solution.multipliers.final_matrices[block.span]
     pairs = zip(*half_indices(block.size), multipliers, strict=True)
     fixed = [
@@ -372,15 +337,15 @@ def _matrix(solution: Solution, block: Block) -> str:
         for i, j, value in pairs
         if abs(value) > NEGLIGIBLE * abs(solution.cost) and not block.backward  # bounds at the end leave tiny ones
     ]
-    return text + ("\n" + render_table(["fixed at T", "multiplier"], fixed) if fixed else "")
+    return [Table(columns=columns, rows=rows), *_table(["fixed at T", "multiplier"], fixed)]
 
 
-def _optimality(solution: Solution) -> str:
+def _optimality(solution: Solution) -> Section:
     """The residuals of the necessary conditions in words."""
     try:
         values = solution.optimality.as_dict()
     except (CovocpError, RuntimeError, ArithmeticError, ValueError) as error:
-        return wrapped(f"necessary conditions: not evaluated ({str(error).splitlines()[0][:100]})")
+        return [Sentence(f"necessary conditions: not evaluated ({str(error).splitlines()[0][:100]})")]
     rows = []
     for name, value in values.items():
         if value is None or (name == "smallest_eigenvalue" and np.isinf(value)):
@@ -392,7 +357,7 @@ def _optimality(solution: Solution) -> str:
                 _verdict(solution, name, value),
             ]
         )
-    return render_table(["necessary conditions", "", ""], rows, words=(0, 2))
+    return [Table(columns=["necessary conditions", "", ""], rows=rows, words=(0, 2))]
 
 
 def _verdict(solution: Solution, name: str, value: float) -> str:
@@ -405,13 +370,13 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     return words if solution.converged and abs(value) > level else ""
 
 
-def _between_nodes(solution: Solution) -> str:
+def _between_nodes(solution: Solution) -> Section:
     """What happens to limits where nobody asked: a sentence, empty where they hold."""
     if solution.statement is None or not solution.converged:
-        return ""
+        return []
     found = [entry for entry in solution.passed_limits() if entry.share > NOTED]
     if not found:
-        return ""
+        return []
     worst = found[0]
     where = "the nodes" if solution.mesh.points == 1 else f"{solution.mesh.points} points of each interval"
     text = (
@@ -419,7 +384,7 @@ def _between_nodes(solution: Solution) -> str:
         f"{100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: points= or more intervals make it less, "
         "check_path() lists all"
     )
-    return wrapped(text)
+    return [Sentence(text)]
 
 
 def _counted(number: int, what: str) -> str:
@@ -427,7 +392,7 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def _effort(solution: Solution) -> str:
+def _effort(solution: Solution) -> Section:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
@@ -445,8 +410,8 @@ def _effort(solution: Solution) -> str:
         effort.append("started again from a saddle")
     if "starts" in stats:
         effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
-    lines = [wrapped("mesh: " + ", ".join(words))]
-    return "\n".join(lines + ([wrapped("effort: " + ", ".join(effort))] if effort else []))
+    lines = [Sentence("mesh: " + ", ".join(words))]
+    return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
 def _intervals(count: int, stats: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from covocp.base.matrices import (
     unpack,
     unpack_costate,
 )
+from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
 from covocp.extremal.dense_output import Dense, dense_output
@@ -509,6 +510,10 @@ class Solution:
     def __str__(self) -> str:
         """The summary that print shows."""
         return str(later("solution.report").summary(self))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same summary, and the figure."""
+        return as_html(later("solution.report").sections(self), later("plot.embedding").embedded(self.plot))
 
     @property
     def state_names(self) -> tuple[str, ...]:

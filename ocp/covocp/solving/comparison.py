@@ -14,9 +14,11 @@ import numpy as np
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
 from covocp.base.expressions import Given
+from covocp.base.later import later
+from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
-from covocp.solution.report import number, render_table, wrapped
 from covocp.solution.solution import Solution
 from covocp.solving.solver import METHODS, Solver, check_problem, method_options
 from covocp.transcription.mesh import Options
@@ -49,6 +51,8 @@ class Row:
     reason: str
     seconds: float
 
+    __repr__ = short_repr
+
 
 @methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +66,8 @@ class Comparison:
 
     name: str
     rows: tuple[Row, ...]
+
+    __repr__ = short_repr
 
     @property
     def solutions(self) -> Mapping[str, Solution]:
@@ -110,12 +116,11 @@ class Comparison:
 
     def plot(self, *names: Any, path: str | Path | None = None, **options: Any) -> Figure:
         """Draw all solutions in one figure; see `covocp.plot.figure.plot_solutions`."""
-        from covocp.plot.figure import check_plot_options, plot_solutions
-
-        check_plot_options(options)
+        figures = later("plot.figure")
+        figures.check_plot_options(options)
         labels = list(self.solutions)
         title = options.pop("title", self.name or None)
-        return plot_solutions(
+        return figures.plot_solutions(
             list(self.solutions.values()),
             *names,
             labels=options.pop("labels", labels),
@@ -126,17 +131,29 @@ class Comparison:
 
     def __str__(self) -> str:
         """The table that print shows."""
+        return as_text(self._sections())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same table, and the figure."""
+        from covocp.plot.embedding import embedded
+
+        return as_html(self._sections(), embedded(self.plot) if self.solutions else "")
+
+    def _sections(self) -> list[Section]:
+        """The name, the table, why runs failed, and what the columns mean."""
         columns = ["method", "cost", "gap", "slope", "costates", "end", "eigenvalue", "iterations", "seconds"]
         rows = [[row.label, *_entries(row, self.best)] for row in self.rows]
-        notes = [wrapped(f"{row.label}: {row.reason}") for row in self.rows if row.reason]
-        legend = wrapped(
+        legend = (
             "gap: relative to the least cost of a converged run; slope: largest slope of the Lagrangian by a control; "
             "costates: multipliers against backward integration; end: largest miss of a terminal condition; "
-            "eigenvalue: smallest one of the covariances",
-            indent="",
+            "eigenvalue: smallest one of the covariances"
         )
-        parts = [self.name, render_table(columns, rows), "\n".join(notes), legend]
-        return "\n\n".join(part for part in parts if part)
+        return [
+            [Sentence(self.name)] if self.name else [],
+            [Table(columns=columns, rows=rows)],
+            [Sentence(f"{row.label}: {row.reason}", warning=True) for row in self.rows if row.reason],
+            [Sentence(legend, "")],
+        ]
 
 
 @one_at_a_time

@@ -24,6 +24,7 @@ from covocp.base.errors import (
     without_warnings,
 )
 from covocp.base.expressions import Given
+from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
@@ -309,9 +310,7 @@ class Solver:
         stayed = before.size > 0 and bool(np.abs(after - before).max() <= UNMOVED * np.abs(before).max() + UNMOVED)
         if not outcome.converged or not (few or stayed):
             return outcome
-        from covocp.extremal.curvature import smallest_curvature
-
-        curvature = smallest_curvature(outcome.extremal)
+        curvature = later("extremal.curvature").smallest_curvature(outcome.extremal)
         if curvature is None or curvature.verdict != "saddle":
             return outcome
         candidates = []

@@ -20,6 +20,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_indices, half_length
+from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
@@ -65,6 +66,8 @@ class Conditions:
     upper: Array
     uses_matrices: bool
 
+    __repr__ = short_repr
+
     @property
     def size(self) -> int:
         """Number of rows."""
@@ -104,6 +107,8 @@ class Loop:
     terminal: ca.Function
     extra_control: ca.Function
     by_parts: ca.Function | None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +177,8 @@ class Statement:
     running_uses_matrices: bool
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
+
+    __repr__ = short_repr
 
     @property
     def measurement_names(self) -> tuple[str, ...]:

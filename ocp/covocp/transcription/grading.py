@@ -19,6 +19,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts, stiffness
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
@@ -122,6 +123,8 @@ class _Steepness:
     times: Array
     rates: Array
     poles: Array
+
+    __repr__ = short_repr
 
     def parts(self) -> Array:
         """Integral of rate / CHANGE from the end to each of the times."""

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import NUMERIC_RUN, interval_columns, shoot
@@ -32,6 +33,8 @@ class Refined:
     running: float
     states: Array
     matrices: Array
+
+    __repr__ = short_repr
 
 
 def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Refined:

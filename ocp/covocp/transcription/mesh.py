@@ -12,6 +12,7 @@ from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import Step
 
@@ -47,6 +48,8 @@ class Graded:
     added: tuple[int, int]
     stiffness: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -61,6 +64,8 @@ class Options:
     covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
     step: Literal["auto", "rk4", "rodas"] = "auto"
     points: int | Literal["auto"] = "auto"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -125,6 +130,8 @@ class Mesh:
     step: Step
     linear_solver: str = LINEAR_SOLVER
     points: int = 1
+
+    __repr__ = short_repr
 
     @property
     def intervals(self) -> int:

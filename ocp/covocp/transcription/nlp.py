@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.errors import OutsideDomainError
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
@@ -30,6 +31,8 @@ class Scales:
     e: Array
     duration: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
@@ -42,6 +45,8 @@ class Rows:
     names: tuple[str, ...]
     scale: Array
     dense: bool = False
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +67,8 @@ class NLP:
     rows: tuple[Rows, ...]
     jacobian: ca.Function | None
     evaluate: ca.Function
+
+    __repr__ = short_repr
 
     def pack(self, trajectory: Trajectory) -> Array:
         """The scaled variables of a trajectory."""

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import (
     check_model,
@@ -69,6 +70,8 @@ class First:
 
     trajectory: Trajectory
     plain: bool
+
+    __repr__ = short_repr
 
 
 def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Trajectory]:
@@ -286,6 +289,8 @@ class _Judged:
     u: Array
     cost: float
     violation: float
+
+    __repr__ = short_repr
 
 
 def _judged(run: Run, fixed: tuple[int, ...], target: Array, shape: Array, flat: Array, steps: int) -> _Judged:

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns
@@ -51,6 +52,8 @@ class Run:
     parameters: Array
     scale: Array
     units: Array
+
+    __repr__ = short_repr
 
     @property
     def divisors(self) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 
@@ -19,6 +20,8 @@ class Trajectory:
     u: Array
     e: Array
     duration: float
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +55,8 @@ class Multipliers:
     gaps: Array = field(default_factory=lambda: np.zeros((0, 0)))
     inside_path: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     inside_states: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+    __repr__ = short_repr
 
     @staticmethod
     def zero(statement: Statement, mesh: Mesh) -> Multipliers:

@@ -16,6 +16,7 @@ import numpy as np
 from covocp.base.arguments import MOST, checked, is_whole, positive, text, texts
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Given
+from covocp.base.pages import lines_as_html
 from covocp.base.threads import methods_one_at_a_time
 from covocp.export.compiled.building import TIMEOUT, Build, Sources, build
 from covocp.export.compiled.library import Laws, Library, laws_of
@@ -239,6 +240,10 @@ class CPackage:
         lines += [f"{law.name}: {note}" for law in self.laws for note in law.notes]
         lines += [str(self._kept["check"])] if "check" in self._kept else []
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same lines."""
+        return lines_as_html(str(self))
 
     @property
     def _built(self) -> Build:

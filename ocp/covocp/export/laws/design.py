@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic
+from covocp.base.short_repr import short_repr
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
 from covocp.statement.statement import Block, Statement
@@ -53,6 +54,8 @@ class Design:
     units: Array
     labels: tuple[str, ...]
     sizes: tuple[int, int, int]
+
+    __repr__ = short_repr
 
     @property
     def symbolic(self) -> Any:

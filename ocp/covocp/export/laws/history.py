@@ -16,6 +16,7 @@ from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import hermite
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import LARGEST, status_of
 from covocp.solution.solution import Solution
 
@@ -33,6 +34,8 @@ class Nominal:
     u: Any
     e: Any
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Clock:
@@ -44,6 +47,8 @@ class Clock:
     time: Any
     within: Any
     conditions: list[tuple[Any, str]]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,6 +75,8 @@ class History:
     u: Array
     states: int
     margin: float
+
+    __repr__ = short_repr
 
     @property
     def duration(self) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 
 Kind = Literal["function", "sample", "controller", "solver"]
 Points = Callable[[np.random.Generator, int], Array]
@@ -117,6 +118,8 @@ class Law:
     notes: tuple[str, ...] = ()
     most: int = 100_000
     tolerance: float = 1e-12
+
+    __repr__ = short_repr
 
     @property
     def arguments(self) -> tuple[Port, ...]:

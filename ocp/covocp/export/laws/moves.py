@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import GAUSS_NODES
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 
@@ -51,6 +52,8 @@ class Moves:
     weight: Array
     sizes: tuple[int, int, int]
     first: Any
+
+    __repr__ = short_repr
 
     @staticmethod
     def of(design: Design, tables: History, t: Array) -> Moves:
@@ -130,6 +133,8 @@ class _Point:
     N: Array
     B: Array
     u: Array
+
+    __repr__ = short_repr
 
     @staticmethod
     def at(design: Design, tables: History, t: Array, h: Array) -> _Point:

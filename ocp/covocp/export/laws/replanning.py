@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_length, pack, unpack
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
@@ -38,6 +39,8 @@ class Entry:
     value: Array
     deviation: Array
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replannable:
@@ -52,6 +55,8 @@ class Replannable:
     statement: Statement
     fixed: Problem
     entries: tuple[Entry, ...]
+
+    __repr__ = short_repr
 
 
 def replannable(problem: Problem) -> Replannable:

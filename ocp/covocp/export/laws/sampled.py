@@ -28,6 +28,7 @@ import numpy as np
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, unpack_symbolic
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
     STATUSES,
@@ -72,6 +73,8 @@ class Samples:
     period: float
     times: Array
     flown: Array
+
+    __repr__ = short_repr
 
     @property
     def count(self) -> int:

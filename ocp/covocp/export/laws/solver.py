@@ -17,6 +17,7 @@ from covocp.base.errors import ExportError, spelling
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
 from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.laws.replanning import Replannable, replannable, stacked
@@ -82,6 +83,8 @@ class _Task:
     solution: Solution
     scale: float
     multipliers: tuple[Array, Array]
+
+    __repr__ = short_repr
 
     @property
     def names(self) -> tuple[str, ...]:

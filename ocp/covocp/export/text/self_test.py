@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import CODES, Law, Port, span, stacked_size
 from covocp.export.text.header import struct_name
 from covocp.export.text.numbers import code, row, table, wrapped
@@ -104,6 +105,8 @@ class Reference:
     values: Array
     status: Array
     smallest: Array
+
+    __repr__ = short_repr
 
     def deviations(self, values: Array, status: Array) -> Array:
         """Largest relative deviation at each point; infinite where the status is another one."""
