@@ -29,7 +29,7 @@ Regulation, cost of the true state's feedback over the optimal cost, which is 26
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -83,7 +83,16 @@ class Scenario:
     """[s]"""
 
 
-def matrices(speed_column: bool = False) -> tuple[Array, Array, Array, Array]:
+class Matrices(NamedTuple):
+    """A_L and A_NL, (5, 5), B, (5, 1), H, (2, 5)."""
+
+    linear: Array
+    bilinear: Array
+    input: Array
+    measured: Array
+
+
+def matrices(speed_column: bool = False) -> Matrices:
     """A_L and A_NL, (5, 5), B, (5, 1), H, (2, 5).
 
     Args:
@@ -93,7 +102,7 @@ def matrices(speed_column: bool = False) -> tuple[Array, Array, Array, Array]:
     if speed_column:
         bilinear[:, 0] = SPEED_COLUMN
     measured = np.eye(5)[[STATES.index(name) for name in MEASURED]]
-    return np.array(LINEAR), bilinear, np.array(INPUT)[:, None], measured
+    return Matrices(np.array(LINEAR), bilinear, np.array(INPUT)[:, None], measured)
 
 
 def regulation(units: str = "rad", angle: float = 30.0) -> Scenario:

@@ -7,7 +7,7 @@ predicted; see `covocp.solvers.gradient` for what is beyond the source.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -90,6 +90,18 @@ class _Control:
     __repr__ = short_repr
 
 
+CONTRADICTING = "the penalties do not remove the violations: they may contradict"
+
+
+class Ending(NamedTuple):
+    """The last iterate, its measures, how the run ended, whether it converged."""
+
+    iterate: Iterate
+    measures: Measures
+    message: str
+    converged: bool
+
+
 class Search:
     """The iterations: passes of the penalties outside, gradient steps inside."""
 
@@ -99,7 +111,7 @@ class Search:
         self.passes = 0
         self.reached: Residuals | None = None
 
-    def run(self, current: Iterate) -> tuple[Iterate, Measures, str, bool]:
+    def run(self, current: Iterate) -> Ending:
         """All passes; returns the last iterate, its measures, how it ended, whether it converged."""
         space, settings = self.space, self.settings
         tolerance = settings.tolerance if not space.groups else max(settings.tolerance, FIRST_PASS_TOLERANCE)
@@ -110,12 +122,14 @@ class Search:
             self.passes += 1
             worst = space.violation(current)
             if not done or not space.groups:
-                return current, measures, message, done
+                return Ending(current, measures, message, done)
             tight = tolerance <= settings.tolerance and worst.max(initial=0.0) <= settings.violation_tolerance
             if tight and self.reached is not None and self.reached.hold(limit):
-                return current, measures, message, True
+                return Ending(current, measures, message, True)
             if self.passes >= LARGEST_PASSES:
-                return current, measures, "the penalties do not remove the violations: they may contradict", False
+                return Ending(
+                    current, measures, "the penalties do not remove the violations: they may contradict", False
+                )
             factor = PASS_FACTOR if worst.any() else 0.0
             tolerance = max(settings.tolerance, factor * tolerance)
             space = self.space = space.with_weights(next_weights(current.penalty, space.weights, before, worst))
@@ -124,12 +138,12 @@ class Search:
             self.control.past.clear()
             self.control.pairs.clear()
 
-    def _pass(self, current: Iterate, tolerance: float) -> tuple[Iterate, Measures, str, bool]:
+    def _pass(self, current: Iterate, tolerance: float) -> Ending:
         """Gradient steps for the present penalties."""
         space, settings, control = self.space, self.settings, self.control
         linear = space.linearise(current)
         if not linear.finite:
-            return current, Measures.unknown(linear), INFINITE_SLOPES, False
+            return Ending(current, Measures.unknown(linear), INFINITE_SLOPES, False)
         measures = space.measure(current, linear)
         ell = measures.ell
         self._check_reachable(current, linear)
@@ -141,21 +155,21 @@ class Search:
         while True:
             self._record(current, measures)
             if self._arrived(current, linear, measures, tolerance):
-                return current, measures, "solved", True
+                return Ending(current, measures, "solved", True)
             if self.progress.stop:
-                return current, measures, "interrupted by the user", False
+                return Ending(current, measures, "interrupted by the user", False)
             message = self._hopeless(measures)
             if message:
-                return current, measures, message, False
+                return Ending(current, measures, message, False)
             base = space.metric(current, linear, ell, settings.weight)
             metric = learnt(control.weight * base, control.pairs)
             trial = self._try(current, linear, metric, ell, active)
             if isinstance(trial, str):
-                return current, measures, trial, False
+                return Ending(current, measures, trial, False)
             following, step = trial
             after = space.linearise(following)
             if not after.finite:
-                return current, measures, INFINITE_SLOPES, False
+                return Ending(current, measures, INFINITE_SLOPES, False)
             self._learn(following.point - current.point, linear, after, step, metric, base)
             current, linear, ell, active = following, after, step.ell, step.active
             measures = space.measure(current, linear)

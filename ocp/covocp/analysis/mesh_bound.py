@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -106,8 +107,17 @@ def _banded_energy(stages: Stages, constant: bool) -> Array:
     return result
 
 
-def _nodal(extremal: Extremal, x: Array) -> tuple[Array, Array, float, Array]:
+class _Nodal(NamedTuple):
     """Slopes by nodes and control values of the multipliers at the nodes, slack, rows of terminal equalities."""
+
+    by_x: Array
+    by_u: Array
+    slack: float
+    rows: Array
+
+
+def _nodal(extremal: Extremal, x: Array) -> _Nodal:
+    """What the limits that act at the nodes do."""
     st, m, count = extremal.statement, extremal.multipliers, extremal.mesh.intervals + 1
     fixed = ~np.isnan(st.boundary_values(extremal.parameters)[1])
     states = m.states.copy()
@@ -132,4 +142,4 @@ def _nodal(extremal: Extremal, x: Array) -> tuple[Array, Array, float, Array]:
         slack += more
         if conditions is st.end:
             rows.append(maps[0, conditions.lower == conditions.upper, : st.nx])
-    return by_x, by_u, slack, np.vstack(rows)
+    return _Nodal(by_x, by_u, slack, np.vstack(rows))

@@ -5,7 +5,7 @@ Slopes are taken at the estimate: F at the one after the last measurement, H at 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 
@@ -57,7 +57,7 @@ def extended(
         raise wrong_argument("step", "a number [s]", f"an expression, {step}"[:80])
     else:
         rate, density = (_with_time(function, model) for function in (model.f, model.noise))
-        ahead = propagated(rate, density, (x, P, ca.DM(0.0), u), bucy.time_step(step), substeps)
+        ahead = propagated(rate, density, Estimated(x, P, ca.DM(0.0), u), bucy.time_step(step), substeps)
     predict = ca.Function(
         "predict", [x, P, u][: model.arguments + 1], ahead, model.names("x", "P"), ["estimate", "covariance"]
     )
@@ -108,9 +108,16 @@ def bucy_slopes(x: Expr, P: Expr, y: Expr, process: tuple[Any, Any], measurement
     return [ca.densify(f + gain @ (y - h)), bucy.rate(P, F, H, noise, density)]
 
 
-def propagated(
-    rate: ca.Function, density: ca.Function, start: tuple[Any, Any, Any, Any], step: Expr, substeps: int
-) -> list[Any]:
+class Estimated(NamedTuple):
+    """Estimate x and covariance P at a time t, and the control u."""
+
+    x: Expr
+    P: Expr
+    t: Expr
+    u: Expr
+
+
+def propagated(rate: ca.Function, density: ca.Function, start: Estimated, step: Expr, substeps: int) -> list[Any]:
     """Estimate and covariance after a step of a continuous model, positive semidefinite at any length of it.
 
     Each substep of length h is two Runge-Kutta steps with tangents Phi1, Phi2; the noise is added by Simpson's rule,
@@ -119,7 +126,7 @@ def propagated(
     Args:
         rate: (x, t, u) -> dx/dt.
         density: (x, t, u) -> power spectral density of the process noise.
-        start: x, P, t and u at the start; u is held.
+        start: estimate, covariance, time and control at the start; the control is held.
         step: [s], a number or an expression.
         substeps: number of them.
 

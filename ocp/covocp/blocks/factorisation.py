@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -140,7 +140,16 @@ def _at_state(f: Callable[[Any], Any], x: Expr) -> Any:
         ) from error
 
 
-def integral_states(x: Expr, A0: Expr, A: Expr, B: Expr, output: Expr) -> tuple[Any, Any, Any, Any]:
+class WithIntegrals(NamedTuple):
+    """The state with its integrals, and the dynamics of both."""
+
+    state: Any
+    A0: Array
+    A: Any
+    B: Array
+
+
+def integral_states(x: Expr, A0: Expr, A: Expr, B: Expr, output: Expr) -> WithIntegrals:
     """Dynamics of (x, z) with dz/dt = output @ x, section 4.
 
     Args:
@@ -151,7 +160,7 @@ def integral_states(x: Expr, A0: Expr, A: Expr, B: Expr, output: Expr) -> tuple[
         output: its rows times x are integrated, numbers, (p, n) or, for one, (n,).
 
     Returns:
-        SX symbol of (x, z), shape (n + p,), and A0, A and B of the system with integral states.
+        SX symbol of (x, z), shape (n + p,), and A0, A and B of the system with integral states, by name or unpacked.
 
     Raises:
         ProblemError: an argument does not fit.
@@ -163,7 +172,7 @@ def integral_states(x: Expr, A0: Expr, A: Expr, B: Expr, output: Expr) -> tuple[
     count = rows.shape[0]
     state, rest = dependence(x, A, size)
     whole = ca.SX.sym("x_and_integrals", size + count)
-    return (
+    return WithIntegrals(
         whole,
         np.block([[constant, np.zeros((size, count))], [rows, np.zeros((count, count))]]),
         ca.diagcat(ca.substitute(rest, state, whole[:size]), ca.SX(count, count)),

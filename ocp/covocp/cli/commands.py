@@ -255,9 +255,8 @@ def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.
             labels.append(label)
             solutions.append(solution)
     if solutions:
-        later("plot.figure").plot_solutions(
-            solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure
-        )
+        draw = later("plot.figure").plot_solutions
+        draw(solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure)
         _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
     return worst
 

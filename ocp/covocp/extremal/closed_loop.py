@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite
+from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, simpson_weight
 from covocp.base.riccati_rates import inverse
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -294,7 +294,16 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     return float((error / np.maximum(variance[1:], np.finfo(float).tiny)).max())
 
 
-def _points(extremal: Extremal, fine: Array) -> tuple[Array, Array, Array, Array]:
+class _Points(NamedTuple):
+    """x, u, t, T at the ends of all substeps, (N, substeps + 1, entries)."""
+
+    x: Array
+    u: Array
+    time: Array
+    duration: Array
+
+
+def _points(extremal: Extremal, fine: Array) -> _Points:
     """x, u, t, T at the ends of all substeps, with the control of their interval; (N, substeps + 1, entries)."""
     n, points, _ = fine.shape
     u, nodes = extremal.controls, extremal.time
@@ -302,7 +311,8 @@ def _points(extremal: Extremal, fine: Array) -> tuple[Array, Array, Array, Array
     c = np.linspace(0.0, 1.0, points)[:, None]
     time = nodes[:-1, None, None] + np.clip(c, one_sided(0.0), one_sided(1.0)) * np.diff(nodes)[:, None, None]
     controls = u[:-1, None, :] + c * (after - u[:-1])[:, None, :]
-    return fine[:, :, : extremal.statement.nx], controls, time, np.full(time.shape, extremal.trajectory.duration)
+    x, duration = fine[:, :, : extremal.statement.nx], np.full(time.shape, extremal.trajectory.duration)
+    return _Points(x=x, u=controls, time=time, duration=duration)
 
 
 def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple[dict[str, float], float | None]:
@@ -315,7 +325,7 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     p = np.tile(extremal.parameters[:, None], (1, n))
     running = deviations = other = 0.0
     for j in range(m + 1):
-        weight = (1 if j in (0, m) else 4 if j % 2 else 2) / (3 * m) * h
+        weight = simpson_weight(j, m) * h
         covariance = joint[j::m][:n].transpose(1, 0, 2).reshape(2 * size, -1)
         at = (x[:, j].T, u[:, j].T, fine[:, j, st.nx :].T, time[:, j].T, duration[:, j].T, p)
         L, fed, alternative = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))

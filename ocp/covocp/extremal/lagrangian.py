@@ -17,7 +17,7 @@ from covocp.base.matrices import Array
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Columns, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, nominal_interval
@@ -84,7 +84,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         ("end", st.end, end, [n]),
     ):
         if conditions.size:
-            places = (x[:, at], at_nodes[:, at], e[:, at], time[:, at])
+            places = Columns(x[:, at], at_nodes[:, at], e[:, at], time[:, at])
             rows[kind] = conditions.columns(places, duration, p)
             value += ca.dot(weights, rows[kind])
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]

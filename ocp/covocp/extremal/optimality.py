@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -121,7 +121,7 @@ def assess(
         The record.
     """
     st = extremal.statement
-    slope, curvature, values, size = _along(extremal, costates)
+    slope, curvature, values, size = _at_nodes(extremal, costates)
     _, slopes, _ = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
@@ -212,8 +212,17 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
     }
 
 
-def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array, Array]:
-    """At the nodes H_u (K, nu), H_uu (K, nu, nu), [H, sum of its absolute terms] (K, 2), sizes of H_u (K, nu)."""
+class _AtNodes(NamedTuple):
+    """H_u (K, nu), H_uu (K, nu, nu), H and the sum of its absolute terms (K, 2), sizes of H_u (K, nu)."""
+
+    slope: Array
+    curvature: Array
+    values: Array
+    sizes: Array
+
+
+def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
+    """The Hamiltonian and its slopes at the nodes."""
     st = extremal.statement
     make = hamiltonian(st)
 
@@ -229,7 +238,7 @@ def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array,
     terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1)
     terms = terms + np.abs(np.asarray(values[2].full()).ravel())
     sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
-    return slope, curvature, np.column_stack([h[:, 0], terms]), sizes
+    return _AtNodes(slope, curvature, np.column_stack([h[:, 0], terms]), sizes)
 
 
 def _path_slopes(extremal: Extremal) -> Array:

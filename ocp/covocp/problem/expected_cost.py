@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -339,7 +339,16 @@ def _with_free_gain(
     return problem.adding(matrices=estimate, rates={ESTIMATE: growth}), X, replace(expansion, gain=C)
 
 
-def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:
+class _GainEntries(NamedTuple):
+    """Pattern, bounds and guess of a gain, all of its shape."""
+
+    pattern: Any
+    lower: Any
+    upper: Any
+    guess: Any
+
+
+def _gain_entries(gain: Gain, shape: tuple[int, int]) -> _GainEntries:
     """Pattern, bounds and guess of a gain, all of its shape.
 
     Raises:
@@ -371,4 +380,4 @@ def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, An
             received=str(gain),
             remedy="correct Gain(...)",
         )
-    return pattern != 0, low, high, np.clip(guess, low, high)
+    return _GainEntries(pattern != 0, low, high, np.clip(guess, low, high))

@@ -11,7 +11,7 @@ from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, unpack
 from covocp.blocks.bucy import time_step
-from covocp.blocks.extended import bucy_slopes, corrected_by, propagated
+from covocp.blocks.extended import Estimated, bucy_slopes, corrected_by, propagated
 from covocp.blocks.updates import Form, Missing
 from covocp.problem.builder import Problem
 from covocp.statement.statement import Statement
@@ -68,7 +68,7 @@ def extended_filter(
         slopes = bucy_slopes(x, P, y, (system.rate(x, t, u), system.noise(x, t, u)), (value, density))
         return ca.Function("rate", [x, P, u, y, t], slopes, ["x", "P", "u", "y", "t"], ["dx", "dP"])
     length = time_step(step)
-    ahead = propagated(system.rate, system.noise, (x, P, t, u), length, substeps)
+    ahead = propagated(system.rate, system.noise, Estimated(x, P, t, u), length, substeps)
     after = corrected_by(x, P, y, (value, density / length), form, missing) if readings else [x, P]
     return (
         ca.Function("predict", [x, P, u, t], ahead, ["x", "P", "u", "t"], names),

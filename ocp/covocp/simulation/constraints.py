@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -96,7 +96,16 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
     return Rows(rows=tuple(rows), function=function, left_out=left_out)
 
 
-def _bounds(st: Statement, a: list[Any], sizes: tuple[int, int]) -> list[tuple[str, Any, float, float]]:
+class _Bound(NamedTuple):
+    """An entry that has bounds."""
+
+    name: str
+    value: Any
+    lower: float
+    upper: float
+
+
+def _bounds(st: Statement, a: list[Any], sizes: tuple[int, int]) -> list[_Bound]:
     """Names, values and limits of the states and fed-back controls that have bounds."""
     found = []
     pairs = ((st.states, a[0], st.state_bounds), (st.controls, a[1], st.control_bounds))
@@ -104,7 +113,7 @@ def _bounds(st: Statement, a: list[Any], sizes: tuple[int, int]) -> list[tuple[s
         names = entry_names(blocks)
         for i in range(size):
             if np.isfinite(lower[i]) or np.isfinite(upper[i]):
-                found.append((names[i], column[i], float(lower[i]), float(upper[i])))
+                found.append(_Bound(names[i], column[i], float(lower[i]), float(upper[i])))
     return found
 
 

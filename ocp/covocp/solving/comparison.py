@@ -120,7 +120,7 @@ class Comparison:
         figures.check_plot_options(options)
         labels = list(self.solutions)
         title = options.pop("title", self.name or None)
-        return figures.plot_solutions(
+        return figures.plot_solutions(  # type: ignore[no-any-return]
             list(self.solutions.values()),
             *names,
             labels=options.pop("labels", labels),

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -53,6 +53,24 @@ class Block:
         return slice(self.offset, self.offset + self.length)
 
 
+class Boundary(NamedTuple):
+    """Initial and final state, initial and final half-vectors; NaN: free."""
+
+    initial: Array
+    final: Array
+    initial_matrices: Array
+    final_matrices: Array
+
+
+class Columns(NamedTuple):
+    """States, controls, half-vectors and times of several points, a column each."""
+
+    x: Expr
+    u: Expr
+    matrices: Expr
+    time: Expr
+
+
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
     """Inequalities lower <= value(...) <= upper of one kind: along the path, at the start or at the end.
@@ -73,16 +91,15 @@ class Conditions:
         """Number of rows."""
         return len(self.names)
 
-    def columns(self, at_columns: tuple[Any, Any, Any, Any], duration: Expr, parameters: Expr) -> Any:
-        """The values for columns of (x, u, matrices, time); matrices that no row reads are no part of the expression.
+    def columns(self, at: Columns, duration: Expr, parameters: Expr) -> Any:
+        """The values for columns of points; matrices that no row reads are no part of the expression.
 
         Else every slope of these values would carry the propagation of the covariances along.
         """
-        x, u, matrices, time = at_columns
-        count = x.shape[1]
-        seen = matrices if self.uses_matrices else ca.DM(*matrices.shape)
-        at = (ca.repmat(duration, 1, count), ca.repmat(parameters, 1, count))
-        return self.function.map(count)(x, u, seen, time, *at)
+        count = at.x.shape[1]
+        seen = at.matrices if self.uses_matrices else ca.DM(*at.matrices.shape)
+        rest = (ca.repmat(duration, 1, count), ca.repmat(parameters, 1, count))
+        return self.function.map(count)(at.x, at.u, seen, at.time, *rest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,10 +261,10 @@ class Statement:
         """Entries of the parameters (known, then means of the unknowns)."""
         return int(self.values.size)
 
-    def boundary_values(self, parameters: Array) -> tuple[Array, Array, Array, Array]:
+    def boundary_values(self, parameters: Array) -> Boundary:
         """Initial state, final state, initial matrices, final matrices for these parameters (NaN: free)."""
         values = self.boundary(parameters)
-        return tuple(np.asarray(value.full()).ravel() for value in values)  # type: ignore[return-value]
+        return Boundary(*(np.asarray(value.full()).ravel() for value in values))
 
     @cached
     def matrix_names(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
-from covocp.statement.statement import Conditions, Statement
+from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
 from covocp.transcription.shooting import interval_columns, shoot
@@ -94,7 +94,7 @@ def _constraints(
         if conditions.size:
             k = len(columns)
             x, u, e, t = (v[:, columns] for v in arguments)
-            value = conditions.columns((x, u, e, t), variables.duration, variables.parameters)
+            value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
             rows.append(
                 Rows(
                     kind=kind,
@@ -179,7 +179,7 @@ def _inside_rows(
         intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
         points = intervals.substeps(mesh.points).columns(at)
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
-        places = (nodes["x_inside"], points.start, e, variables.duration * points.s)
+        places = Columns(nodes["x_inside"], points.start, e, variables.duration * points.s)
         rows.append(
             Rows(
                 kind="path_inside",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -32,6 +32,15 @@ def stacked(value: Expr, count: int) -> Array:
     """Matrices beside each other as (count, rows, columns)."""
     array = np.asarray(value.full())
     return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
+
+
+class Period(NamedTuple):
+    """Phi and Gamma of a period, by the state at its start and the control that is held, g, and P after it."""
+
+    transition: Array
+    held: Array
+    offset: Array
+    covariance: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,13 +94,13 @@ class Moves:
         """The steps of period k."""
         return range(int(self.first[k]), int(self.first[k + 1]))
 
-    def over(self, k: int, P: Array) -> tuple[Array, Array, Array, Array]:
-        """Phi, Gamma, g over period k, and the covariance P after it without a measurement."""
+    def over(self, k: int, P: Array) -> Period:
+        """What a period does without a measurement."""
         n, m, _ = self.sizes
         z = np.eye(n + m + 1)
         for i in self.steps(k):
             z, P = self.state[i] @ z, _moved(self.noise[i], P)
-        return z[:n, :n], z[:n, n : n + m], z[:n, n + m :], P
+        return Period(transition=z[:n, :n], held=z[:n, n : n + m], offset=z[:n, n + m :], covariance=P)
 
     def measuring(self, k: int) -> tuple[Array, Array, Array]:
         """Over period k, of the deviation d and the integral a of what is measured of it, noise included.
