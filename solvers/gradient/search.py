@@ -127,9 +127,7 @@ class Search:
             if tight and self.reached is not None and self.reached.hold(limit):
                 return Ending(current, measures, message, True)
             if self.passes >= LARGEST_PASSES:
-                return Ending(
-                    current, measures, "the penalties do not remove the violations: they may contradict", False
-                )
+                return Ending(current, measures, CONTRADICTING, False)
             factor = PASS_FACTOR if worst.any() else 0.0
             tolerance = max(settings.tolerance, factor * tolerance)
             space = self.space = space.with_weights(next_weights(current.penalty, space.weights, before, worst))

@@ -11,6 +11,7 @@ import casadi as ca
 
 from covocp.base.arguments import checked, whole
 from covocp.base.expressions import Expr
+from covocp.base.quadrature import classical_step
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.blocks.updates import Form, Missing, updating
@@ -187,11 +188,7 @@ def _half_step(rate: ca.Function) -> ca.Function:
     kind: Any = ca.SX if expands(rate) else ca.MX
     x, t, u = kind.sym("x", rate.size1_in(0)), kind.sym("t"), kind.sym("u", rate.size1_in(2))
     h = kind.sym("h")
-    k1 = rate(x, t, u)
-    k2 = rate(x + h / 2 * k1, t + h / 2, u)
-    k3 = rate(x + h / 2 * k2, t + h / 2, u)
-    k4 = rate(x + h * k3, t + h, u)
-    end = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    end = classical_step(lambda value, c: rate(value, t + c * h, u), x, h)
     return ca.Function("half_step", [x, t, u, h], [end, ca.jacobian(end, x)])
 
 

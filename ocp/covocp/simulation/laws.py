@@ -18,6 +18,7 @@ from covocp.base.arguments import a, a_function, checked, optional, positive, wh
 from covocp.base.errors import CovocpError, ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
+from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
@@ -366,11 +367,7 @@ def _runge_kutta(rate: ca.Function, h: float) -> Law:
     """One classical step with the noise held."""
 
     def advance(state: Given, t: Given, process: Given, measurement: Given) -> Any:
-        one = rate(state, t, process, measurement)
-        two = rate(state + 0.5 * h * one, t + 0.5 * h, process, measurement)
-        three = rate(state + 0.5 * h * two, t + 0.5 * h, process, measurement)
-        four = rate(state + h * three, t + h, process, measurement)
-        return state + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
+        return classical_step(lambda value, c: rate(value, t + c * h, process, measurement), state, h)
 
     return advance
 

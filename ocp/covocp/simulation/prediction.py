@@ -24,6 +24,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
+from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
@@ -152,16 +153,13 @@ def _evaluate(
 def _step(mean: Array, covariance: Array, h: float, sides: list[tuple[Array, ...]]) -> tuple[Array, Array]:
     """One Runge-Kutta step of mean' = A mean + b and P' = A P + P A' + Q."""
 
-    def rates(mean: Array, covariance: Array, side: tuple[Array, ...]) -> tuple[Array, Array]:
-        drift, noise, offset = side
+    def rate(both: Array, c: float) -> Array:
+        (drift, noise, offset), (mean, covariance) = sides[round(2 * c)], (both[:, 0], both[:, 1:])
         moved = drift @ covariance
-        return drift @ mean + offset, moved + moved.T + noise
+        return np.column_stack([drift @ mean + offset, moved + moved.T + noise])
 
-    m1, p1 = rates(mean, covariance, sides[0])
-    m2, p2 = rates(mean + h / 2 * m1, covariance + h / 2 * p1, sides[1])
-    m3, p3 = rates(mean + h / 2 * m2, covariance + h / 2 * p2, sides[1])
-    m4, p4 = rates(mean + h * m3, covariance + h * p3, sides[2])
-    return mean + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4), covariance + h / 6 * (p1 + 2 * p2 + 2 * p3 + p4)
+    after = classical_step(rate, np.column_stack([mean, covariance]), h)
+    return after[:, 0], after[:, 1:]
 
 
 def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: System, n: int) -> tuple[Array, Array]:

@@ -34,8 +34,8 @@ NEGLIGIBLE = 1e-6
 SAME_OPTIMUM = 1e-5
 
 RESIDUALS = {
-    "stationarity": "largest slope of the Lagrangian by a control (relative)",
-    "complementarity": "multipliers times the distance from their bounds (relative to the cost)",
+    "stationarity": "stationarity (relative)",
+    "complementarity": "complementarity (relative to the cost)",
     "control_slope": "H_u at the nodes, root mean square (relative)",
     "costate_difference": "costates: multipliers against backward integration (relative)",
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",

@@ -141,10 +141,10 @@ class Comparison:
 
     def _sections(self) -> list[Section]:
         """The name, the table, why runs failed, and what the columns mean."""
-        columns = ["method", "cost", "gap", "slope", "costates", "end", "eigenvalue", "iterations", "seconds"]
+        columns = ["method", "cost", "gap", "stationarity", "costates", "end", "eigenvalue", "iterations", "seconds"]
         rows = [[row.label, *_entries(row, self.best)] for row in self.rows]
         legend = (
-            "gap: relative to the least cost of a converged run; slope: largest slope of the Lagrangian by a control; "
+            "gap: relative to the least cost of a converged run; stationarity: relative, as in each solution; "
             "costates: multipliers against backward integration; end: largest miss of a terminal condition; "
             "eigenvalue: smallest one of the covariances"
         )
