@@ -244,7 +244,7 @@ def test_figures_share_solutions_and_have_names_and_given_nominals(capsys, tmp_p
     assert names == (("rms", "x"),)
     assert options["over"] == "x"
     assert [s.method for s in first] == ["ipopt", "ipopt", "evaluate"]
-    assert [s.stats.get("nominal") for s in second] == [None, "deterministic"]
+    assert [s.origin for s in second] == ["optimised", "classical"]
     assert first[0] is second[0]
 
 

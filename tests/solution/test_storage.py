@@ -367,3 +367,9 @@ def test_without_xarray_the_extra_is_named(lag, monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(co.ExportError, match=r"covocp\[xarray\]"):
         lag.to_xarray()
+
+
+def test_a_file_with_an_unknown_origin_is_refused(lag, tmp_path):
+    co.Solution.save(replace(lag, stats={**lag.stats, "origin": "heaven"}), tmp_path / "lag.json")
+    with pytest.raises(co.ProblemError, match=r"stats\.origin"):
+        co.load(tmp_path / "lag.json")

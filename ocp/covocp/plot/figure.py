@@ -21,6 +21,7 @@ from covocp.plot.curves import Panel
 from covocp.plot.legends import fold_title, place_legend
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.plot.paths import outline
+from covocp.solution.origin import Origin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -209,7 +210,7 @@ def _kind(solution: Solution) -> str:
     """How the nominal came about."""
     if solution.method == "evaluate":
         return "evaluated"
-    return "classical" if solution.stats.get("nominal") == "deterministic" else "combined"
+    return "classical" if solution.origin is Origin.CLASSICAL else "combined"
 
 
 def _grid(count: int) -> tuple[int, int]:

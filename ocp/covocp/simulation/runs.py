@@ -28,6 +28,7 @@ from covocp.simulation.schedule import Filter, Grid, Nominal, base_grid, nominal
 from covocp.simulation.step_choice import StepChoice, choose_step, examined, given_step
 from covocp.simulation.verdict import LEFT
 from covocp.simulation.workers import Harvest, simulate_batches
+from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
 from covocp.statement.names import control_limits
@@ -36,8 +37,6 @@ from covocp.statement.names import control_limits
 UNLIMITED = 1e300
 # Runs in a batch: wide enough that numpy's operations outweigh their calls, and tasks enough for some workers.
 LARGEST_BATCH, LARGEST_TASK = 2048, 512
-# How the message of a solution begins that `evaluate` made for a truth.
-UNDER_TRUTH = "evaluated under other statistics"
 
 
 @one_at_a_time
@@ -145,7 +144,7 @@ def _design(solution: Solution) -> System:
             received=type(solution).__name__,
             remedy="solve or evaluate the problem first: simulate(solve(problem), runs, seed)",
         )
-    if solution.message.startswith(UNDER_TRUTH):
+    if solution.origin is Origin.OTHER_TRUTH:
         raise ProblemError(
             "This solution was evaluated under other statistics, which simulate() does not see in it.",
             expected="the solution of the design",

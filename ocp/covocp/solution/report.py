@@ -11,6 +11,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.extremal.path_limits import NOTED
+from covocp.solution.origin import Classical
 from covocp.statement.statement import Block, entry_names
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def _costs(solution: Solution) -> Section:
         parts += _left_out(solution)
     if solution.optimised:
         parts += _gained(solution)
-    missing = solution.stats.get("classical_missing")
+    missing = Classical.beside(solution.stats).missing
     if missing:
         parts.append(Sentence(f"There is no classical design to compare with: {missing}", ""))
     return parts
@@ -168,13 +169,13 @@ def _left_out(solution: Solution) -> Section:
 
 def _gained(solution: Solution) -> Section:
     """What the combined design gains over the classical one, and whether the mesh can tell."""
-    classical = solution.stats.get("classical_cost")
-    if not classical:
+    classical = Classical.beside(solution.stats)
+    if not classical.cost:
         return []
-    text = f"classical design: {number(classical)}"
-    if solution.stats.get("classical_same"):
+    text = f"classical design: {number(classical.cost)}"
+    if classical.same:
         return [Sentence(f"{text}, the same to roundoff")]
-    gain = 1.0 - solution.cost / classical
+    gain = 1.0 - solution.cost / classical.cost
     text += f", of which {100 * gain:.3g} % are gained"
     if NO_GAIN < abs(gain) < solution.mesh_error:
         text += f": less than the error of the mesh, {100 * solution.mesh_error:.2g} %; more intervals can tell"

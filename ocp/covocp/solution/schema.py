@@ -17,6 +17,7 @@ from covocp.base.errors import CovocpError
 from covocp.extremal.mean_effect import MEAN_EFFECT, noted
 from covocp.extremal.optimality import Optimality
 from covocp.solution.fingerprint import Fingerprint, fingerprint
+from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.transcription.trajectory import Multipliers
 
@@ -174,6 +175,8 @@ def _check_stats(stats: Mapping[str, Any]) -> None:
     if not (isinstance(starts, np.ndarray) and starts.ndim == 1 and starts.dtype.kind in "fiu"):
         listed = isinstance(starts, (tuple, list)) and all(_of_type(float, cost) for cost in starts)
         wrong += [] if listed else ["stats.starts"]
+    if stats.get("origin", Origin.OPTIMISED) not in list(Origin):
+        wrong.append("stats.origin")
     if wrong:
         raise DamagedFileError("entries of the wrong type: " + ", ".join(wrong))
 

@@ -32,6 +32,7 @@ from covocp.extremal.nodes import filter_gain, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
 from covocp.solution.fingerprint import Fingerprint
+from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names
@@ -144,7 +145,12 @@ class Solution:
     @property
     def optimised(self) -> bool:
         """Whether the nominal was chosen for this cost, not given nor taken from the deterministic one."""
-        return self.method != "evaluate" and self.stats.get("nominal") != "deterministic"
+        return self.origin is Origin.OPTIMISED
+
+    @property
+    def origin(self) -> Origin:
+        """How it came about: optimised, classical, given, or under another truth."""
+        return origin_of(self.method, self.stats)
 
     @property
     def status(self) -> str:

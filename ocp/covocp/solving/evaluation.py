@@ -24,6 +24,7 @@ from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.path_limits import NOTED
 from covocp.problem.builder import Problem
 from covocp.solution.doubts import mention_doubts
+from covocp.solution.origin import METHOD, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
@@ -33,7 +34,6 @@ from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import check_costs
 
-METHOD = "evaluate"
 # Relative difference of rates or slopes above which the truth is another system.
 SAME = 1e-9
 
@@ -214,6 +214,7 @@ def _under(solution: Solution, truth: Given) -> Solution:
         solution,
         method=METHOD,
         message="evaluated under other statistics than the design's",
+        stats={**solution.stats, "origin": Origin.OTHER_TRUTH.value},
         cost_terms=dict(loop.cost),
         loop=loop,
         stored_optimality=None,

@@ -35,6 +35,7 @@ from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
 from covocp.solving.random_starts import random_guesses
@@ -221,7 +222,7 @@ class Solver:
             converged=outcome.converged and closed.converged,
             message=f"{outcome.message}: nominal of the deterministic cost, filter and feedback around it",
             violations=outcome.violations,
-            stats={**outcome.stats, "nominal": "deterministic"},
+            stats={**outcome.stats, "origin": Origin.CLASSICAL.value},
         )
 
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
@@ -239,21 +240,21 @@ class Solver:
             message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
             raise Interrupted(message, solution=solution) from None
         except CovocpError as error:  # no deterministic cost: there is nothing to compare with
-            return _noted(solution, classical_missing=str(error).partition("\n")[0])
+            return _noted(solution, **Classical(missing=str(error).partition("\n")[0]).counts)
         if classical is None:
-            return _noted(solution, classical_missing="The problem without noise was not solved.")
+            return _noted(solution, **Classical(missing="The problem without noise was not solved.").counts)
         if _is_worse(solution, classical):  # stationary up to a tolerance only, or spurious: going on from there tells
             solution = self._continued(solution, given)
         excess, worse = solution.cost - classical, _is_worse(solution, classical)
         suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
         if suspicious and is_roundoff(excess, self.statement, self._options, given):
-            return _noted(solution, classical_cost=classical, classical_same=True)
+            return _noted(solution, **Classical(cost=classical, same=True).counts)
         if worse:
             warn_user(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
                 f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
             )
-        return _noted(solution, classical_cost=classical)
+        return _noted(solution, **Classical(cost=classical).counts)
 
     def _continued(self, solution: Solution, values: Array) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
