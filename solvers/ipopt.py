@@ -17,8 +17,8 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
+from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
-from covocp.extremal.hamiltonian import without_passage
 from covocp.solvers.plugins import merged, silent
 from covocp.solvers.reached import (
     FirstOrder,
@@ -33,10 +33,12 @@ from covocp.solvers.reached import (
 )
 from covocp.statement.statement import Statement
 from covocp.transcription.domain import needs_exact_bounds
-from covocp.transcription.first_guess import choose_scales, resolve_mesh, starts
+from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import NLP, Scales, check_finite
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 
 TOLERANCE = 1e-7

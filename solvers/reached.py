@@ -11,8 +11,8 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
 from covocp.base.short_repr import short_repr
-from covocp.transcription.first_guess import choose_scales, magnitudes
 from covocp.transcription.nlp import NLP, Scales
+from covocp.transcription.scales import choose_scales, magnitudes
 from covocp.transcription.trajectory import Trajectory
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.

@@ -37,7 +37,8 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
-from covocp.extremal.hamiltonian import backward_interval, forward_costates, hamiltonian
+from covocp.extremal.costates import backward_interval, forward_costates
+from covocp.extremal.hamiltonian import hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement

@@ -29,8 +29,8 @@ from covocp.solvers.gradient.influence import (
 )
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
-from covocp.transcription.first_guess import choose_scales
 from covocp.transcription.nlp import Scales
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import Multipliers, Trajectory
 

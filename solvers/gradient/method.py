@@ -46,9 +46,10 @@ from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings, Variant
 from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import controls_guess, resolve_mesh, stiffness
+from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import check_costs
+from covocp.transcription.stiffness import resolve_mesh, stiffness
 from covocp.transcription.trajectory import Trajectory
 
 LARGEST_PAIRS = 64

@@ -15,7 +15,7 @@ from problems import graded, order, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
-from covocp.extremal.hamiltonian import discrete_costates, integrated_costates
+from covocp.extremal.costates import discrete_costates, integrated_costates
 from covocp.models import unknown_lag
 
 UNIFORM = np.linspace(0.0, 1.0, NODES.size)  # as the reference: the default would be graded

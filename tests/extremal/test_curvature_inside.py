@@ -11,10 +11,10 @@ import pytest
 from scipy.linalg import eigh, null_space
 
 import covocp as co
+from covocp.extremal.costates import discrete_costates
 from covocp.extremal.curvature import held_jacobian, mass_matrix, smallest_curvature
-from covocp.extremal.hamiltonian import discrete_costates
 from covocp.extremal.optimality import complementarity
-from covocp.transcription.first_guess import choose_scales
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.transcribing import transcribe
 
 SMALLEST = 1e-5  # multiplier, in the units of the NLP, from which on a limit is active

@@ -9,7 +9,7 @@ from certificates import is_symmetric, lag_hamiltonian, lag_rates, second_singul
 from problems import LAG_EIGENVALUE, lag, solve
 
 import covocp as co
-from covocp.extremal.hamiltonian import integrated_costates
+from covocp.extremal.costates import integrated_costates
 from covocp.models import (
     chord_test,
     free_time_integrator,

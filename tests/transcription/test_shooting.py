@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.models import damped_oscillator, mass_chain, noisy_integrator
-from covocp.transcription.first_guess import resolve_mesh
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import Scales
+from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 
 FORMULATIONS = ("eliminated", "states")

@@ -21,9 +21,10 @@ from covocp.base.krylov import krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.active_constraints import held_by
+from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
-from covocp.extremal.hamiltonian import Costates, discrete_costates
+from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, second_order
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh

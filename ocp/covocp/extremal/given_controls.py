@@ -10,9 +10,10 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import resolve_mesh, starts
+from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.shooting import single_shooting
+from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions absolute.

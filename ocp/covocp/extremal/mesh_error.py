@@ -7,12 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
-from covocp.extremal.hamiltonian import discrete_costates
 from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import magnitudes
 from covocp.transcription.halved_steps import Refined, refined_end, refined_run
 from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Trajectory
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.

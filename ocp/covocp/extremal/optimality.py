@@ -13,23 +13,16 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
+from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
-from covocp.extremal.hamiltonian import (
-    Costates,
-    along,
-    discrete_costates,
-    duration_slope,
-    hamiltonian,
-    integrated_costates,
-    passage_end,
-)
+from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
-from covocp.transcription.first_guess import state_jacobian
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.stiffness import state_jacobian
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5

@@ -10,26 +10,18 @@ import numpy as np
 
 from covocp.base.arguments import checked, text
 from covocp.base.checks import (
-    as_expression,
     as_number,
     bound_columns,
     caller,
     check_bounds,
-    check_constrains,
     check_inside,
     check_kind,
-    check_limits,
-    check_name,
     check_positive,
-    check_size,
     check_symmetric,
     column,
-    column_expression,
     density_matrix,
-    find_name,
     is_scalar,
     is_symbolic,
-    scale_column,
 )
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -37,6 +29,16 @@ from covocp.base.matrices import pack_symbolic
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
+from covocp.problem.checks import (
+    as_expression,
+    check_constrains,
+    check_limits,
+    check_name,
+    check_size,
+    column_expression,
+    find_name,
+    scale_column,
+)
 from covocp.problem.declarations import (
     Constraint,
     Control,

@@ -7,10 +7,11 @@ from typing import Any
 
 import casadi as ca
 
-from covocp.base.checks import caller, check_name, is_symbolic
+from covocp.base.checks import caller, is_symbolic
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
+from covocp.problem.checks import check_name
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
 
 Entry = State | Unknown

@@ -8,9 +8,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import check_dynamics, density_matrix
+from covocp.base.checks import density_matrix
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Declarations, Expansion, Expected
 
 

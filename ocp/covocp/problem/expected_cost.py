@@ -31,11 +31,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import as_expression, as_number, caller, density_matrix, find_name
+from covocp.base.checks import as_number, caller, density_matrix
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
+from covocp.problem.checks import as_expression, find_name
 from covocp.problem.declarations import (
     Backward,
     Control,

@@ -11,12 +11,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import check_dynamics
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.base.short_repr import short_repr
+from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.estimation_covariance import augmented_names
 from covocp.problem.measurement_information import check_readings, inverse_density

@@ -23,9 +23,10 @@ from covocp.base.matrices import (
 from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
+from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import Dense, dense_output
 from covocp.extremal.extremal import Extremal, Outcome
-from covocp.extremal.hamiltonian import Costates, discrete_costates
+from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gain, rates_along

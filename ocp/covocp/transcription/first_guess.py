@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, half_indices, pack, real_numbers, unpack
-from covocp.statement.interval import model_symbols
+from covocp.base.matrices import Array, pack, real_numbers, unpack
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
-from covocp.transcription.nlp import Scales
+from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, nominal_interval
-from covocp.transcription.trajectory import Trajectory
 
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.
 BENDING = 1.0
-RESPONSE_STEP = 1e-3
-# Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
-DAMPED = -0.5
 
 
 def controls_guess(statement: Statement, nodes: Array, control: str, sign: float = 1.0) -> Array:
@@ -258,133 +250,3 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p)
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])
-
-
-def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
-    """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
-    stiff = stiffness(statement, options, parameters)
-    return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
-
-
-def stiffness(statement: Statement, options: Options, parameters: Array) -> Stiffness:
-    """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
-
-    A graded mesh knows that of the filter on each of its intervals.
-    """
-    nodes, control = options.nodes(), options.control
-    u = controls_guess(statement, nodes[:2], control)[0]
-    mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
-    x, e = starts(statement, mesh, parameters)
-    duration = statement.duration.guess
-    rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
-    longest = duration * float(np.diff(nodes).max())
-    matrices = 0.0
-    for block, form in zip(statement.matrices, statement.riccati, strict=True):
-        if form is None:
-            slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
-            matrices = max(matrices, _largest(_eigenvalues(slope)))
-            break
-        if block.estimation and isinstance(options.grid, Graded):
-            matrices = max(matrices, options.grid.stiffness / longest)
-            continue
-        drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
-        with np.errstate(invalid="ignore"):  # a density that is zero: refused by its name later
-            filtered = drift - unpack(e[block.span], block.size) @ information
-        matrices = max(matrices, 2 * _largest(_eigenvalues(filtered)))
-    return Stiffness(
-        nominal=longest * _largest(rates),
-        oscillating=longest * _largest(rates[rates.real >= DAMPED * np.abs(rates)]),
-        decaying=longest * _largest(rates[rates.real <= 0.0]),
-        matrices=longest * matrices,
-    )
-
-
-def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
-    """Eigenvalues; none of a matrix that is not finite."""
-    return np.linalg.eigvals(matrix).astype(complex) if np.isfinite(matrix).all() else np.zeros(0, complex)
-
-
-def _largest(values: NDArray[np.complex128]) -> float:
-    return float(np.abs(values).max(initial=0.0))
-
-
-@lru_cache(maxsize=KEPT)
-def state_jacobian(statement: Statement) -> ca.Function:
-    """f_x as a function of the six arguments."""
-    symbols = model_symbols(statement)
-    if statement.nominal is None:
-        rate = statement.rates(*symbols)[0]
-    else:
-        rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
-    return ca.Function("jacobian", symbols, [ca.jacobian(rate, symbols[0])])
-
-
-def _matrix_jacobian(statement: Statement) -> ca.Function:
-    """V_e as a function of the six arguments."""
-    symbols = model_symbols(statement)
-    return ca.Function("jacobian", symbols, [ca.jacobian(statement.rates(*symbols)[1], symbols[2])])
-
-
-def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:
-    """Magnitudes from the given scales, bounds, boundary values, standard deviations and the trajectory itself."""
-    x0, xf, e0, _ = statement.boundary_values(parameters)
-    lower, upper = statement.state_bounds
-    candidates = [np.abs(guess.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
-    for block in statement.matrices:
-        if block.estimation:
-            diagonal = np.diagonal(unpack(np.nan_to_num(e0[block.span]), block.size))
-            known = min(statement.nx, block.size)  # constants to be chosen are states that nothing estimates
-            deviations = np.zeros(statement.nx)
-            deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
-            candidates.append(deviations)
-    span = upper - lower
-    x = np.max(candidates, axis=0)
-    bounded = np.isfinite(span) & (span > 0)
-    x = np.where(bounded, np.clip(x, 1e-3 * span, np.where(x > 0, span, np.inf)), x)
-    x = np.where(x > 0, x, np.where(bounded, span, 1.0))
-    for block in statement.states:
-        if block.name in statement.scales:
-            x[block.span] = statement.scales[block.name]
-    u = np.ones(statement.nu)
-    for block in statement.controls:
-        u[block.span] = control_scale(statement, block, guess.u[:, block.span])
-    return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
-
-
-def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
-    """The magnitudes along a guess; controls without bounds on both sides by what they move as well."""
-    scales = magnitudes(statement, guess, parameters)
-    u, response = scales.u.copy(), None
-    for block in statement.controls:
-        bounds = np.concatenate([bound[block.span] for bound in statement.control_bounds])
-        if block.name not in statement.scales and not np.isfinite(bounds).all() and not statement.coupled:
-            if response is None:
-                response = _needed_controls(statement, mesh, guess, scales.x, parameters)
-            magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
-            u[block.span] = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
-    return replace(scales, u=u)
-
-
-def _needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
-    """Constant changes of each control that move some state by its scale, to first order; 0 where none does."""
-    needed = np.zeros(statement.nu)
-    base = simulate_states(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
-    for i in range(statement.nu):
-        changed = guess.u.copy()
-        step = RESPONSE_STEP * max(1.0, float(np.abs(guess.u[:, i]).max(initial=0.0)))
-        changed[:, i] += step
-        moved = simulate_states(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
-        response = float((np.abs(moved - base).max(axis=0, initial=0.0) / scale).max(initial=0.0)) / step
-        needed[i] = 1.0 / response if np.isfinite(response) and response > 0 else 0.0
-    return needed
-
-
-def _matrix_scales(statement: Statement, e: Array) -> Array:
-    """sqrt(E_ii E_jj) from the largest diagonal entries along the guess; 1 where these are zero."""
-    scales = np.ones(statement.ne)
-    for block in statement.matrices:
-        rows, columns = half_indices(block.size)
-        diagonal = np.abs(e[:, block.span][:, rows == columns]).max(axis=0, initial=0.0)
-        diagonal = np.where(diagonal > 0, diagonal, 1.0)
-        scales[block.span] = np.sqrt(diagonal[rows]) * np.sqrt(diagonal[columns])
-    return scales

@@ -21,9 +21,10 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import controls_guess, starts, stiffness
+from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
 from covocp.transcription.starts import own_start
+from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory
 
 # Change of ln E in a part of an interval: ratio 1.5 of neighbouring parts. Ratio 2 leaves errors of the expected cost

@@ -28,11 +28,11 @@ from covocp.transcription.first_guess import (
     simulate_matrices,
     simulate_states,
     starts,
-    stiffness,
 )
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, explicit_substeps
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
 from covocp.transcription.steps import KEPT
+from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory
 
 # A bend is halved until its second half moves the states as its first half does, up to this share, or until it moves

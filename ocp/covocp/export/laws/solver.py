@@ -25,9 +25,9 @@ from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.solver import Solver
-from covocp.transcription.first_guess import choose_scales
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import NLP
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.transcribing import transcribe
 

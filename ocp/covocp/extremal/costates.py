@@ -1,0 +1,395 @@
+"""Costates in two independent ways.
+
+By the adjoint of the discrete steps, with the multipliers of the NLP as terminal values (`discrete_costates`), and by
+integrating the continuous adjoint equations p' = -H_x, P' = -H_E backward (`integrated_costates`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.base.matrices import Array
+from covocp.base.quadrature import classical_step, hermite
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
+from covocp.extremal.hamiltonian import Costates, state_slope
+from covocp.statement.interval import Interval, model_symbols
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.nlp import terminal_slopes
+from covocp.transcription.shooting import interval_columns, matrices_along
+from covocp.transcription.steps import KEPT, Step, full_interval, nominal_interval
+
+
+def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
+    """p(T) = k_x + l and the costate of the half-vectors at T, with all multipliers that act there."""
+    multipliers = extremal.multipliers
+    slopes = terminal_slopes(
+        extremal.statement,
+        extremal.trajectory,
+        extremal.parameters,
+        multipliers.end,
+        multipliers.path[-1],
+        extremal.mesh,
+    )
+    return slopes[0] + multipliers.final, slopes[1] + multipliers.final_matrices
+
+
+def impulses(extremal: Extremal) -> Array:
+    """Jumps of the costates at the nodes, (N + 1, nx + ne): multipliers of path constraints and bounds that act there.
+
+    The row of the last node is zero: what acts there is part of the terminal costates.
+    """
+    statement, multipliers = extremal.statement, extremal.multipliers
+    jumps = np.hstack([multipliers.states, multipliers.matrices])
+    if statement.path.size:
+        symbolic: Any = statement.symbolic
+        symbols = model_symbols(statement)
+        weights = symbolic.sym("mu", statement.path.size)
+        value = ca.dot(weights, statement.path.function(*symbols))
+        slope = (
+            ca.gradient(value, ca.vertcat(symbols[0], symbols[2]))
+            if statement.symbolic is ca.SX
+            else ca.vertcat(ca.gradient(value, symbols[0]), ca.gradient(value, symbols[2]))
+        )
+        function = ca.Function("jumps", [*symbols, weights], [ca.densify(slope)])
+        count = extremal.mesh.intervals + 1
+        jumps = jumps + np.asarray(function.map(count)(*extremal.columns(), multipliers.path.T).full()).T
+    jumps[-1] = 0.0
+    return np.asarray(jumps)
+
+
+def _stack(extremal: Extremal) -> Any:
+    return ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
+
+
+@lru_cache(maxsize=KEPT)
+def adjoint_interval(statement: Statement, substeps: int, step: Step, *, nominal: bool = False) -> ca.Function:
+    """Adjoint of one discrete control interval; with `nominal` of the nominal alone, without cost.
+
+    Returns:
+        (costates at the end, which of them to keep (1 or 0), values in place of the others, impulse at the start,
+        x and e stacked, *common) -> costates at the start, slopes of the Lagrangian by the control at the start, by
+        that at the end, by T.
+    """
+    interval = nominal_interval(statement, substeps, step) if nominal else full_interval(statement, substeps, step)
+    symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
+    size = interval.size1_in(0)
+    after, keep, known, impulse, z = (symbolic.sym(name, size) for name in ("after", "keep", "known", "impulse", "z"))
+    common = Interval.symbols(statement, symbolic)
+    end, _, cost = interval(z, *common)
+    value = ca.dot(keep * after + known, end) + (0 if nominal else cost)
+    by = (z, common.start, common.end, *([common.duration] if statement.duration.free else []))
+    slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
+    return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
+
+
+def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """Costates of the discretised problem, by the adjoint sweep from the multipliers at the end.
+
+    Where the problem was shot in segments, each is swept from the multipliers of the continuity at its end: a nominal
+    that is unstable would amplify the error of those at the end of all.
+
+    Returns:
+        Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
+        multipliers of control bounds; its slope by T through the intervals.
+    """
+    st, points = extremal.statement, extremal.mesh.points
+    if points > 1:  # limits act between the nodes: swept on the mesh that has them as nodes
+        fine, slopes, by_duration = discrete_costates(refined(extremal))
+        at_nodes = Costates(state=fine.state[::points], matrices=fine.matrices[::points])
+        return at_nodes, prolongation(extremal.mesh).T @ slopes, by_duration
+    if st.behind:
+        return _costates_both_ways(extremal)
+    last = np.concatenate(terminal_costates(extremal))
+    interval = adjoint_interval(st, extremal.mesh.substeps, extremal.mesh.step)
+    costates, slopes, by_duration = _swept(extremal, interval, last, impulses(extremal), _stack(extremal))
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
+
+
+def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Expr) -> tuple[Array, Array, float]:
+    """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
+    st, mesh = extremal.statement, extremal.mesh
+    n, size = mesh.intervals, last.size
+    sweep = interval.mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    keep, known = (values[:size] for values in _restarts(extremal))
+    stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
+    outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
+    values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
+    slopes = np.zeros((mesh.control_nodes, st.nu))
+    slopes[:n] += by_start.T
+    slopes[int(mesh.control == "linear") :][:n] += by_end.T
+    return np.vstack([values.T, last]), slopes, float(by_duration.sum())
+
+
+def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """The same where some matrix runs backward: its costate runs forward, from zero.
+
+    The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
+    both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.
+    """
+    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    nx = st.nx
+    jumps = impulses(extremal)
+    last_x, last_e = terminal_costates(extremal)
+    behind = st.entries(st.behind)
+    direct = last_e[behind] - extremal.multipliers.final_matrices[behind]
+    weights = jumps[:, nx:].copy()
+    weights[-1] = last_e
+    weights[-1, behind] = direct
+    outputs = passage_slopes(st, mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    by_x, by_u, by_duration, kicks = (np.asarray(v.full()).T for v in outputs)
+    kicks[-1, behind] -= direct
+    kicks[:, behind] *= -1.0
+    last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
+    interval = adjoint_interval(st, mesh.substeps, mesh.step, nominal=True)
+    costates, slopes, total = _swept(extremal, interval, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T))
+    return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
+
+
+def without_passage(extremal: Extremal) -> Extremal:
+    """The extremal whose multipliers `final` are l of p(T) = k_x + l + (slope through the matrices that start at T).
+
+    A transcription that eliminates these matrices sees l and the slope as one.
+    """
+    st, m = extremal.statement, extremal.multipliers
+    if st.matrix_end is None or not st.matrix_end.jac_sparsity(0, 0).nnz():
+        return extremal
+    fine = refined(extremal)
+    t = fine.trajectory
+    weights = impulses(fine)[:, st.nx :]
+    weights[-1] = terminal_costates(fine)[1]
+    behind = st.entries(st.behind)
+    weights[-1, behind] -= m.final_matrices[behind]
+    outputs = passage_slopes(st, fine.mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    through = np.asarray(outputs[0].full())[:, -1]
+    return replace(extremal, multipliers=replace(m, final=m.final - through))
+
+
+def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float]:
+    """Slopes by x(T) and by T through the matrices that start at T, nu' S(T), nu = k_S - P_S.
+
+    Args:
+        extremal: the solution.
+        given: costates P_S of these matrices at T.
+    """
+    st, t = extremal.statement, extremal.trajectory
+    if st.matrix_end is None:
+        return np.zeros(st.nx), 0.0
+    behind = st.entries(st.behind)
+    nu = terminal_costates(extremal)[1][behind] - extremal.multipliers.final_matrices[behind] - given
+    x, duration = ca.MX.sym("x", st.nx), ca.MX.sym("T")
+    value = ca.dot(ca.DM(nu), st.matrix_end(x, duration, extremal.parameters))
+    function = ca.Function("passage_end", [x, duration], [ca.gradient(value, x), ca.gradient(value, duration)])
+    by_x, by_duration = function(t.x[-1], t.duration)
+    return np.asarray(by_x.full()).ravel(), float(by_duration)
+
+
+@lru_cache(maxsize=KEPT)
+def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
+    """Slopes of cost and weighted half-vectors along given nodes of the nominal.
+
+    Returns:
+        (states at the nodes, controls, T, parameters, half-vectors at the start, weights of the half-vectors at the
+        nodes) -> slopes of int L dt + weights . half-vectors by the states at the nodes, the controls, T, and by kicks
+        at the nodes.
+    """
+    n = mesh.intervals
+    x, u = ca.MX.sym("x", statement.nx, n + 1), ca.MX.sym("u", statement.nu, mesh.control_nodes)
+    duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
+    e0, kicks = ca.MX.sym("e0", statement.ne), ca.MX.sym("kicks", statement.ne, n + 1)
+    weights = ca.MX.sym("weights", statement.ne, n + 1)
+    common = interval_columns(mesh, u, duration, p)
+    _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
+    value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
+    slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
+    inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
+    values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
+    return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
+
+
+def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
+    """Classical Runge-Kutta step of the adjoint equations p' = -H_x, P' = -H_E backward over a pair of substeps.
+
+    The costates of matrices that run backward are not integrated here, they run forward: they are given.
+
+    Args:
+        statement: the problem.
+        cost: False for an influence function, R' = -f_x' R: the adjoint of the rates alone.
+        matrices: False where the costates of the half-vectors are zero.
+
+    Returns:
+        (costates at the end, stacked x and e at start, middle and end, given costates there, *common of the pair) ->
+        costates at the start.
+    """
+    symbolic: Any = statement.symbolic
+    nx, size, behind = statement.nx, statement.nx + statement.ne, _behind(statement)
+    after = symbolic.sym("after", size)
+    points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
+    given = [symbolic.sym(name, len(behind)) for name in ("k0", "km", "k1")]
+    pair = Interval.symbols(statement)
+    slope = state_slope(statement, cost=cost, matrices=matrices)
+
+    def rate(costate: Expr, c: float) -> Expr:
+        z, full = points[round(2 * (1 - c))], _with(costate, behind, given[round(2 * (1 - c))])
+        return slope(*pair.at(1 - c, z[:nx], z[nx:]), full[:nx], full[nx:])
+
+    before = _with(classical_step(rate, after, pair.h), behind, given[0])
+    return ca.Function("backward", [after, *points, *given, *pair], [before])
+
+
+def _behind(statement: Statement) -> list[int]:
+    """Entries of z = (x, e) that run backward."""
+    return [statement.nx + k for k in statement.entries(statement.behind)]
+
+
+def _with(column: Expr, entries: list[int], values: Expr) -> Any:
+    """A column with some entries replaced."""
+    if not entries:
+        return column
+    result = type(column)(column)
+    result[entries] = values
+    return result
+
+
+@lru_cache(maxsize=KEPT)
+def forward_costates(statement: Statement, pairs: int) -> ca.Function:
+    """Costates of the matrices that run backward, forward over the pairs of substeps of one control interval.
+
+    P' = -H_S does not depend on the other costates. Between the ends of a pair they are cubic.
+
+    Returns:
+        (their costates at the start, x and e stacked at the starts, middles and ends of the pairs (size, 2 pairs + 1),
+        *common) -> at the end, at the starts, middles and ends of the pairs.
+    """
+    nx, behind = statement.nx, _behind(statement)
+    start, z = ca.MX.sym("start", len(behind)), ca.MX.sym("z", nx + statement.ne, 2 * pairs + 1)
+    interval = Interval.symbols(statement, ca.MX)
+    slope = state_slope(statement)
+    value, points = start, [start]
+
+    def rate(pair: int, costate: Expr, c: float) -> Expr:
+        full, point = _with(ca.MX.zeros(nx + statement.ne), behind, costate), round(2 * (pair + c))
+        place = interval.at(point / (2 * pairs), z[:nx, point], z[nx:, point])
+        return -slope(*place, full[:nx], full[nx:])[behind]
+
+    h, slope_there = interval.h / pairs, rate(0, start, 0.0)
+    for j in range(pairs):
+        after = classical_step(partial(rate, j), value, h, slope_there)
+        before, slope_there = slope_there, rate(j, after, 1.0)
+        points += [hermite(value, after, h * before, h * slope_there, 0.5), after]
+        value = after
+    return ca.Function("forward_costates", [start, z, *interval], [value, ca.horzcat(*points)])
+
+
+def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, matrices: bool = True) -> ca.Function:
+    """Costates and influence functions backward over the pairs of substeps of one control interval.
+
+    Args:
+        statement: the problem.
+        pairs: Runge-Kutta steps.
+        influences: number of influence functions, columns beside the costates.
+        matrices: whether the influence functions have costates of the half-vectors that are not zero.
+
+    Returns:
+        (columns at the end (size, 1 + influences), impulse at the start, x and e stacked at the starts, middles and
+        ends of the pairs (size, 2 pairs + 1), the costates there of the matrices that run backward, *common) -> columns
+        at the start with the impulse on the first, columns at the starts of the pairs without it
+        (size, pairs (1 + influences)).
+    """
+    size, count = statement.nx + statement.ne, len(_behind(statement))
+    after, impulse = ca.MX.sym("after", size, 1 + influences), ca.MX.sym("impulse", size)
+    z, given = ca.MX.sym("z", size, 2 * pairs + 1), ca.MX.sym("given", count, 2 * pairs + 1)
+    zero = ca.DM.zeros(count, 2 * pairs + 1)
+    interval = Interval.symbols(statement, ca.MX)
+    steps = [backward_pair(statement), backward_pair(statement, cost=False, matrices=matrices)]
+    columns, passed = ca.horzsplit(after), []
+    for j in range(pairs - 1, -1, -1):
+        part = interval.part(j / pairs, (j + 1) / pairs)
+        at = [2 * j, 2 * j + 1, 2 * j + 2]
+        columns = [
+            steps[min(k, 1)](column, *(v[:, i] for v in (z, zero if k else given) for i in at), *part)
+            for k, column in enumerate(columns)
+        ]
+        passed.append(ca.horzcat(*columns))
+    start = ca.horzcat(columns[0] + impulse, *columns[1:])
+    return ca.Function("backward_interval", [after, impulse, z, given, *interval], [start, ca.horzcat(*passed[::-1])])
+
+
+def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
+    """Costates by integrating the adjoint equations backward, independently of the discrete steps.
+
+    Args:
+        extremal: trajectory and terminal multipliers.
+        pairs: Runge-Kutta steps of the adjoint per control interval.
+
+    Returns:
+        Costates at the nodes.
+    """
+    st, n, parts = extremal.statement, extremal.mesh.intervals, extremal.mesh.points
+    if parts > 1:
+        fine = integrated_costates(refined(extremal), max(1, -(-pairs // parts)))
+        return Costates(state=fine.state[::parts], matrices=fine.matrices[::parts])
+    size = st.nx + st.ne
+    values = fine_trajectory(extremal, 2 * pairs)
+    interval = backward_interval(st, pairs)
+    after, *rest = interval.mx_in()
+    keep, known = ca.MX.sym("keep", size), ca.MX.sym("known", size)
+    start, _ = interval(keep * after + known, *rest)
+    sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
+    backward = list(range(n - 1, -1, -1))
+    given, last_given = given_costates(st, values, extremal.intervals, pairs)
+    points = values[backward].transpose(2, 0, 1).reshape(size, -1)
+    stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
+    last = np.concatenate(terminal_costates(extremal))
+    last[_behind(st)] = last_given
+    last[: st.nx] += passage_end(extremal, last_given)[0]
+    reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
+    result = sweep(last, *stacked, points, reversed_given, *extremal.intervals.columns(backward))
+    costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
+    return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
+
+
+def given_costates(statement: Statement, values: Array, common: Interval, pairs: int) -> tuple[Array, Array]:
+    """Costates of the matrices that run backward along a trajectory; none where none does.
+
+    Args:
+        statement: the problem.
+        values: x and e at the starts, middles and ends of the pairs of all intervals, (N, 2 pairs + 1, size).
+        common: the intervals, a column for each.
+        pairs: Runge-Kutta steps an interval.
+
+    Returns:
+        At the same points (N, 2 pairs + 1, rows), and at the end (rows,).
+    """
+    n, points, size = values.shape
+    rows = len(_behind(statement))
+    if not rows:
+        return np.zeros((n, points, 0)), np.zeros(0)
+    sweep = forward_costates(statement, pairs).mapaccum("forward", n)
+    ends, inside = sweep(np.zeros(rows), values.transpose(2, 0, 1).reshape(size, -1), *common)
+    at_points = np.asarray(inside.full()).reshape(rows, n, points).transpose(1, 2, 0)
+    return at_points, np.asarray(ends.full())[:, -1]
+
+
+def _restarts(extremal: Extremal) -> tuple[Array, Array]:
+    """Which costates to keep at the ends of the intervals (1 or 0) and the values in place of the others, (size, N).
+
+    Inside, where a shooting segment ends, the multipliers of its continuity are the costates.
+    """
+    mesh, gaps = extremal.mesh, extremal.multipliers.gaps
+    size = extremal.statement.nx + extremal.statement.ne
+    keep, known = np.ones((size, mesh.intervals)), np.zeros((size, mesh.intervals))
+    if gaps.shape[0] == len(mesh.segments):
+        inner = np.array(mesh.starts[1:-1], dtype=np.intp) - 1
+        keep[: gaps.shape[1], inner] = 0.0
+        known[: gaps.shape[1], inner] = gaps[:-1].T
+    return keep, known

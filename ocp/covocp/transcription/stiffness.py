@@ -1,0 +1,84 @@
+"""How stiff a problem is at its start, and the mesh whose steps follow from it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.matrices import Array, unpack
+from covocp.statement.interval import model_symbols
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import controls_guess, starts
+from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
+from covocp.transcription.steps import KEPT
+
+# Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
+DAMPED = -0.5
+
+
+def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
+    """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
+    stiff = stiffness(statement, options, parameters)
+    return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
+
+
+def stiffness(statement: Statement, options: Options, parameters: Array) -> Stiffness:
+    """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
+
+    A graded mesh knows that of the filter on each of its intervals.
+    """
+    nodes, control = options.nodes(), options.control
+    u = controls_guess(statement, nodes[:2], control)[0]
+    mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
+    x, e = starts(statement, mesh, parameters)
+    duration = statement.duration.guess
+    rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
+    longest = duration * float(np.diff(nodes).max())
+    matrices = 0.0
+    for block, form in zip(statement.matrices, statement.riccati, strict=True):
+        if form is None:
+            slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
+            matrices = max(matrices, _largest(_eigenvalues(slope)))
+            break
+        if block.estimation and isinstance(options.grid, Graded):
+            matrices = max(matrices, options.grid.stiffness / longest)
+            continue
+        drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
+        with np.errstate(invalid="ignore"):  # a density that is zero: refused by its name later
+            filtered = drift - unpack(e[block.span], block.size) @ information
+        matrices = max(matrices, 2 * _largest(_eigenvalues(filtered)))
+    return Stiffness(
+        nominal=longest * _largest(rates),
+        oscillating=longest * _largest(rates[rates.real >= DAMPED * np.abs(rates)]),
+        decaying=longest * _largest(rates[rates.real <= 0.0]),
+        matrices=longest * matrices,
+    )
+
+
+def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
+    """Eigenvalues; none of a matrix that is not finite."""
+    return np.linalg.eigvals(matrix).astype(complex) if np.isfinite(matrix).all() else np.zeros(0, complex)
+
+
+def _largest(values: NDArray[np.complex128]) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+@lru_cache(maxsize=KEPT)
+def state_jacobian(statement: Statement) -> ca.Function:
+    """f_x as a function of the six arguments."""
+    symbols = model_symbols(statement)
+    if statement.nominal is None:
+        rate = statement.rates(*symbols)[0]
+    else:
+        rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
+    return ca.Function("jacobian", symbols, [ca.jacobian(rate, symbols[0])])
+
+
+def _matrix_jacobian(statement: Statement) -> ca.Function:
+    """V_e as a function of the six arguments."""
+    symbols = model_symbols(statement)
+    return ca.Function("jacobian", symbols, [ca.jacobian(statement.rates(*symbols)[1], symbols[2])])
