@@ -489,16 +489,16 @@ class Solution:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.figure.plot_solutions`."""
-        _later("plot").check_plot_options(options)
-        return _later("plot").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
+        _later("plot.figure").check_plot_options(options)
+        return _later("plot.figure").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
 
     def save(self, path: str | Path) -> Path:
         """Write the solution to a .npz or .json file; see `covocp.solution.storage.save`."""
-        return _later("storage").save(self, path)  # type: ignore[no-any-return]
+        return _later("solution.storage").save(self, path)  # type: ignore[no-any-return]
 
     def to_xarray(self) -> Any:
         """The solution as an xarray.Dataset; see `covocp.solution.storage.to_xarray`."""
-        return _later("storage").to_xarray(self)
+        return _later("solution.storage").to_xarray(self)
 
     def __repr__(self) -> str:
         """One line: what a console shows of a solution that nobody prints is no page of numbers."""
@@ -506,7 +506,7 @@ class Solution:
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(_later("report").summary(self))
+        return str(_later("solution.report").summary(self))
 
     @property
     def state_names(self) -> tuple[str, ...]:
