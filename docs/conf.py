@@ -50,10 +50,15 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = False
+autodoc_type_aliases = {name: name.rpartition(".")[2] for name in ("Array", "ArrayLike", "npt.ArrayLike")}
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
+napoleon_attr_annotations = False
 python_maximum_signature_line_length = 100
+
+highlight_language = "text"  # unless a block says otherwise; equations are no Python
+smartquotes = False  # M' is no apostrophe
 
 html_theme = "furo"
 html_title = "covocp"

@@ -12,11 +12,15 @@ from dataclasses import is_dataclass
 from itertools import groupby
 from typing import Any
 
+from docutils.nodes import Element
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
 
 SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Warns):$")
 CODE = re.compile(r"(``.+?``|`[^`]+`)")
 STARRED = re.compile(r"^\s*\*{1,2}\w+:")
+INITIAL = re.compile(r"^[A-Z]\. ")
 MADE = ("Free", "Gain")  # dataclasses that the user makes
 ITEM = re.compile(r"^(-|\d+\.) ")
 
@@ -27,7 +31,8 @@ def escaped(line: str) -> str:
     head = start.group() if start else ""
     parts = CODE.split(line[len(head) :])
     plain = (re.sub(r"(?<=\w)_(?!\w)", r"\\_", re.sub(r"([\\*|])", r"\\\1", part)) for part in parts[::2])
-    return head + "".join(text + code for text, code in zip(plain, [*parts[1::2], ""], strict=True))
+    codes = (f"`{code}`" if code.startswith("`.") else code for code in parts[1::2])  # of whatever was just named
+    return head + "".join(text + code for text, code in zip(plain, [*codes, ""], strict=True))
 
 
 def table(lines: list[str]) -> list[str]:
@@ -46,6 +51,8 @@ def paragraph(lines: list[str]) -> list[str]:
         return table(lines)
     if ITEM.match(lines[0]):
         return [escaped(line) for line in lines]
+    if INITIAL.match(lines[0]):  # the name of an author is no item of a list
+        return ["\\" + escaped(lines[0]), *map(escaped, lines[1:])]
     result: list[str] = []
     for indented, group in groupby(lines, key=lambda line: line.startswith("  ")):
         run = list(group)
@@ -72,8 +79,17 @@ def signature(app: Sphinx, what: str, name: str, thing: Any, options: Any, *part
     return ("", None) if what == "class" and is_dataclass(thing) and thing.__name__ not in MADE else None
 
 
+def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, shown: Element) -> Element | None:
+    """Where `solve` leads that is written outside of a module: to the one of `covocp`."""
+    if node.get("refdomain") != "py" or node["reftype"] != "obj" or node.get("py:module"):
+        return None
+    name = f"covocp.{node['reftarget']}"
+    return env.domains.python_domain.resolve_xref(env, node["refdoc"], app.builder, "obj", name, node, shown)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Before napoleon, which listens with the usual priority."""
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-signature", signature)
+    app.connect("missing-reference", public_name)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

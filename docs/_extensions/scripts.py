@@ -150,7 +150,7 @@ def copy_scripts() -> None:
     for folder, title, text, names in GALLERY:
         section = COPIES / "gallery" / folder
         section.mkdir(parents=True)
-        (section / HEADER).write_text(f"{title}\n{'=' * len(title)}\n\n{text}\n", encoding="utf-8")
+        (section / HEADER).write_text(f"{title}\n{'-' * len(title)}\n\n{text}\n", encoding="utf-8")
         for name in names:
             shutil.copy(EXAMPLES / f"{name}.py", section)
     shutil.copy(OWN / "gallery" / HEADER, COPIES / "gallery")
