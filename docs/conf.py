@@ -58,7 +58,7 @@ napoleon_attr_annotations = False
 python_maximum_signature_line_length = 100
 
 highlight_language = "text"  # unless a block says otherwise; equations are no Python
-smartquotes = False  # M' is no apostrophe
+smartquotes_action = "D"  # dashes; M' is no apostrophe
 
 html_theme = "furo"
 html_title = "covocp"

@@ -101,13 +101,13 @@ class ListedOrder:
 
 
 def written_pictures(block: Any, variables: dict[str, Any], settings: dict[str, Any]) -> str:
-    """The PNG files that the last lines of a script wrote, oldest first."""
-    folder, paths = Path(variables["src_file"]).parent, variables["image_path_iterator"]
-    shown = []
+    """The PNG files that the last lines of a script wrote, oldest first, one below the other."""
+    folder, text = Path(variables["src_file"]).parent, ""
     for picture in sorted(folder.glob("*.png"), key=lambda path: path.stat().st_mtime_ns):
-        shown.append(next(paths))
-        shutil.move(picture, shown[-1])
-    return figure_rst(shown, settings["src_dir"])
+        place = next(variables["image_path_iterator"])
+        shutil.move(picture, place)
+        text += str(figure_rst([place], settings["src_dir"]))
+    return text
 
 
 def tidy(settings: dict[str, Any], script: str | None) -> None:
