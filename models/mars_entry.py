@@ -384,8 +384,8 @@ def _entry(
 
 def _symbols(problem: co.Problem, names: tuple[str, ...]) -> list[Any]:
     """Symbols of states and controls by name."""
-    entries: list[Any] = [*problem.states, *problem.controls]
-    known = {entry.name: entry.symbol for entry in entries}
+    entries: list[Any] = [*problem.declarations.states, *problem.declarations.controls]
+    known: dict[str, Any] = {entry.name: entry.symbol for entry in entries}
     missing = [name for name in names if name not in known]
     if missing:
         raise co.ProblemError(

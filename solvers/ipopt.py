@@ -12,6 +12,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
@@ -162,7 +163,7 @@ def prepare(
     return ShootingSolver(statement, mesh, plugin, settings, limited, limit)
 
 
-def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: Any) -> None:
+def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plugin: Given) -> None:
     """Refuse a plugin that is not there, and options that mean nothing to it."""
     if not ca.has_nlpsol(plugin):
         raise ProblemError(
@@ -181,7 +182,7 @@ def _check_options(tolerance: Any, max_iterations: Any, hessian: Any, plugin: An
             raise _option_error(name, f"nothing: it is Ipopt's, and '{plugin}' takes plugin_options", value)
 
 
-def _option_error(name: str, expected: str, received: Any) -> ProblemError:
+def _option_error(name: str, expected: str, received: Given) -> ProblemError:
     return ProblemError(
         f"The option '{name}' has a value that does not apply.",
         expected=expected,

@@ -112,7 +112,8 @@ def stated(**given: dict[str, Any]) -> co.Problem:
         ocp.symmetric(**to("symmetric", name="S", size=2, initial=np.eye(2)))
         ocp.dynamics("S", ca.MX.zeros(2, 2))
     if "Problem" not in given:  # names that clash are told by their own arguments
-        x, b, u = (group[0].symbol for group in (ocp.states, ocp.unknowns, ocp.controls))
+        own = ocp.declarations
+        x, b, u = (group[0].symbol for group in (own.states, own.unknowns, own.controls))
     ocp.dynamics(**to("dynamics", symbol=x, rate=u - b * x, noise=0.1))
     ocp.measurement(**to("measurement", name="m", expression=x, noise=0.1))
     if "minimize_expected" in given or "Gain" in given:

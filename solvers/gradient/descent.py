@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.solvers.gradient.memory import Metric
 from covocp.transcription.mesh import Mesh
@@ -76,7 +77,7 @@ def control_metric(mesh: Mesh, duration: float, weights: Array) -> Any:
     return sparse.coo_array(entries, shape=(size, size)).tocsc()
 
 
-def with_extra(metric: Any, extra: Array) -> Any:
+def with_extra(metric: Expr, extra: Array) -> Any:
     """The metric of the controls beside weights of further entries (b of the terminal time, of free initial values)."""
     count = metric.shape[0]
     size = count + extra.size

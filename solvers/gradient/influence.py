@@ -33,14 +33,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.quadrature import simpson_weight
 from covocp.extremal.hamiltonian import backward_interval, forward_costates, hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.rosenbrock import one_sided, part_of
-from covocp.transcription.shooting import common_columns, matrices_along
-from covocp.transcription.steps import COMMON, full_interval, inside_interval, interval_symbols, nominal_interval
+from covocp.transcription.shooting import interval_columns, matrices_along
+from covocp.transcription.steps import full_interval, inside_interval, nominal_interval
 
 # Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.
 LARGEST_FLAT = 10_000
@@ -175,15 +177,15 @@ def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
     """(z(0), *common) -> z at the nodes (size, N + 1), running cost of each interval (steps 2 and 3 of appendix E)."""
     n, nx, solver = mesh.intervals, statement.nx, mesh.linear_solver
     start = ca.MX.sym("start", nx + statement.ne)
-    symbols = zip(COMMON, interval_symbols(statement, ca.MX), strict=True)
-    common = tuple(ca.MX.sym(name, symbol.shape[0], n) for name, symbol in symbols)
+    one = Interval.symbols(statement, ca.MX)
+    common = Interval(*(ca.MX.sym(name, entry.shape[0], n) for name, entry in one._asdict().items()))
     if not statement.behind:
         interval = full_interval(statement, mesh.substeps, mesh.step, solver).mapaccum("passage", n)
         ends, _, cost = interval(start, *common)
         return ca.Function("forward", [start, *common], [ca.horzcat(start, ends), cost])
     ends, fine, cost = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("passage", n)(start[:nx], *common)
     x = ca.horzcat(start[:nx], ends)
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common[-1][:, 0], start[nx:])
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common.parameters[:, 0], start[nx:])
     return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
 
 
@@ -235,20 +237,19 @@ def quadrature_interval(statement: Statement, pairs: int, influences: int, *, ma
     size, width = statement.nx + statement.ne, 1 + influences
     after, passed = ca.MX.sym("after", size, width), ca.MX.sym("passed", size, width * pairs)
     z = ca.MX.sym("z", size, 2 * pairs + 1)
-    common = interval_symbols(statement, ca.MX)
+    common = Interval.symbols(statement, ca.MX)
     points = _columnwise(_point_slopes(statement), _point_slopes(statement, cost=False, matrices=matrices))
     rates = _columnwise(_point_rates(statement), _point_rates(statement, cost=False, matrices=matrices))
-    rest = (common[4], common[5])
     ends = [*(passed[:, j * width : (j + 1) * width] for j in range(pairs)), after]
-    where = [part_of(common, c, c) for c in np.arange(2 * pairs + 1) / (2 * pairs)]
-    sides = [common[2] + one_sided(i / (2 * pairs)) * common[3] for i in range(2 * pairs + 1)]
-    at = [(z[:, i], place[0], sides[i], *rest) for i, place in enumerate(where)]
+    shares = [i / (2 * pairs) for i in range(2 * pairs + 1)]
+    rest = (common.duration, common.parameters)
+    at = [(z[:, i], common.control(c), common.place(c), *rest) for i, c in enumerate(shares)]
     slopes = [rates(ends[j], *at[2 * j])[0] for j in range(pairs + 1)]
-    step = common[4] * common[3] / pairs
+    step = common.h / pairs
     totals: list[Any] = [0.0] * 5
     for i in range(2 * pairs + 1):
         c, j = i / (2 * pairs), i // 2
-        area = (1 if i in (0, 2 * pairs) else 4 if i % 2 else 2) / (6 * pairs) * common[3]
+        area = simpson_weight(i, 2 * pairs) * common.ds
         columns = ends[j] if i % 2 == 0 else (ends[j] + ends[j + 1]) / 2 + step / 8 * (slopes[j] - slopes[j + 1])
         by_control, by_duration = points(columns, *at[i])
         by_cost = points(ca.DM.zeros(size, 1), *at[i])[0]
@@ -260,7 +261,7 @@ def quadrature_interval(statement: Statement, pairs: int, influences: int, *, ma
 def _columnwise(first: ca.Function, others: ca.Function) -> Callable[..., list[Any]]:
     """(columns, z, u, s, T, p) -> outputs side by side: of `first` for the first column, of `others` for the rest."""
 
-    def apply(columns: Any, *arguments: Any) -> list[Any]:
+    def apply(columns: Expr, *arguments: Any) -> list[Any]:
         split = ca.horzsplit(columns)
         outputs = [(others if k else first).call([*arguments, column]) for k, column in enumerate(split)]
         return [ca.horzcat(*values) for values in zip(*outputs, strict=True)]
@@ -302,7 +303,7 @@ def sweep_forward(sweeps: Sweeps, u: Array, duration: float, start: Array, param
         start: z(0), (size,); S(0) follows from the others.
         parameters: of the statement.
     """
-    common = common_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
+    common = interval_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
     nodes, cost = sweeps.forward(start, *common)
     z = np.ascontiguousarray(nodes.full().T)
     terminal, values, *_ = sweeps.terminal.function(z[-1], duration, parameters, 0.0)
@@ -328,7 +329,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     """
     mesh, pairs = sweeps.mesh, sweeps.pairs
     n, size, width = mesh.intervals, run.z.shape[1], 1 + len(sweeps.terminal.names)
-    common = common_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
+    common = interval_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
     points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
     z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
     given, given_end = _given(sweeps, points, common)
@@ -348,7 +349,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
-def _given(sweeps: Sweeps, points: Any, common: tuple[Any, ...]) -> tuple[Array, Array]:
+def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...]) -> tuple[Array, Array]:
     """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
     shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
     if sweeps.given is None:
@@ -370,7 +371,7 @@ def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middle
     def side_by_side(values: Array) -> Any:
         return ca.DM(values.transpose(1, 0, 2).reshape(size, -1))
 
-    common = common_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
+    common = interval_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
     outputs = sweeps.quadrature(
         side_by_side(at_nodes[1:]), side_by_side(at_pairs), side_by_side(z.transpose(0, 2, 1)), *common
     )

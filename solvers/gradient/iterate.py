@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.residuals import VANISHING, Residuals
 from covocp.extremal.extremal import Guess
@@ -285,11 +286,11 @@ class Space:
             violation=measures.miss,
         )
 
-    def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Any) -> Any:
+    def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Expr) -> Any:
         """Matrix of int du' W du dt + b dT^2 + ...: W = H_uu made positive definite, or the given one."""
         return self._metric(iterate.run, iterate.run.u, linear, ell, weight, iterate.penalty.curvature)
 
-    def _metric(self, run: Run, u: Array, linear: Linear, ell: Array, weight: Any, penalty: Array) -> Any:
+    def _metric(self, run: Run, u: Array, linear: Linear, ell: Array, weight: Expr, penalty: Array) -> Any:
         st, mesh = self.sweeps.statement, self.sweeps.mesh
         if isinstance(weight, str):
             blocks = control_curvature(self.sweeps, run, u, linear.slopes.columns, ell, self.parameters)
@@ -330,7 +331,7 @@ class Space:
             extra[i] = max(abs(float(turned)), SMALLEST_EXTRA * extra[i]) if np.isfinite(turned) else extra[i]
         return replace(self, extra=extra)
 
-    def probe(self, iterate: Iterate, linear: Linear, metric: Any, ell: Array) -> float:
+    def probe(self, iterate: Iterate, linear: Linear, metric: Expr, ell: Array) -> float:
         """Curvature of the Lagrangian along the step that the metric would take, in units of the metric."""
         lower, upper = self.room(iterate)
         still = np.zeros(self.conditions)

@@ -11,12 +11,12 @@ describe. Changes of slope that would make B indefinite are damped [M. J. D. Pow
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse.linalg import splu
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 
 # Share of d' B d below which the curvature seen along a step d is damped.
@@ -28,7 +28,7 @@ Pair = tuple[Array, Array]
 class Metric:
     """A symmetric positive definite matrix: a sparse one less V N^-1 V'."""
 
-    def __init__(self, base: Any, columns: Array, middle: Array) -> None:
+    def __init__(self, base: Expr, columns: Array, middle: Array) -> None:
         """Keep B_0, V, N."""
         self._base, self._columns, self._middle = base, columns, middle
         self._factor = lu_factor(middle) if middle.size else None
@@ -44,7 +44,7 @@ class Metric:
         """A multiple of it."""
         return Metric(factor * self._base, factor * self._columns, factor * self._middle)
 
-    def inverse(self, free: Any) -> Callable[[Array], Array]:
+    def inverse(self, free: Expr) -> Callable[[Array], Array]:
         """right -> B_ff^-1 right, B_ff the rows and columns of some entries."""
         solve = splu(self._base[free][:, free].tocsc()).solve
         if self._factor is None:
@@ -60,7 +60,7 @@ class Metric:
         return apply
 
 
-def learnt(base: Any, pairs: Sequence[Pair]) -> Metric:
+def learnt(base: Expr, pairs: Sequence[Pair]) -> Metric:
     """The metric from B_0 and the pairs (change of the point, change of the slope), the oldest first."""
     size = base.shape[0]
     if not pairs:

@@ -34,6 +34,7 @@ from scipy.sparse.linalg import splu
 from covocp.base.arguments import checked, one_of, positive, share, whole
 from covocp.base.checks import as_number
 from covocp.base.errors import OutsideDomainError, ProblemError, shown
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Extremal, Guess, Outcome
@@ -71,7 +72,7 @@ def prepare(
     options: Options,
     *,
     variant: Variant = "gradient",
-    weight: Any = "adaptive",
+    weight: Given = "adaptive",
     weight_factor: float = 1.0,
     fraction: float = 1.0,
     tolerance: float = 1e-6,
@@ -132,7 +133,7 @@ def prepare(
     return GradientSolver(statement, mesh, pairs, settings)
 
 
-def _check_weight(weight: Any, nu: int, nodes: int) -> None:
+def _check_weight(weight: Given, nu: int, nodes: int) -> None:
     """Refuse a metric W that is none."""
     if isinstance(weight, str):
         if weight not in ("adaptive", "curvature"):
@@ -155,7 +156,7 @@ def _definite(values: Array) -> bool:
     return symmetric and bool((np.linalg.eigvalsh(values) > 0).all())
 
 
-def _option_error(name: str, expected: str, received: Any) -> ProblemError:
+def _option_error(name: str, expected: str, received: Given) -> ProblemError:
     return ProblemError(
         f"The option '{name}' of the gradient method has an unknown value.",
         expected=expected,
@@ -268,7 +269,7 @@ class Iteration:
 
 
 def one_iteration(
-    statement: Statement, options: Options, *, weight: Any = 1.0, fraction: float = 1.0, duration_weight: float = 1.0
+    statement: Statement, options: Options, *, weight: Given = 1.0, fraction: float = 1.0, duration_weight: float = 1.0
 ) -> Iteration:
     """One gradient iteration from the guess of the controls as it stands, without step control.
 

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.solvers.gradient.influence import Run, controls_at_nodes
 from covocp.statement.statement import Statement
@@ -118,8 +119,9 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
     return tuple(group for group in candidates if group is not None)
 
 
-def _entries(x: Any, e: Any, chosen: list[int]) -> Any:
-    return ca.vertcat(x, e)[chosen]
+def _entries(x: Expr, e: Expr, chosen: list[int]) -> Any:
+    stacked: Expr = ca.vertcat(x, e)
+    return stacked[chosen]
 
 
 def _group(
@@ -140,12 +142,12 @@ def _group(
     p, weights, shifts = symbolic.sym("p", statement.np), symbolic.sym("d", count), symbolic.sym("shift", count)
     value = rows(z[:nx], u, z[nx:], s * duration, duration, p)
 
-    def excess(rows: Any) -> Any:
+    def excess(rows: Expr) -> Any:
         over = [rows[i] - upper[i] if np.isfinite(upper[i]) else -1.0 for i in range(count)]
         under = [lower[i] - rows[i] if np.isfinite(lower[i]) else -1.0 for i in range(count)]
         return ca.vertcat(*(ca.fmax(o, 0) - ca.fmax(b, 0) for o, b in zip(over, under, strict=True)))
 
-    def room(rows: Any, multipliers: Any) -> Any:
+    def room(rows: Expr, multipliers: Expr) -> Any:
         left = []
         for i in range(count):
             above = ca.fmax(upper[i] - rows[i], 0) if np.isfinite(upper[i]) else 0.0

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
@@ -282,7 +283,7 @@ class Search:
         target = -control.fraction * current.run.miss
         return solve_step(control.raised * metric, linear.slope, linear.rows, target, lower, upper, active)
 
-    def _learn(self, change: Array, before: Linear, after: Linear, step: Step, metric: Metric, base: Any) -> None:
+    def _learn(self, change: Array, before: Linear, after: Linear, step: Step, metric: Metric, base: Expr) -> None:
         """The curvature of the Lagrangian seen along this step: for w, and remembered with the step.
 
         Only what keeps the terminal conditions is remembered: across them, an unstable plant is stiffer by the square

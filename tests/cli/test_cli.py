@@ -418,7 +418,7 @@ def test_wrong_commands_are_refused_by_the_parser(capsys, arguments):
 
 
 def test_a_reader_that_has_gone_is_no_error():
-    command = f"{sys.executable} -m covocp.cli.commands list | true; echo ${{PIPESTATUS[0]}}"
+    command = f"{sys.executable} -m covocp list | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "0"
     assert done.stderr == ""
@@ -428,9 +428,9 @@ def test_other_problems_of_a_model_and_none_as_a_value() -> None:
     from covocp.cli.catalogue import find_model
 
     steering = find_model("unknown_lag:steering")
-    assert steering.build(["duration=5"]).expected is not None
+    assert steering.build(["duration=5"]).declarations.expected is not None
     assert not steering.figures()
-    assert find_model("mars_entry").build(["regularization=none"]).expected is not None
+    assert find_model("mars_entry").build(["regularization=none"]).declarations.expected is not None
     with pytest.raises(co.ProblemError, match="perhaps 'steering' is meant"):
         find_model("unknown_lag:steerin")
 

@@ -14,7 +14,8 @@ import pytest
 from killed import ends_at
 
 import covocp as co
-from covocp.export import export_c, folder
+from covocp.export import export_c
+from covocp.export.compiled import folder
 
 X = ca.SX.sym("x")
 LAW = ca.Function("law", [X], [ca.sin(X)], ["x"], ["u"])

@@ -9,7 +9,8 @@ import pytest
 from exports import FOLDER, PLANNER, package
 
 import covocp as co
-from covocp.export import export_c, linking
+from covocp.export import export_c
+from covocp.export.compiled import linking
 from covocp.models import brachistochrone, unknown_lag
 
 # The meshes are coarse.

@@ -57,8 +57,9 @@ def moved(problem, starts):
     """The problem with other initial values of states."""
     for argument, value in starts.items():
         name = argument.removeprefix("initial_")
-        index = next(i for i, state in enumerate(problem.states) if state.name == name)
-        problem.states[index] = replace(problem.states[index], initial=ca.MX(value))
+        own = problem.declarations
+        states = tuple(replace(s, initial=ca.MX(value)) if s.name == name else s for s in own.states)
+        problem = co.Problem.of(replace(own, states=states))
     return problem
 
 

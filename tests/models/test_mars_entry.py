@@ -43,8 +43,8 @@ def rms(loop):
 
 def values(problem, expression, x, u):
     """An expression of the problem's symbols along histories of state and control."""
-    symbols = [entry.symbol for entry in problem.states]
-    function = ca.Function("f", [*symbols, problem.controls[0].symbol], [expression])
+    symbols = [entry.symbol for entry in problem.declarations.states]
+    function = ca.Function("f", [*symbols, problem.declarations.controls[0].symbol], [expression])
     return function(*(ca.DM(row).T for row in x.T), ca.DM(np.ravel(u)).T).full().ravel()
 
 
@@ -150,7 +150,7 @@ def test_data_reach_the_statement(data):
     np.testing.assert_allclose(end, lower(np.diag([*weights, 0.0, 0.0, 0.0])), rtol=1e-4)
     assert (statement.duration.guess, statement.duration.free) == (900.0, False)
     np.testing.assert_array_equal(np.ravel(statement.control_bounds), [-0.2, 0.7])
-    assert [entry.unit for entry in problem.states] == ["ft", "rad", "ft/s", "rad", "ln(slug/ft^3)"]
+    assert [entry.unit for entry in problem.declarations.states] == ["ft", "rad", "ft/s", "rad", "ln(slug/ft^3)"]
 
 
 def test_without_regularization_only_the_covariances_cost():
@@ -170,7 +170,7 @@ def test_duration_may_be_free():
 
 def test_loads_of_the_reference():
     problem, loop = mars_entry.problem(), reference()
-    assert mars_entry.reference() == {problem.controls[0].name: 0.5}
+    assert mars_entry.reference() == {problem.declarations.controls[0].name: 0.5}
     rho, v = np.exp(loop.x[:, 4]), loop.x[:, 2]
     load = values(problem, mars_entry.load_factor(problem), loop.x, loop.u)
     np.testing.assert_allclose(load, 0.5 * 1.023 * rho * v**2 * np.sqrt(1.25) / 32.174, rtol=1e-12)

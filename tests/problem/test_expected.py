@@ -270,14 +270,14 @@ def test_a_control_weight_costs_deviations_only():
 
 def test_the_problem_itself_is_not_changed():
     ocp = loop.problem(gain=co.Gain(constant=True))
-    before = {name: list(getattr(ocp, name)) for name in ("states", "controls", "matrices", "constraints")}
-    rates = dict(ocp.rates)
+    before = {name: getattr(ocp.declarations, name) for name in ("states", "controls", "matrices", "constraints")}
+    rates = dict(ocp.declarations.rates)
     first = ocp.statement()
-    assert {name: getattr(ocp, name) for name in before} == before
-    assert ocp.rates == rates
-    assert ocp.cost is None
+    assert {name: getattr(ocp.declarations, name) for name in before} == before
+    assert ocp.declarations.rates == rates
+    assert ocp.declarations.cost is None
     assert ocp.statement() is first
-    assert "C" not in [entry.name for entry in ocp.states]
+    assert "C" not in [entry.name for entry in ocp.declarations.states]
 
 
 def test_what_is_added_after_a_first_solution_counts():

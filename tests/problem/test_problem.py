@@ -182,8 +182,9 @@ def test_time_in_the_terminal_cost():
 
 @wrong("terminal cost contains 'u'")
 def test_control_in_the_terminal_cost():
-    ocp, _, u = simple()
-    ocp.cost = None
+    ocp = co.Problem(duration=1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u)
     ocp.minimize(terminal=u)
     co.solve(ocp)
 
@@ -326,7 +327,7 @@ def test_covariance_of_an_expression_is_first_order():
     """E[x^2, b] = 2 x E[x, b]."""
     ocp, x, b, _, E = lag()
     values = {"x": 3.0, "b": 1.0}
-    entry = ca.Function("f", [x, b, ocp.matrices[0].symbol], [E[x**2, b], E[x * b, x * b]])
+    entry = ca.Function("f", [x, b, ocp.declarations.matrices[0].symbol], [E[x**2, b], E[x * b, x * b]])
     product, quadratic = entry(values["x"], values["b"], [2.0, 0.5, 4.0])
     assert float(product) == pytest.approx(2 * 3 * 0.5)
     gradient = np.array([1.0, 3.0])

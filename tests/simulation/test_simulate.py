@@ -1,5 +1,7 @@
 """Simulations against closed forms, linear theory where it is exact, and section 9 of the specification (6.12)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from loops import GRADED, linear_quadratic, open_loop, setting_of, steered
@@ -258,9 +260,8 @@ def test_limits_of_the_actual_control(oscillator):
 
 def test_bounds_of_the_problem_as_limits_and_as_a_measure():
     problem = linear_quadratic()
-    problem.controls[0] = problem.controls[0].__class__(
-        **{**vars(problem.controls[0]), "lower": np.full(2, -0.8), "upper": np.full(2, 0.8)}
-    )
+    limited = replace(problem.declarations.controls[0], lower=np.full(2, -0.8), upper=np.full(2, 0.8))
+    problem = co.Problem.of(replace(problem.declarations, controls=(limited,)))
     solution = co.solve(problem, intervals=40, progress=False)
     free = simulate(solution, 500, 1, step=0.02, **OPTIONS)
     bound = simulate(solution, 500, 1, step=0.02, limits="bounds", **OPTIONS)
@@ -274,9 +275,9 @@ def test_bounds_of_the_problem_as_limits_and_as_a_measure():
 
 def test_states_that_leave_their_bounds_are_counted():
     problem = linear_quadratic()
-    problem.states[0] = problem.states[0].__class__(
-        **{**vars(problem.states[0]), "lower": np.array([-0.5, -np.inf]), "upper": np.array([1.5, np.inf])}
-    )
+    own = problem.declarations
+    bounded = replace(own.states[0], lower=np.array([-0.5, -np.inf]), upper=np.array([1.5, np.inf]))
+    problem = co.Problem.of(replace(own, states=(bounded, *own.states[1:])))
     sample = simulate(co.solve(problem, intervals=40, progress=False), 1000, 1, step=0.02, **OPTIONS)
     assert 0.1 < sample.outside_share["r[0]"] < 1.0
     assert "r[0]" in str(sample)

@@ -254,7 +254,7 @@ def test_a_given_step_that_is_to_blame_is_named():
     problem.measurement("m", x, noise=1.0)
     problem.minimize_expected(running=0.5 * u**2, terminal_weight={x: 1e-3})
     solution = co.solve(problem, intervals=8, **OPTIONS)
-    with pytest.warns(co.errors.CovocpWarning, match="step of 0.5 s is too long"):
+    with pytest.warns(co.base.errors.CovocpWarning, match="step of 0.5 s is too long"):
         long = simulate(solution, 2000, 1, step=0.5, **OPTIONS)
     short = simulate(solution, 2000, 1, step=0.01, **OPTIONS)
     assert long.verdict.reasons[0] == "step"

@@ -96,7 +96,7 @@ def test_the_problem_is_attached_again(case, suffix, tmp_path):
     problem = make()
     loaded = co.load(solution.save(tmp_path / f"solution{suffix}"), problem)
     assert loaded.statement is problem.statement()
-    key = next(iter(problem.states)).symbol
+    key = next(iter(problem.declarations.states)).symbol
     np.testing.assert_array_equal(loaded[key], solution[key.name()])
     doubled = (2 * solution[key.name()]).reshape(loaded.t.size, -1)
     np.testing.assert_allclose(loaded[2 * key].reshape(loaded.t.size, -1), doubled, rtol=1e-15)

@@ -226,7 +226,7 @@ def test_penalty_against_the_arc_on_the_bound() -> None:
 
 def test_penalty_on_controls_agrees_with_the_projection() -> None:
     ocp = noisy(1.0)
-    ocp.subject_to(ocp.controls[0].symbol - 1.2, name="cap")
+    ocp.subject_to(ocp.declarations.controls[0].symbol - 1.2, name="cap")
     one, two = solve(ocp, intervals=50), solve(noisy(1.0, upper=1.2), intervals=50)
     assert one.cost == pytest.approx(two.cost, rel=1e-6)
     np.testing.assert_allclose(one.multipliers.path[:, 0], two.multipliers.controls[:, 0], atol=1e-5)

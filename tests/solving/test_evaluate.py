@@ -91,7 +91,7 @@ def drifted(size=1, final=None):
 def test_all_ways_to_give_a_constant():
     """Number, array, function, symbol as key, and the control's own guess."""
     ocp = drifted()
-    u = ocp.controls[0].symbol
+    u = ocp.declarations.controls[0].symbol
     found = [
         co.evaluate(ocp, nominal=nominal, intervals=10)
         for nominal in (

@@ -209,4 +209,4 @@ def test_parameters_by_name_and_by_symbol():
 @wrong("no parameter 'x'", "one of v, r")
 def test_a_state_for_a_parameter():
     ocp = uncertain()
-    co.Solver(ocp, intervals=10).solve({ocp.states[0].symbol: 1.0}, progress=False)
+    co.Solver(ocp, intervals=10).solve({ocp.declarations.states[0].symbol: 1.0}, progress=False)

@@ -18,7 +18,7 @@ from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.steps import simpson_interval
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "defaults_expected_cost.py"
+PATH = Path(__file__).parents[2] / "benchmarks" / "measurements" / "expected_cost.py"
 
 
 def benchmark():
@@ -92,7 +92,7 @@ def test_steep_end_is_divided_down_to_its_time_scale():
 
 def test_given_grid_is_never_changed():
     grid = np.linspace(0, 1, 41)
-    with pytest.warns(co.errors.CovocpWarning, match="too coarse"):
+    with pytest.warns(co.base.errors.CovocpWarning, match="too coarse"):
         solution = at_rest(accurate(), grid=grid)
     np.testing.assert_array_equal(solution.mesh.nodes, grid)
     assert "nodes_added" not in solution.stats
@@ -187,7 +187,7 @@ def test_both_forms_of_the_running_cost_telescope():
 def test_identity_compares_the_cost_that_was_optimised():
     """On a mesh that spoils the covariances' own cost the identity says so, in the record and in a warning."""
     system = SAMPLE.random_system(1)
-    with pytest.warns(co.errors.CovocpWarning, match="does not resolve the gains"):
+    with pytest.warns(co.base.errors.CovocpWarning, match="does not resolve the gains"):
         found = at_rest(SAMPLE.problem(system), grid=np.linspace(0, 1, 101))
     own = found.loop.expected_cost
     assert found.optimality.cost_identity == pytest.approx(abs(found.cost - own) / own)

@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.base.quadrature import GAUSS_NODES
 from covocp.transcription.rosenbrock import between, implicit_interval, implicit_step
-from covocp.transcription.steps import GAUSS_NODES
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13, "method": "DOP853"}
 

@@ -498,7 +498,7 @@ def test_path_inequality_on_a_large_covariance():
     solutions = {}
     for formulation in ("auto", "states"):
         problem = mass_chain.problem(masses=3)
-        (covariance,) = problem.matrices
+        (covariance,) = problem.declarations.matrices
         stiffness = covariance.matrix[6, 6]
         problem.subject_to(stiffness - bound(problem.time) - 0.25 * ca.exp(-0.4 * problem.time), name="stiffness")
         solutions[formulation] = solve(problem, covariances=formulation, intervals=50)

@@ -13,9 +13,10 @@ from scipy.linalg import expm, solve_continuous_are
 
 import covocp as co
 from covocp.base.matrices import pack, unpack
+from covocp.base.quadrature import hermite
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import common_columns
-from covocp.transcription.steps import full_interval, hermite, nominal_interval
+from covocp.transcription.shooting import interval_columns
+from covocp.transcription.steps import full_interval, nominal_interval
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13, "method": "DOP853"}
 STEPS = ("gauss", "strang", "rk4")
@@ -71,7 +72,7 @@ def run(statement, intervals, step, start, u=None, substeps=1, parameters=()):
     mesh = mesh_of(intervals, step, substeps)
     controls = np.zeros((statement.nu, intervals + 1)) if u is None else u
     interval = full_interval(statement, substeps, step).mapaccum("run", intervals)
-    columns = common_columns(
+    columns = interval_columns(
         mesh, ca.DM(controls), statement.duration.guess, ca.DM(np.asarray(parameters, dtype=float))
     )
     ends, _, cost = interval(start, *columns)
@@ -280,7 +281,7 @@ def test_order_of_the_nominal_and_its_cost():
     counts, errors = [10, 20, 40, 80], []
     for n in counts:
         interval = nominal_interval(statement, 1, "rk4").mapaccum("run", n)
-        columns = common_columns(mesh_of(n, "rk4"), ca.DM(np.linspace(0.5, -0.5, n + 1)).T, 3.0, ca.DM(0, 1))
+        columns = interval_columns(mesh_of(n, "rk4"), ca.DM(np.linspace(0.5, -0.5, n + 1)).T, 3.0, ca.DM(0, 1))
         ends, _, cost = interval([1.0, 0.0], *columns)
         found = np.append(np.asarray(ends.full())[:, -1], np.sum(cost.full()))
         errors.append(np.abs(found - exact).max())

@@ -20,6 +20,7 @@ import numpy as np
 
 from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.curvature import held_jacobian, mass_matrix
@@ -82,7 +83,7 @@ class Worth:
 
 
 @one_at_a_time
-def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **options: Any) -> Worth:
+def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **options: Any) -> Worth:
     """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
 
     Args:
@@ -99,11 +100,12 @@ def worth(problem: Problem, *, nominal: Any = None, intervals: int = 100, **opti
         SolveError: the deterministic problem was not solved.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
-    if problem.expected is None or problem.expected.gain is not None:
+    expected = problem.declarations.expected
+    if expected is None or expected.gain is not None:
         raise ProblemError(
             "worth() compares the classical with the combined design.",
             expected="a problem with minimize_expected() and the best gain",
-            received=f"'{problem.name}' with " + ("a constrained gain" if problem.expected else "minimize()"),
+            received=f"'{problem.name}' with " + ("a constrained gain" if expected else "minimize()"),
             remedy="compare solutions by their costs instead",
         )
     if nominal is None:

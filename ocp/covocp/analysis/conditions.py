@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.analysis.kinks import kinked
 from covocp.analysis.reduction import Parts, parts
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, unpack, unpack_costate
 from covocp.statement.statement import Conditions, Statement
 
@@ -73,12 +74,12 @@ def _start(statement: Statement, parameters: Array) -> str:
     return ""
 
 
-def _varying(rows: Any, z: Any) -> list[int]:
+def _varying(rows: Given, z: Given) -> list[int]:
     """Rows of a matrix that depend on state or control."""
     return [i for i in range(rows.shape[0]) if ca.depends_on(rows[i, :], z) or kinked(rows[i, :], z)]
 
 
-def _slopes_vary(rows: Any, z: Any) -> list[int]:
+def _slopes_vary(rows: Given, z: Given) -> list[int]:
     """Rows of a matrix that are not affine in state and control."""
     return [
         i for i in range(rows.shape[0]) if ca.depends_on(ca.jacobian(ca.vec(rows[i, :]), z), z) or kinked(rows[i, :], z)

@@ -7,11 +7,12 @@ without them is analytic in the symbols, so that a Hessian that does not depend 
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+
+from covocp.base.expressions import Given
 
 # Operations whose derivatives jump; each is looked up, because versions of CasADi differ in what they have.
 KINKED = {
@@ -26,7 +27,7 @@ KINKED = {
 }
 
 
-def kinked(expression: Any, symbols: Any) -> bool:
+def kinked(expression: Given, symbols: Given) -> bool:
     """Whether an expression may have kinks or jumps in some symbols; functions that cannot be read count as such.
 
     Args:

@@ -23,10 +23,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
+from covocp.base.quadrature import GAUSS_NODES, hermite
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.steps import GAUSS_NODES, hermite
 
 # Coefficients of the two-stage Gauss method; the weights of both stages are 1/2.
 GAUSS_MATRIX = ((0.25, 0.25 - np.sqrt(3.0) / 6.0), (0.25 + np.sqrt(3.0) / 6.0, 0.25))
@@ -113,7 +114,7 @@ def sample(given: Parts, times: Array) -> Samples:
     count = times.size
     values = function.map(count)(np.zeros((z.shape[0], count)), times.reshape(1, -1))
 
-    def shaped(value: Any, *shape: int) -> Array:
+    def shaped(value: Given, *shape: int) -> Array:
         """CasADi stores columns first: axes are reversed, then put in order behind (K, 5)."""
         numbers = np.asarray(value.full()).T.reshape(*times.shape, *shape[::-1])
         return np.asarray(np.moveaxis(numbers, range(2, numbers.ndim), range(numbers.ndim - 1, 1, -1)))

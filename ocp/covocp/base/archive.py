@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.encoding import KINDS, LARGEST_ITEM, DamagedFileError, decode, encode
+from covocp.base.expressions import Given
 
 DOCUMENT = "document"
 NPY = ".npy"
@@ -188,7 +189,7 @@ def _info(name: str, compression: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo
     return info
 
 
-def _npy(array: Any) -> bytes:
+def _npy(array: Given) -> bytes:
     """An array in numpy's own format."""
     stream = io.BytesIO()
     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)

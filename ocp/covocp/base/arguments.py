@@ -17,6 +17,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from covocp.base.errors import ProblemError, shown
+from covocp.base.expressions import Given
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -57,7 +58,7 @@ def checked(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
     return of
 
 
-def check_argument(owner: str, name: str, kind: Kind, value: Any) -> None:
+def check_argument(owner: str, name: str, kind: Kind, value: Given) -> None:
     """An argument must be of a kind.
 
     Raises:
@@ -73,7 +74,7 @@ def check_argument(owner: str, name: str, kind: Kind, value: Any) -> None:
         )
 
 
-def truth(value: Any) -> str:
+def truth(value: Given) -> str:
     """True or False (also as 0 and 1)."""
     plain = isinstance(value, (bool, np.bool_)) or (isinstance(value, (int, np.integer)) and value in (0, 1))
     return "" if plain else "True or False"
@@ -83,19 +84,19 @@ def whole(least: int, most: int | None = MOST) -> Kind:
     """A whole number from `least` on."""
     expected = f"{least}, {least + 1}, {least + 2}, ..." + ("" if most is None else f", at most {most:.3g}")
 
-    def kind(value: Any) -> str:
+    def kind(value: Given) -> str:
         return "" if is_whole(value, least, most) else expected
 
     return kind
 
 
-def is_whole(value: Any, least: int = 1, most: int | None = MOST) -> bool:
+def is_whole(value: Given, least: int = 1, most: int | None = MOST) -> bool:
     """Whether the value is a whole number (no truth value) within these limits; most=None: without an upper one."""
     kind = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     return kind and bool(value >= least and (most is None or value <= most))
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Given) -> bool:
     """Whether the value is a finite real number, also one of numpy; no truth value."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         return False
@@ -105,17 +106,17 @@ def is_number(value: Any) -> bool:
         return False
 
 
-def positive(value: Any) -> str:
+def positive(value: Given) -> str:
     """A finite number above zero."""
     return "" if is_number(value) and value > 0 else "a finite number > 0"
 
 
-def share(value: Any) -> str:
+def share(value: Given) -> str:
     """A number in (0, 1]."""
     return "" if is_number(value) and 0 < value <= 1 else "a number in (0, 1]"
 
 
-def text(value: Any) -> str:
+def text(value: Given) -> str:
     """Words."""
     return "" if isinstance(value, str) else "a text"
 
@@ -126,35 +127,35 @@ def one_of(*words: str) -> Kind:
     return lambda value: "" if isinstance(value, str) and value in words else expected
 
 
-def mapping(value: Any) -> str:
+def mapping(value: Given) -> str:
     """A dict by name."""
     return "" if isinstance(value, Mapping) else "a dict"
 
 
-def texts(value: Any) -> str:
+def texts(value: Given) -> str:
     """A sequence of words."""
     fits = isinstance(value, (list, tuple)) and all(isinstance(word, str) for word in value)
     return "" if fits else "a list of texts"
 
 
-def texts_by_name(value: Any) -> str:
+def texts_by_name(value: Given) -> str:
     """A dict of words by words."""
     fits = isinstance(value, Mapping) and all(isinstance(word, str) for pair in value.items() for word in pair)
     return "" if fits else "a dict of name to text"
 
 
-def a_function(value: Any) -> str:
+def a_function(value: Given) -> str:
     """Something to be called, also a casadi.Function."""
     return "" if callable(value) else "a function"
 
 
-def positives(value: Any) -> str:
+def positives(value: Given) -> str:
     """A sequence of finite numbers above zero; it may be empty."""
     fits = isinstance(value, (list, tuple, np.ndarray)) and np.ndim(np.asarray(value, dtype=object)) == 1
     return "" if fits and not any(positive(number) for number in value) else "a list of finite numbers > 0"
 
 
-def sequence(value: Any) -> str:
+def sequence(value: Given) -> str:
     """A list or a tuple."""
     return "" if isinstance(value, (list, tuple)) else "a list"
 
@@ -167,7 +168,7 @@ def either(*kinds: Kind) -> Kind:
 def optional(kind: Kind) -> Kind:
     """None, or of a kind."""
 
-    def wanted(value: Any) -> str:
+    def wanted(value: Given) -> str:
         expected = "" if value is None else kind(value)
         return expected and f"{expected}, or None"
 

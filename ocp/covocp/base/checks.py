@@ -13,6 +13,7 @@ import numpy as np
 from covocp.base.arguments import is_number
 from covocp.base.arguments import is_whole as is_whole
 from covocp.base.errors import ProblemError, kind_and_name, shown, spelling
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack_symbolic, real_numbers
 
 # Components of a symbol that still make a matrix that fits into a memory.
@@ -29,17 +30,17 @@ def caller() -> str:
     return f"{frame.f_code.co_filename}:{frame.f_lineno}"
 
 
-def is_symbolic(value: Any) -> bool:
+def is_symbolic(value: Given) -> bool:
     """Whether the value is a CasADi expression (also one that happens to be constant)."""
     return isinstance(value, ca.MX)
 
 
-def is_scalar(value: Any) -> bool:
+def is_scalar(value: Given) -> bool:
     """Whether a number, an array or an expression has one entry."""
     return bool(value.numel() == 1 if isinstance(value, (ca.MX, ca.DM)) else np.size(value) == 1)
 
 
-def check_kind(value: Any, kind: type, remedy: str) -> None:
+def check_kind(value: Given, kind: type, remedy: str) -> None:
     """A value must be of a kind, such as a Problem or a Solution.
 
     Raises:
@@ -54,7 +55,7 @@ def check_kind(value: Any, kind: type, remedy: str) -> None:
         )
 
 
-def as_number(name: str, what: str, value: Any) -> Array:
+def as_number(name: str, what: str, value: Given) -> Array:
     """The value as an array of floats, or an error that names the symbol."""
     if isinstance(value, (ca.SX, ca.MX)):
         raise ProblemError(
@@ -74,7 +75,7 @@ def as_number(name: str, what: str, value: Any) -> Array:
         ) from error
 
 
-def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, inf: bool = False) -> Array:
+def column(name: str, what: str, value: Given, size: int, *, nan: bool = False, inf: bool = False) -> Array:
     """The value as a vector of `size` numbers; a scalar is repeated.
 
     Raises:
@@ -96,17 +97,17 @@ def column(name: str, what: str, value: Any, size: int, *, nan: bool = False, in
     return numbers
 
 
-def one_number(name: str, what: str, value: Any) -> float:
+def one_number(name: str, what: str, value: Given) -> float:
     """The value as one number, which may be NaN or infinite."""
     return float(column(name, what, value, 1, nan=True, inf=True)[0])
 
 
-def bound_columns(name: str, lower: Any, upper: Any, size: int) -> tuple[Array, Array]:
+def bound_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Array, Array]:
     """Lower and upper bounds as vectors of `size` numbers; infinite ones do not bind."""
     return column(name, "lower bound", lower, size, inf=True), column(name, "upper bound", upper, size, inf=True)
 
 
-def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = False) -> Any:
+def data_column(name: str, what: str, value: Given, size: int, *, nan: bool = False) -> Any:
     """Like `column`, but an expression in the parameters of the problem is accepted too."""
     if is_symbolic(value):
         if value.shape == (size, 1):
@@ -117,7 +118,7 @@ def data_column(name: str, what: str, value: Any, size: int, *, nan: bool = Fals
     return ca.MX(ca.DM(column(name, what, value, size, nan=nan)))
 
 
-def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
+def density_matrix(name: str, what: str, value: Given, size: int) -> Any:
     """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix.
 
     Constant data are checked here: finite, symmetric, positive semidefinite.
@@ -143,7 +144,7 @@ def density_matrix(name: str, what: str, value: Any, size: int) -> Any:
     return ca.MX(ca.DM(numbers))
 
 
-def symmetric_data(name: str, what: str, value: Any, size: int, *, semidefinite: bool) -> Any:
+def symmetric_data(name: str, what: str, value: Given, size: int, *, semidefinite: bool) -> Any:
     """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
     matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
     if not is_symbolic(value):
@@ -233,7 +234,7 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
         )
 
 
-def check_size(name: str, size: Any) -> int:
+def check_size(name: str, size: Given) -> int:
     """The shape of a symbol must be a positive whole number."""
     if not is_whole(size, 1, LARGEST_SIZE):
         raise ProblemError(
@@ -245,7 +246,7 @@ def check_size(name: str, size: Any) -> int:
     return int(size)
 
 
-def check_positive(name: str, value: Any, unit: str = "") -> float:
+def check_positive(name: str, value: Given, unit: str = "") -> float:
     """A positive finite number."""
     number = np.full(1, np.nan) if value is None else as_number(name, "value", value)
     if number.size != 1 or not math.isfinite(float(number.reshape(()))) or float(number.reshape(())) <= 0:
@@ -283,7 +284,7 @@ def shape_error(name: str, what: str, expected: str, received: str) -> ProblemEr
     )
 
 
-def scale_column(name: str, scale: Any, size: int) -> Array | None:
+def scale_column(name: str, scale: Given, size: int) -> Array | None:
     """Typical magnitudes, positive; None stays None."""
     if scale is None:
         return None
@@ -298,7 +299,7 @@ def scale_column(name: str, scale: Any, size: int) -> Array | None:
     return values
 
 
-def check_name(name: Any, declared: list[Any]) -> None:
+def check_name(name: Given, declared: list[Any]) -> None:
     """A name must be a text that no declaration has yet."""
     if not isinstance(name, str) or not name:
         raise ProblemError(
@@ -333,7 +334,7 @@ def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
             )
 
 
-def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, ...]) -> str:
+def find_name(symbol: Given, what: str, declared: list[Any], allowed: tuple[Any, ...]) -> str:
     """Name of what was declared, from its symbol or name."""
     for entry in declared:
         own = getattr(entry, "symbol", None)
@@ -356,7 +357,7 @@ def find_name(symbol: Any, what: str, declared: list[Any], allowed: tuple[Any, .
     )
 
 
-def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> ca.MX:
+def as_expression(name: str, what: str, value: Given, shape: tuple[int, int]) -> ca.MX:
     """The value as an expression of the given shape (a scalar zero fits every shape)."""
     try:
         expression = value if isinstance(value, ca.MX) else ca.MX(ca.DM(real_numbers(value)))
@@ -385,7 +386,7 @@ def as_expression(name: str, what: str, value: Any, shape: tuple[int, int]) -> c
 COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 
-def column_expression(name: str, what: str, value: Any) -> ca.MX:
+def column_expression(name: str, what: str, value: Given) -> ca.MX:
     """The value as a column of expressions; comparisons, lists and symbols of another kind are refused."""
     if not isinstance(value, (ca.MX, ca.DM)) and not is_number(value):
         raise ProblemError(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Given
 
 KINDS = "biuf"  # of arrays: truth values, whole numbers, floating-point numbers
 LARGEST_ITEM = 8  # bytes: what Python's own numbers hold exactly
@@ -25,7 +26,7 @@ class DamagedFileError(Exception):
     """What was read is not what was written; the reader of the file turns this into a `ProblemError`."""
 
 
-def encode(value: Any, name: str, arrays: dict[str, Any] | None = None) -> Any:
+def encode(value: Given, name: str, arrays: dict[str, Any] | None = None) -> Any:
     """A value as what `json.dumps(..., allow_nan=False)` writes.
 
     Args:
@@ -100,7 +101,7 @@ def decode(tree: Any, arrays: Mapping[str, Any] | None = None) -> Any:
     raise DamagedFileError(f"an object with the key {tag}")
 
 
-def _put_aside(array: Any, name: str, arrays: dict[str, Any]) -> str:
+def _put_aside(array: Given, name: str, arrays: dict[str, Any]) -> str:
     """Keep an array beside the text under a plain name that is not taken yet."""
     plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
     while plain in arrays:
@@ -109,7 +110,7 @@ def _put_aside(array: Any, name: str, arrays: dict[str, Any]) -> str:
     return plain
 
 
-def _written_out(array: Any) -> dict[str, Any]:
+def _written_out(array: Given) -> dict[str, Any]:
     """An array as JSON: numbers in their shortest exact form, words where they are not finite."""
     flat = array.ravel()
     values = flat.tolist()
@@ -131,7 +132,7 @@ def _read_in(content: Mapping[str, Any]) -> Any:
     return numbers.reshape([int(n) for n in content["shape"]])
 
 
-def _word(entry: Any) -> str:
+def _word(entry: Given) -> str:
     """inf, -inf, nan, or nan with its bytes where it is not the usual one; `entry` has shape (1,)."""
     if np.isinf(entry[0]):
         return "inf" if entry[0] > 0 else "-inf"
@@ -139,7 +140,7 @@ def _word(entry: Any) -> str:
     return "nan" if usual else f"nan:{entry.tobytes().hex()}"
 
 
-def _number(word: str, dtype: Any) -> Any:
+def _number(word: str, dtype: Given) -> Any:
     """The inverse of `_word`."""
     if word.startswith("nan:"):
         return np.frombuffer(bytes.fromhex(word[4:]), dtype=dtype, count=1)

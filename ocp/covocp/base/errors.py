@@ -64,12 +64,14 @@ class SolveError(CovocpError, RuntimeError):
         self,
         problem: str,
         *,
+        expected: str = "",
+        received: str = "",
+        remedy: str = "",
         solution: Solution | None = None,
         violations: Mapping[str, float] | None = None,
-        **parts: str,
     ) -> None:
         """Keep the last iterate and the violated constraints beside the message."""
-        super().__init__(problem, **parts)
+        super().__init__(problem, expected=expected, received=received, remedy=remedy)
         self.solution = solution
         self.violations = dict(violations or {})
 

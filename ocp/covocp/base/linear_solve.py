@@ -6,6 +6,8 @@ from typing import Any
 
 import casadi as ca
 
+from covocp.base.expressions import Expr
+
 # Fastest for dense systems of this size; COMPILED_SOLVER can be written out as C code.
 LINEAR_SOLVER = "lapacklu"
 COMPILED_SOLVER = "qr"
@@ -14,7 +16,7 @@ COMPILED_SOLVER = "qr"
 SOLVER_OPTIONS: dict[str, dict[str, Any]] = {"lapacklu": {"equilibration": False}, "qr": {"eps": 1e-300}}
 
 
-def linear_solve(matrix: Any, right: Any, solver: str) -> Any:
+def linear_solve(matrix: Expr, right: Expr, solver: str) -> Any:
     """matrix^-1 right; where the matrix is singular the evaluation fails, without a word on the terminal.
 
     CasADi's QR does not exchange rows, so it loses what rows of different units differ by (Mars entry in feet and

@@ -15,6 +15,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from covocp.base.expressions import Expr, Given
+
 Array = NDArray[np.float64]
 
 # A covariance counts as positive semidefinite while its smallest eigenvalue is above minus this times its largest:
@@ -22,7 +24,7 @@ Array = NDArray[np.float64]
 SEMIDEFINITE_TOLERANCE = 1e-9
 
 
-def real_numbers(value: Any) -> Array:
+def real_numbers(value: Given) -> Array:
     """Numbers as an array of floats. None in a sequence is NaN; arrays of truths are patterns of 0 and 1.
 
     Raises:
@@ -44,7 +46,7 @@ def real_numbers(value: Any) -> Array:
     return numbers.astype(float)
 
 
-def _no_number(value: Any) -> bool:
+def _no_number(value: Given) -> bool:
     """Whether a value is a truth, a word or a symbol, or a sequence that holds a word or a symbol."""
     if isinstance(value, (list, tuple)):
         return any(not isinstance(entry, (bool, np.bool_)) and _no_number(entry) for entry in value)
@@ -106,7 +108,7 @@ def pack_costate(matrix: ArrayLike) -> Array:
     return np.asarray(np.where(rows == columns, half, 2.0 * half))
 
 
-def pack_symbolic(matrix: Any) -> Any:
+def pack_symbolic(matrix: Expr) -> Any:
     """Half-vector of a symbolic symmetric matrix; the symmetric part is taken."""
     size = matrix.shape[0]
     rows, columns = half_indices(size)
@@ -115,7 +117,7 @@ def pack_symbolic(matrix: Any) -> Any:
     return 0.5 * (flat[lower.tolist()] + flat[upper.tolist()])
 
 
-def unpack_symbolic(half: Any, size: int) -> Any:
+def unpack_symbolic(half: Expr, size: int) -> Any:
     """Full symmetric matrix of a symbolic half-vector."""
     order = unpack_indices(size).T.ravel().tolist()
     return ca.reshape(half[order], size, size)

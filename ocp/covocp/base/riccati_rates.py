@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_density
+from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, pack_symbolic, unpack_symbolic
 
 # Agreement asked between a rate and its recognised form at random points.
@@ -20,13 +21,13 @@ RECOGNITION_TOLERANCE = 1e-9
 RECOGNITION_POINTS = 3
 
 
-def riccati_rate(covariance: Any, drift: Any, noise: Any, information: Any) -> Any:
+def riccati_rate(covariance: Expr, drift: Expr, noise: Expr, information: Expr) -> Any:
     """Rate F E + E F' + Q - E W E of a covariance, W = M' U^-1 M [Schmidt 2.5-3]; all n x n."""
     product = drift @ covariance
     return product + product.T + noise - covariance @ information @ covariance
 
 
-def inverse(density: Any) -> Any:
+def inverse(density: Expr) -> Any:
     """Inverse of a density or weight matrix, with as much structure as it has.
 
     Raises:
@@ -41,7 +42,7 @@ def inverse(density: Any) -> Any:
     return ca.inv(density)
 
 
-def recognise(rate: Any, half: Any, size: int) -> tuple[Any, Any, Any] | None:
+def recognise(rate: Expr, half: Expr, size: int) -> tuple[Any, Any, Any] | None:
     """F, Q, W of a rate, as expressions, or None where it has not the Riccati form.
 
     Args:
@@ -76,7 +77,7 @@ def recognise(rate: Any, half: Any, size: int) -> tuple[Any, Any, Any] | None:
     return (drift, unpack_symbolic(constant, size), information) if _same(rate, form, half) else None
 
 
-def _same(first: Any, second: Any, half: Any) -> bool:
+def _same(first: Expr, second: Expr, half: Expr) -> bool:
     """Whether two expressions agree at a few random points."""
     symbols = ca.symvar(ca.veccat(first, second, half))
     function = ca.Function("both", [ca.veccat(*symbols)], [first, second])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
 
@@ -28,7 +29,7 @@ MARGINAL = 1e-9
 RESIDUAL = 1e-7
 
 
-def continuous(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
+def continuous(A: Expr, B: Expr, Q: Expr, R: Expr, *, cross: Expr = None) -> Any:
     """Stabilising solution S of A'S + S A - (S B + N) R^-1 (B'S + N') + Q = 0.
 
     Args:
@@ -48,7 +49,7 @@ def continuous(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
     return restored(stabilising(*weights(A, B, Q, R, cross), discrete=False), A)
 
 
-def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
+def discrete(A: Expr, B: Expr, Q: Expr, R: Expr, *, cross: Expr = None) -> Any:
     """Stabilising solution S of S = A'S A - (A'S B + N) (R + B'S B)^-1 (B'S A + N') + Q, of item 5.
 
     Args:
@@ -68,7 +69,7 @@ def discrete(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None) -> Any:
 
 
 @checked(discrete=truth)
-def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
+def lyapunov(A: Expr, Q: Expr, *, discrete: bool = False) -> Any:
     """Solution X of A X + X A' + Q = 0, or of A X A' - X + Q = 0.
 
     Args:
@@ -110,7 +111,7 @@ def lyapunov(A: Any, Q: Any, *, discrete: bool = False) -> Any:
 
 
 @checked(discrete=truth)
-def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
+def unstabilisable(A: Expr, B: Expr, *, discrete: bool = False) -> Modes:
     """Modes of A that are not stable and that B does not reach (Hautus: [A - mode I, B] loses rank).
 
     Args:
@@ -129,7 +130,7 @@ def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> Modes:
 
 
 @checked(discrete=truth)
-def undetectable(A: Any, H: Any, *, discrete: bool = False) -> Modes:
+def undetectable(A: Expr, H: Expr, *, discrete: bool = False) -> Modes:
     """Modes of A that are not stable and that H does not see: those of the dual pair (A', H').
 
     Args:
@@ -223,7 +224,7 @@ class Words:
 CONTROL = Words()
 
 
-def weights(A: Any, B: Any, Q: Any, R: Any, cross: Any, words: Words = CONTROL) -> tuple[Array, ...]:
+def weights(A: Expr, B: Expr, Q: Expr, R: Expr, cross: Expr, words: Words = CONTROL) -> tuple[Array, ...]:
     """The five matrices of a linear-quadratic problem as checked numbers.
 
     Raises:
@@ -295,7 +296,7 @@ def gain_of(A: Array, B: Array, R: Array, cross: Array, S: Array, *, discrete: b
     return np.asarray(np.linalg.solve(R, B.T @ S + cross.T))
 
 
-def frozen(numbers: Any) -> Any:
+def frozen(numbers: Expr) -> Any:
     """A copy of an array that cannot be written to."""
     result = np.array(numbers)
     result.setflags(write=False)
@@ -331,12 +332,13 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discre
     return A.T @ S + S @ A + Q - (S @ B + N) @ K
 
 
-def _linear_lyapunov(A: Any, Q: Any, discrete: bool) -> Any:
+def _linear_lyapunov(A: Expr, Q: Expr, discrete: bool) -> Any:
     """The equation as one linear system of n^2 unknowns, which expands to SX."""
 
-    def lyapunov(a: Any, q: Any) -> tuple[Any]:
+    def lyapunov(a: Expr, q: Expr) -> tuple[Any]:
         unit = ca.SX.eye(a.shape[0])
         operator = ca.kron(a, a) - ca.SX.eye(a.shape[0] ** 2) if discrete else ca.kron(unit, a) + ca.kron(a, unit)
-        return (ca.reshape(ca.solve(operator, -ca.vec(q)), a.shape),)
+        right: Expr = ca.vec(q)
+        return (ca.reshape(ca.solve(operator, -right), a.shape),)
 
     return apply(lyapunov, A, Q)[0]

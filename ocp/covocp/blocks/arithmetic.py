@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks.values import is_symbolic
 
 Array = NDArray[Any]
@@ -29,7 +30,7 @@ def precision(*arguments: Any) -> Any:
     return np.float32 if kinds and all(kind == np.float32 for kind in kinds) else np.float64
 
 
-def apply(law: Callable[..., Sequence[Any]], *values: Any, precision: Any = np.float64) -> list[Any]:
+def apply(law: Callable[..., Sequence[Any]], *values: Any, precision: Expr = np.float64) -> list[Any]:
     """The results of a law.
 
     Args:
@@ -68,37 +69,37 @@ def apply(law: Callable[..., Sequence[Any]], *values: Any, precision: Any = np.f
     return list(ca.Function(getattr(law, "__name__", "law").strip("_<>"), symbols, results).call(given, False, False))
 
 
-def unit(like: Any, size: int) -> Any:
+def unit(like: Expr, size: int) -> Any:
     """The unit matrix of the kind of another matrix."""
     return np.eye(size, dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX.eye(size)
 
 
-def zeros(like: Any, rows: int, columns: int) -> Any:
+def zeros(like: Expr, rows: int, columns: int) -> Any:
     """Zeros of the kind of another matrix."""
     return np.zeros((rows, columns), dtype=like.dtype) if isinstance(like, np.ndarray) else ca.SX(rows, columns)
 
 
-def symmetric(value: Any) -> Any:
+def symmetric(value: Expr) -> Any:
     """The symmetric part, in the precision of the value."""
     return (value + value.T) / 2
 
 
-def diagonal(value: Any) -> Any:
+def diagonal(value: Expr) -> Any:
     """A column as a diagonal matrix."""
     return np.diag(value.ravel()) if isinstance(value, np.ndarray) else ca.diag(value)
 
 
-def below(upper: Any, lower: Any) -> Any:
+def below(upper: Expr, lower: Expr) -> Any:
     """One matrix below another."""
     return np.vstack([upper, lower]) if isinstance(upper, np.ndarray) else ca.vertcat(upper, lower)
 
 
-def beside(left: Any, right: Any) -> Any:
+def beside(left: Expr, right: Expr) -> Any:
     """One matrix beside another."""
     return np.hstack([left, right]) if isinstance(left, np.ndarray) else ca.horzcat(left, right)
 
 
-def definite_solve(matrix: Any, right: Any, what: str) -> Any:
+def definite_solve(matrix: Expr, right: Expr, what: str) -> Any:
     """matrix^-1 right for a positive definite matrix, by L D L' without pivots.
 
     Args:
@@ -119,16 +120,16 @@ def definite_solve(matrix: Any, right: Any, what: str) -> Any:
     return ca.ldl_solve(ca.densify(right), entries, upper, order)
 
 
-def unit_triangular(matrix: Any, what: str) -> tuple[Any, Any]:
+def unit_triangular(matrix: Expr, what: str) -> tuple[Any, Any]:
     """L and the column D of matrix = L diag(D) L', L unit lower triangular.
 
     Raises:
         ProblemError: numbers, not diagonal, that are not positive definite.
     """
     if isinstance(matrix, np.ndarray):
-        entries = np.diag(matrix)
-        if not np.any(matrix - np.diag(entries)):
-            return unit(matrix, matrix.shape[0]), entries[:, None]
+        diagonal = np.diag(matrix)
+        if not np.any(matrix - np.diag(diagonal)):
+            return unit(matrix, matrix.shape[0]), diagonal[:, None]
         try:
             factor = np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError as error:
@@ -138,7 +139,7 @@ def unit_triangular(matrix: Any, what: str) -> tuple[Any, Any]:
     return ca.SX.eye(matrix.shape[0]) + upper.T, entries
 
 
-def triangular_solve(lower: Any, right: Any) -> Any:
+def triangular_solve(lower: Expr, right: Expr) -> Any:
     """lower^-1 right for a unit lower triangular matrix, by substitution."""
     if isinstance(lower, np.ndarray):
         return np.linalg.solve(lower, right)
@@ -150,21 +151,21 @@ def triangular_solve(lower: Any, right: Any) -> Any:
     return ca.vertcat(*rows)
 
 
-def is_there(reading: Any) -> Any:
+def is_there(reading: Expr) -> Any:
     """1 where a reading is a number, 0 where it is missing (NaN or infinite)."""
     if isinstance(reading, np.ndarray):
         return np.isfinite(reading).astype(reading.dtype)
     return ca.fabs(reading) <= LARGEST_READING
 
 
-def where(condition: Any, value: Any) -> Any:
+def where(condition: Expr, value: Expr) -> Any:
     """The value where the condition is 1, zero elsewhere, also where the value is NaN."""
     if isinstance(value, np.ndarray):
         return np.where(condition > 0, value, 0).astype(value.dtype)
     return ca.if_else(condition, value, 0)
 
 
-def semidefinite(value: Any) -> Any:
+def semidefinite(value: Expr) -> Any:
     """A covariance without the negative eigenvalues that rounding can leave; expressions as they are."""
     if not isinstance(value, np.ndarray) or not value.size:
         return value

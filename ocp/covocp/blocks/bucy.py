@@ -11,6 +11,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.riccati_rates import riccati_rate
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.updates import row_matrix
@@ -24,7 +25,7 @@ ORDER = 8
 NOISE_POINTS = 4
 
 
-def rate(E: Any, F: Any, M: Any, Q: Any, U: Any, *, gain: Any = None, cross: Any = None) -> Any:
+def rate(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, *, gain: Expr = None, cross: Expr = None) -> Any:
     """Kalman-Bucy rate of the covariance: F E + E F' + Q - K U K', K = (E M' + C) U^-1 [Schmidt 2.5-3].
 
     With a given gain K it is (F - K M) E + E (F - K M)' + Q + K U K' - K C' - C K' [Schmidt 6.2-31].
@@ -61,20 +62,20 @@ def rate(E: Any, F: Any, M: Any, Q: Any, U: Any, *, gain: Any = None, cross: Any
     return restored(slope, E)
 
 
-def _best(E: Any, F: Any, M: Any, Q: Any, U: Any, C: Any) -> tuple[Any]:
+def _best(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, C: Expr) -> tuple[Any]:
     """The rate with the best gain; correlation moves into drift and noise."""
     seen = definite_solve(U, M, "measurement noise U")
     share = definite_solve(U, C.T, "measurement noise U").T
     return (symmetric(riccati_rate(E, F - share @ M, Q - share @ C.T, M.T @ seen)),)
 
 
-def _given(E: Any, F: Any, M: Any, Q: Any, U: Any, C: Any, K: Any) -> tuple[Any]:
+def _given(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, C: Expr, K: Expr) -> tuple[Any]:
     """The rate with a given gain."""
     moved, common = (F - K @ M) @ E, K @ C.T
     return (symmetric(moved + moved.T + Q + K @ U @ K.T - common - common.T),)
 
 
-def discretise(A: Any, Q: Any, step: Any) -> tuple[Any, Any]:
+def discretise(A: Expr, Q: Expr, step: Expr) -> tuple[Any, Any]:
     """Transition matrix exp(A h) and noise covariance of a step: the integral of exp(A s) Q exp(A' s) over [0, h].
 
     Numbers: exact to rounding, by Van Loan's exponential of [-A Q; 0 A'] over a step so short that the exponential is
@@ -102,7 +103,7 @@ def discretise(A: Any, Q: Any, step: Any) -> tuple[Any, Any]:
     return restored(transition, A), restored(noise, Q)
 
 
-def time_step(value: Any) -> Any:
+def time_step(value: Expr) -> Any:
     """A step as a CasADi scalar.
 
     Raises:
@@ -128,14 +129,14 @@ def _van_loan(A: NDArray[np.float64], Q: NDArray[np.float64], h: float) -> tuple
     return _doubled(transition, symmetric(transition @ exponential[:size, size:]), doublings)
 
 
-def _doubled(transition: Any, noise: Any, doublings: int) -> tuple[Any, Any]:
+def _doubled(transition: Expr, noise: Expr, doublings: int) -> tuple[Any, Any]:
     for _ in range(doublings):
         noise = symmetric(noise + transition @ noise @ transition.T)
         transition = transition @ transition
     return transition, noise
 
 
-def _series(A: Any, Q: Any, h: Any) -> tuple[Any, Any]:
+def _series(A: Expr, Q: Expr, h: Expr) -> tuple[Any, Any]:
     """The symbolic discretisation; the powers of A serve the transition over all the parts of the short step."""
     short = h / 2**DOUBLINGS
     powers = [ca.SX.eye(A.shape[0])]

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 
 from covocp.base.arguments import checked, whole
+from covocp.base.expressions import Expr
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.blocks.updates import Form, Missing, updating
@@ -20,10 +21,10 @@ from covocp.blocks.values import is_symbolic, weight, wrong_argument
 def extended(
     f: ca.Function,
     h: ca.Function,
-    noise: Any,
-    R: Any,
+    noise: Expr,
+    R: Expr,
     *,
-    step: Any = None,
+    step: Expr = None,
     substeps: int = 1,
     form: Form = "joseph",
     missing: Missing = "raise",
@@ -64,7 +65,7 @@ def extended(
     return predict, ca.Function("update", [x, P, y], corrected, ["x", "P", "y"], ["estimate", "covariance"])
 
 
-def extended_rate(f: ca.Function, h: ca.Function, noise: Any, R: Any) -> ca.Function:
+def extended_rate(f: ca.Function, h: ca.Function, noise: Expr, R: Expr) -> ca.Function:
     """Extended Kalman-Bucy filter of dx/dt = f(x, u) + w with the continuous measurement y = h(x) + v.
 
     Args:
@@ -85,7 +86,7 @@ def extended_rate(f: ca.Function, h: ca.Function, noise: Any, R: Any) -> ca.Func
     return ca.Function("rate", [x, P, y, u][: model.arguments + 2], slopes, model.names("x", "P", "y"), ["dx", "dP"])
 
 
-def bucy_slopes(x: Any, P: Any, y: Any, process: tuple[Any, Any], measurement: tuple[Any, Any]) -> list[Any]:
+def bucy_slopes(x: Expr, P: Expr, y: Expr, process: tuple[Any, Any], measurement: tuple[Any, Any]) -> list[Any]:
     """Rates f + K (y - h) and F P + P F' + Q - K U K', K = P H' U^-1, of the continuous filter.
 
     Args:
@@ -108,7 +109,7 @@ def bucy_slopes(x: Any, P: Any, y: Any, process: tuple[Any, Any], measurement: t
 
 
 def propagated(
-    rate: ca.Function, density: ca.Function, start: tuple[Any, Any, Any, Any], step: Any, substeps: int
+    rate: ca.Function, density: ca.Function, start: tuple[Any, Any, Any, Any], step: Expr, substeps: int
 ) -> list[Any]:
     """Estimate and covariance after a step of a continuous model, positive semidefinite at any length of it.
 
@@ -136,7 +137,7 @@ def propagated(
     return [ca.densify(x), P]
 
 
-def corrected_by(x: Any, P: Any, y: Any, measurement: tuple[Any, Any], form: Form, missing: Missing) -> list[Any]:
+def corrected_by(x: Expr, P: Expr, y: Expr, measurement: tuple[Any, Any], form: Form, missing: Missing) -> list[Any]:
     """Estimate and covariance after a reading: the linear update of y - h + H x.
 
     Args:
@@ -164,11 +165,11 @@ def expands(function: ca.Function) -> bool:
     return True
 
 
-def _covariance_after(P: Any, F: Any, Q: Any) -> tuple[Any]:
+def _covariance_after(P: Expr, F: Expr, Q: Expr) -> tuple[Any]:
     return (symmetric(F @ P @ F.T + Q),)
 
 
-def _simpson(P: Any, first: Any, second: Any, start: Any, middle: Any, end: Any, h: Any) -> tuple[Any]:
+def _simpson(P: Expr, first: Expr, second: Expr, start: Expr, middle: Expr, end: Expr, h: Expr) -> tuple[Any]:
     before = symmetric(P + h / 6 * start)
     between = first @ before @ first.T + 2 * h / 3 * middle
     return (symmetric(second @ between @ second.T + h / 6 * end),)
@@ -190,7 +191,7 @@ def _half_step(rate: ca.Function) -> ca.Function:
 class _Model:
     """The four functions of a filter, checked: f and noise of (x, u), h and R of x, with symbols that suit them."""
 
-    def __init__(self, f: ca.Function, h: ca.Function, noise: Any, R: Any, *, definite: bool) -> None:
+    def __init__(self, f: ca.Function, h: ca.Function, noise: Expr, R: Expr, *, definite: bool) -> None:
         size, controls = _check_function("f", f, (1, 2))
         _check_shape("f", f.size_out(0), (size, 1))
         if _check_function("h", h, (1,))[0] != size:
@@ -218,7 +219,7 @@ def _with_time(function: ca.Function, model: _Model) -> ca.Function:
     return ca.Function(function.name(), [x, type(x).sym("t"), u], [function(x, u)])
 
 
-def _density(name: str, value: Any, size: int, model: ca.Function, *, definite: bool) -> ca.Function:
+def _density(name: str, value: Expr, size: int, model: ca.Function, *, definite: bool) -> ca.Function:
     """A covariance as a function of the arguments of f or h."""
     if isinstance(value, ca.Function):
         if [value.size_in(i) for i in range(value.n_in())] != [model.size_in(i) for i in range(model.n_in())]:
@@ -232,7 +233,7 @@ def _density(name: str, value: Any, size: int, model: ca.Function, *, definite: 
     return ca.Function(name, inputs, [ca.SX(numbers)])
 
 
-def _check_function(name: str, function: Any, counts: tuple[int, ...]) -> tuple[int, int]:
+def _check_function(name: str, function: Expr, counts: tuple[int, ...]) -> tuple[int, int]:
     """Rows of the first and of the second argument (0) of a function of columns.
 
     Raises:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, whole
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks import values
 
 Array = NDArray[np.float64]
@@ -21,7 +22,7 @@ SCALES = (0.03, 0.3, 1.0, 3.0)
 TOLERANCE = 1e-9
 
 
-def in_state(name: str, x: Any, expression: Any, state: Any) -> Any:
+def in_state(name: str, x: Expr, expression: Expr, state: Expr) -> Any:
     """An expression in the user's symbol, SX or MX, as SX in another symbol.
 
     Args:
@@ -59,7 +60,7 @@ def in_state(name: str, x: Any, expression: Any, state: Any) -> Any:
     )
 
 
-def dependence(x: Any, A: Any, size: int) -> tuple[Any, Any]:
+def dependence(x: Expr, A: Expr, size: int) -> tuple[Any, Any]:
     """The state as a new SX symbol, shape (n,), and A(x) in it, (n, n); see `in_state`."""
     state = ca.SX.sym("x", size)
     return state, in_state("A", x, values.square("A", A, size), state)
@@ -71,7 +72,7 @@ def random_states(size: int, count: int, seed: int, scales: tuple[float, ...] = 
     return np.asarray(generator.standard_normal((count, size)) * generator.choice(np.array(scales), (count, size)))
 
 
-def as_states(states: Any, size: int) -> Array:
+def as_states(states: Expr, size: int) -> Array:
     """States given by the user, one in each row, (samples, size).
 
     Raises:
@@ -84,7 +85,7 @@ def as_states(states: Any, size: int) -> Array:
 
 
 @checked(seed=whole(0, None))
-def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, seed: int = 0) -> None:
+def check_factorisation(x: Expr, A0: Expr, A: Expr, f: Expr, *, states: Expr = None, seed: int = 0) -> None:
     """Whether (A0 + A(x)) x = f(x), checked at some states.
 
     Args:
@@ -122,7 +123,7 @@ def check_factorisation(x: Any, A0: Any, A: Any, f: Any, *, states: Any = None, 
         raise _wrong(f"component {row} of f, {right[sample, row]:.8g}, at x = {at}", f"{left[sample, row]:.8g}")
 
 
-def _at_state(f: Callable[[Any], Any], x: Any) -> Any:
+def _at_state(f: Callable[[Any], Any], x: Expr) -> Any:
     """What a function returns for the symbol.
 
     Raises:
@@ -139,7 +140,7 @@ def _at_state(f: Callable[[Any], Any], x: Any) -> Any:
         ) from error
 
 
-def integral_states(x: Any, A0: Any, A: Any, B: Any, output: Any) -> tuple[Any, Any, Any, Any]:
+def integral_states(x: Expr, A0: Expr, A: Expr, B: Expr, output: Expr) -> tuple[Any, Any, Any, Any]:
     """Dynamics of (x, z) with dz/dt = output @ x, section 4.
 
     Args:
@@ -170,7 +171,7 @@ def integral_states(x: Any, A0: Any, A: Any, B: Any, output: Any) -> tuple[Any, 
     )
 
 
-def as_rows(value: Any) -> Any:
+def as_rows(value: Expr) -> Any:
     """A matrix; one of one dimension as a row."""
     if isinstance(value, (ca.DM, *values.SYMBOLIC)):
         return value

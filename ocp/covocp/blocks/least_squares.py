@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, positive, share, whole
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks import values
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric, unit
 from covocp.blocks.updates import Missing, check_choice, reading, updating
@@ -22,13 +23,13 @@ Array = NDArray[np.float64]
 
 
 def recursive_least_squares(
-    estimate: Any,
-    covariance: Any,
-    regressor: Any,
-    output: Any,
+    estimate: Expr,
+    covariance: Expr,
+    regressor: Expr,
+    output: Expr,
     *,
-    forgetting: Any = 1.0,
-    weight: Any = 1.0,
+    forgetting: Expr = 1.0,
+    weight: Expr = 1.0,
     missing: Missing = "raise",
 ) -> tuple[Any, Any]:
     """One sample more: L = P/g phi (1/a + phi' P/g phi)^-1, theta + L (y - phi' theta), P/g - L phi' P/g (item 2).
@@ -58,7 +59,7 @@ def recursive_least_squares(
     y = reading("output", output, phi.shape[1], missing)
     correct = updating("joseph", missing)
 
-    def sample(x: Any, P: Any, phi: Any, y: Any, g: Any, a: Any) -> tuple[Any, Any]:
+    def sample(x: Expr, P: Expr, phi: Expr, y: Expr, g: Expr, a: Expr) -> tuple[Any, Any]:
         variance = symmetric(definite_solve(a, unit(a, a.shape[0]), "weight"))
         theta, spread = correct(x, P / g, y, phi.T, variance)
         return theta, spread
@@ -70,7 +71,7 @@ def recursive_least_squares(
 
 @checked(forgetting=share)
 def least_squares_start(
-    regressors: Any, outputs: Any, *, forgetting: float = 1.0, weight: Any = 1.0, missing: Missing = "raise"
+    regressors: Expr, outputs: Expr, *, forgetting: float = 1.0, weight: Expr = 1.0, missing: Missing = "raise"
 ) -> tuple[Array, Array]:
     """Batch start of the recursion: theta and P = (sum of a g^(N-i) phi_i phi_i')^-1 of N samples (item 2), by QR.
 
@@ -143,7 +144,7 @@ def _solved(rows: Array, right: Array, size: int) -> tuple[Array, Array]:
     return inverse @ (orthogonal.T @ right), inverse @ inverse.T
 
 
-def _forgetting(value: Any) -> Any:
+def _forgetting(value: Expr) -> Any:
     """A number in (0, 1] or an expression."""
     result = values.matrix("forgetting", value, (1, 1))
     if not values.is_symbolic(result) and not 0.0 < float(result) <= 1.0:
@@ -152,7 +153,7 @@ def _forgetting(value: Any) -> Any:
     return result
 
 
-def _weight(value: Any, size: int) -> Any:
+def _weight(value: Expr, size: int) -> Any:
     """The weight of a sample as a matrix; one number stands for all the outputs."""
     result = values.matrix("weight", value)
     if result.shape == (1, 1) and size != 1:

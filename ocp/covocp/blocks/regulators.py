@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
@@ -67,7 +68,7 @@ class ReferenceInput:
     state: Array
     control: Array
 
-    def law(self, gain: Any) -> Array:
+    def law(self, gain: Expr) -> Array:
         """Feedforward N of u = -gain x + N r, which is u = control r - gain (x - state r), shape (m, p)."""
         return np.asarray(self.control + numeric("gain", matrix("gain", gain)) @ self.state)
 
@@ -88,7 +89,7 @@ class Augmented:
 
 
 @checked(discrete=truth)
-def lqr(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None, discrete: bool = False) -> Regulator:
+def lqr(A: Expr, B: Expr, Q: Expr, R: Expr, *, cross: Expr = None, discrete: bool = False) -> Regulator:
     """Regulator u = -K x of least cost: the integral (discrete: sum) of x'Q x + 2 x'N u + u'R u.
 
     Args:
@@ -113,7 +114,7 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, *, cross: Any = None, discrete: bool = F
 
 
 def lqg(
-    transition: Any, B: Any, H: Any, noise: Any, R: Any, state_weight: Any, control_weight: Any
+    transition: Expr, B: Expr, H: Expr, noise: Expr, R: Expr, state_weight: Expr, control_weight: Expr
 ) -> GaussianRegulator:
     """Discrete regulator and steady-state filter, u_k = -K x_k with the estimate after the measurement y_k (item 6).
 
@@ -145,7 +146,7 @@ def lqg(
     )
 
 
-def rate(S: Any, A: Any, B: Any, Q: Any, R: Any, *, gain: Any = None, cross: Any = None) -> Any:
+def rate(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr, *, gain: Expr = None, cross: Expr = None) -> Any:
     """Rate of the cost to go: dS/dt = -(A'S + S A + Q - (S B + N) R^-1 (B'S + N')), the dual of `kalman.rate`.
 
     With a given gain K it is -((A - B K)'S + S (A - B K) + Q + K'R K - N K - K'N').
@@ -182,7 +183,7 @@ def rate(S: Any, A: Any, B: Any, Q: Any, R: Any, *, gain: Any = None, cross: Any
     return restored(-slope if is_symbolic(slope) else -np.atleast_2d(slope), S)
 
 
-def recursion(S: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Any, Any]:
+def recursion(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> tuple[Any, Any]:
     """One step back of item 5: M = S - S B (R + B'S B)^-1 B'S, S_before = A'M A + Q, K = (R + B'S B)^-1 B'S A.
 
     Args:
@@ -206,7 +207,7 @@ def recursion(S: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Any, Any]:
     return restored(before, S), gain
 
 
-def _step_back(S: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Any, Any]:
+def _step_back(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> tuple[Any, Any]:
     """The step back in Joseph form, so that S stays positive semidefinite."""
     K = definite_solve(symmetric(R + B.T @ S @ B), B.T @ S @ A, "weight R + B'S B")
     closed = A - B @ K
@@ -214,7 +215,7 @@ def _step_back(S: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Any, Any]:
 
 
 @checked(discrete=truth)
-def reference_input(A: Any, B: Any, output: Any, *, discrete: bool = False) -> ReferenceInput:
+def reference_input(A: Expr, B: Expr, output: Expr, *, discrete: bool = False) -> ReferenceInput:
     """State and control of the steady state in which output x is r.
 
     Args:
@@ -249,7 +250,7 @@ def reference_input(A: Any, B: Any, output: Any, *, discrete: bool = False) -> R
     return ReferenceInput(state=frozen(solution[:size]), control=frozen(solution[size:]))
 
 
-def integral_states(A: Any, B: Any, output: Any, *, step: Any = None) -> Augmented:
+def integral_states(A: Expr, B: Expr, output: Expr, *, step: Expr = None) -> Augmented:
     """The model with integral states: dz/dt = output x - r, or z+ = z + step (output x - r).
 
     Args:

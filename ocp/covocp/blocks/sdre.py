@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks import values
 from covocp.blocks.algebraic import continuous
 from covocp.blocks.factorisation import as_rows, dependence
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 Law = Callable[[ArrayLike, float], Array]
 
 
-def solution(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Callable[[ArrayLike], Array]:
+def solution(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Callable[[ArrayLike], Array]:
     """Stabilising solution P(x) of the Riccati equation of A0 + A(x).
 
     Args:
@@ -41,7 +42,7 @@ def solution(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Callable[[Array
     return _regulator(x, A0, A, B, Q, R)[0]
 
 
-def regulator(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Law:
+def regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Law:
     """Feedback u = -R^-1 B' P(x) x.
 
     Args:
@@ -67,7 +68,7 @@ def regulator(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> Law:
     return law
 
 
-def filter_gain(x: Any, A0: Any, A: Any, H: Any, W: Any, V: Any) -> Law:
+def filter_gain(x: Expr, A0: Expr, A: Expr, H: Expr, W: Expr, V: Expr) -> Law:
     """Gain P(x) H' V^-1 of the filter, P(x) from the dual Riccati equation.
 
     Args:
@@ -99,7 +100,7 @@ def filter_gain(x: Any, A0: Any, A: Any, H: Any, W: Any, V: Any) -> Law:
     return gain
 
 
-def _regulator(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any) -> tuple[Callable[[ArrayLike], Array], Array]:
+def _regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> tuple[Callable[[ArrayLike], Array], Array]:
     """P(x) and R^-1 B' of checked arguments."""
     constant = values.numeric("A0", values.square("A0", A0))
     size = constant.shape[0]

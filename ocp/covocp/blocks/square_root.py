@@ -13,12 +13,13 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import apply, below, beside, diagonal, is_there, precision, unit_triangular, where, zeros
 from covocp.blocks.updates import Missing, reading, row_matrix, shift
 from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
 
 
-def factor(covariance: Any) -> Any:
+def factor(covariance: Expr) -> Any:
     """Lower triangular L with L L' = covariance.
 
     Args:
@@ -39,7 +40,7 @@ def factor(covariance: Any) -> Any:
 
 
 def predict_factor(
-    estimate: Any, factor: Any, transition: Any, noise_factor: Any, *, drift: Any = 0
+    estimate: Expr, factor: Expr, transition: Expr, noise_factor: Expr, *, drift: Expr = 0
 ) -> tuple[Any, Any]:
     """Time update of item 3 on factors: L+ L+' = Phi L L' Phi' + G G'.
 
@@ -66,7 +67,7 @@ def predict_factor(
 
 
 def update_factor(
-    estimate: Any, factor: Any, measurement: Any, H: Any, R_factor: Any, *, missing: Missing = "raise"
+    estimate: Expr, factor: Expr, measurement: Expr, H: Expr, R_factor: Expr, *, missing: Missing = "raise"
 ) -> tuple[Any, Any]:
     """Measurement update of item 3 on factors.
 
@@ -94,7 +95,7 @@ def update_factor(
     return restored(corrected, estimate), restored(lower, factor)
 
 
-def triangular(roots: Any) -> Any:
+def triangular(roots: Expr) -> Any:
     """Lower triangular L, its diagonal not negative, with L L' = roots roots' for roots of at least as many columns."""
     count = roots.shape[0]
     if isinstance(roots, np.ndarray):
@@ -111,7 +112,7 @@ def triangular(roots: Any) -> Any:
     return ca.horzcat(*columns)
 
 
-def _reflected(block: Any) -> Any:
+def _reflected(block: Expr) -> Any:
     """The block times a Householder reflection that leaves of its first row the first entry, the norm of the row."""
     row = block[0, :]
     squares = ca.sumsqr(row)
@@ -125,27 +126,27 @@ def _reflected(block: Any) -> Any:
     return beside(-sign * result[:, 0], result[:, 1:])
 
 
-def _definite_factor(P: Any) -> tuple[Any]:
+def _definite_factor(P: Expr) -> tuple[Any]:
     lower, entries = unit_triangular(P, "covariance")
     return (lower @ diagonal(ca.sqrt(entries)),)
 
 
-def _time_update(x: Any, L: Any, phi: Any, G: Any, drift: Any) -> tuple[Any, Any]:
+def _time_update(x: Expr, L: Expr, phi: Expr, G: Expr, drift: Expr) -> tuple[Any, Any]:
     return phi @ x + drift, triangular(beside(phi @ L, G))
 
 
-def _measurement_update(x: Any, L: Any, y: Any, H: Any, V: Any) -> tuple[Any, Any]:
+def _measurement_update(x: Expr, L: Expr, y: Expr, H: Expr, V: Expr) -> tuple[Any, Any]:
     return _correct(x, L, y - H @ x, H, V)
 
 
-def _skipping_update(x: Any, L: Any, y: Any, H: Any, V: Any) -> tuple[Any, Any]:
+def _skipping_update(x: Expr, L: Expr, y: Expr, H: Expr, V: Expr) -> tuple[Any, Any]:
     """Rows that are missing become 0 = 0 x + noise of variance 1."""
     there = is_there(y)
     kept = diagonal(there)
     return _correct(x, L, where(there, y - H @ x), kept @ H, beside(kept @ V, diagonal(1 - there)))
 
 
-def _correct(x: Any, L: Any, residual: Any, H: Any, V: Any) -> tuple[Any, Any]:
+def _correct(x: Expr, L: Expr, residual: Expr, H: Expr, V: Expr) -> tuple[Any, Any]:
     """[V, H L; 0, L] becomes [S, 0; K S, L+] with S S' the covariance of the innovation."""
     count = H.shape[0]
     lower = triangular(below(beside(V, H @ L), beside(zeros(L, L.shape[0], V.shape[1]), L)))
@@ -153,7 +154,7 @@ def _correct(x: Any, L: Any, residual: Any, H: Any, V: Any) -> tuple[Any, Any]:
     return x + spread @ _substituted(innovation, residual), lower[count:, count:]
 
 
-def _substituted(lower: Any, right: Any) -> Any:
+def _substituted(lower: Expr, right: Expr) -> Any:
     """lower^-1 right by substitution."""
     if isinstance(lower, np.ndarray):
         if np.diag(lower).min(initial=np.inf) <= 0.0:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
 from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 
@@ -38,7 +38,7 @@ class LyapunovCertificate:
 
 @checked(discrete=truth)
 def lyapunov_certificate(
-    closed_loop: Any, matrix: Any = None, *, decrease: Any = None, discrete: bool = False
+    closed_loop: Expr, matrix: Expr = None, *, decrease: Expr = None, discrete: bool = False
 ) -> LyapunovCertificate:
     """What a quadratic Lyapunov function says about a linear closed loop (item 7).
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
+from covocp.base.expressions import Expr
 from covocp.blocks.algebraic import Words, frozen, sorted_modes, stabilising, weights
 from covocp.blocks.duality import Estimation, dual
 from covocp.blocks.updates import joseph_form
@@ -50,7 +50,7 @@ class Filter:
 
 
 @checked(discrete=truth)
-def steady_state(transition: Any, H: Any, noise: Any, R: Any, *, discrete: bool = True) -> Filter:
+def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: bool = True) -> Filter:
     """Steady state of the Kalman filter (item 4), discrete or continuous, by duality with the regulator.
 
     Args:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
+from covocp.base.expressions import Expr
 from covocp.blocks import theta_d_series as series
 from covocp.blocks import values
 from covocp.blocks.factorisation import as_rows, dependence, integral_states
@@ -73,16 +74,16 @@ class _Options:
 
 
 def regulator(
-    x: Any,
-    A0: Any,
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    B: Expr,
+    Q: Expr,
+    R: Expr,
     *,
     terms: int = 3,
-    k: Any = 0.0,
-    l: Any = 0.0,
+    k: Expr = 0.0,
+    l: Expr = 0.0,
     form: str = "auto",
 ) -> ca.Function:
     """θ-D feedback for dx/dt = (A0 + A(x)) x + B u, section 2.
@@ -113,16 +114,16 @@ def regulator(
 
 @checked(printed=truth)
 def filter_gain(
-    x: Any,
-    A0: Any,
-    A: Any,
-    H: Any,
-    W: Any,
-    V: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    H: Expr,
+    W: Expr,
+    V: Expr,
     *,
     terms: int = 3,
-    k: Any = 0.0,
-    l: Any = 0.0,
+    k: Expr = 0.0,
+    l: Expr = 0.0,
     form: str = "auto",
     printed: bool = False,
 ) -> ca.Function:
@@ -154,17 +155,17 @@ def filter_gain(
 
 
 def servo(
-    x: Any,
-    A0: Any,
-    A: Any,
-    B: Any,
-    output: Any,
-    Q: Any,
-    R: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    B: Expr,
+    output: Expr,
+    Q: Expr,
+    R: Expr,
     *,
     terms: int = 3,
-    k: Any = 0.0,
-    l: Any = 0.0,
+    k: Expr = 0.0,
+    l: Expr = 0.0,
     form: str = "auto",
 ) -> ca.Function:
     """θ-D feedback that follows a reference, with integral states, section 4 and (61) corrected.
@@ -202,16 +203,16 @@ def servo(
 
 
 def expansion(
-    x: Any,
-    A0: Any,
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    B: Expr,
+    Q: Expr,
+    R: Expr,
     *,
     terms: int = 3,
-    k: Any = 0.0,
-    l: Any = 0.0,
+    k: Expr = 0.0,
+    l: Expr = 0.0,
     form: str = "auto",
 ) -> Expansion:
     """The terms of `regulator`, for whoever looks inside; same arguments and errors."""
@@ -220,16 +221,16 @@ def expansion(
 
 @checked(printed=truth)
 def filter_expansion(
-    x: Any,
-    A0: Any,
-    A: Any,
-    H: Any,
-    W: Any,
-    V: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    H: Expr,
+    W: Expr,
+    V: Expr,
     *,
     terms: int = 3,
-    k: Any = 0.0,
-    l: Any = 0.0,
+    k: Expr = 0.0,
+    l: Expr = 0.0,
     form: str = "auto",
     printed: bool = False,
 ) -> Expansion:
@@ -238,7 +239,7 @@ def filter_expansion(
     return _expansion(x, (A0, A, as_rows(H), W, V), _Options(terms=terms, k=k, l=l, form=form), kind)
 
 
-def _expansion(x: Any, matrices: tuple[Any, ...], options: _Options, kind: series.Kind) -> Expansion:
+def _expansion(x: Expr, matrices: tuple[Any, ...], options: _Options, kind: series.Kind) -> Expansion:
     """Terms, their sum, its gain and the perturbations, in the form that is asked for."""
     A0, A, B, Q, R = matrices
     count = _corrections(options)
@@ -279,7 +280,7 @@ def _expansion(x: Any, matrices: tuple[Any, ...], options: _Options, kind: serie
 
 
 def _polynomials(
-    begin: series.Start, state: Any, rest: Any, indices: list[int | float], variables: int, form: str
+    begin: series.Start, state: Expr, rest: Expr, indices: list[int | float], variables: int, form: str
 ) -> tuple[list[Any], list[series.Polynomial]] | None:
     """Functions phi_k and the terms as polynomials; None where the operator form is meant."""
     if form == "operator":

@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import half_indices, half_length, pack, pack_symbolic, unpack, unpack_symbolic
 from covocp.blocks import values
 from covocp.blocks.algebraic import Words, lyapunov, stabilising, weights
@@ -100,7 +101,7 @@ FILTER = Kind(words=FILTER_WORDS, dual=True)
 PRINTED_FILTER = Kind(words=FILTER_WORDS, dual=True, printed=True)
 
 
-def start(A0: Any, B: Any, Q: Any, R: Any, kind: Kind = REGULATOR) -> Start:
+def start(A0: Expr, B: Expr, Q: Expr, R: Expr, kind: Kind = REGULATOR) -> Start:
     """T_0, the closed loop and the inverse of the Lyapunov operator.
 
     Args:
@@ -136,7 +137,7 @@ def start(A0: Any, B: Any, Q: Any, R: Any, kind: Kind = REGULATOR) -> Start:
     )
 
 
-def epsilons(t: Any, k: Array, l: Array) -> tuple[list[Any], list[int | float], list[Any]]:
+def epsilons(t: Expr, k: Array, l: Array) -> tuple[list[Any], list[int | float], list[Any]]:
     """Factors epsilon_n(t) = 1 - k_n exp(-l_n t) of the corrections.
 
     Args:
@@ -161,7 +162,7 @@ def epsilons(t: Any, k: Array, l: Array) -> tuple[list[Any], list[int | float], 
     return factors, indices, list(variables.values())
 
 
-def corrections(begin: Start, A: Any, epsilon: Sequence[Any]) -> list[Any]:
+def corrections(begin: Start, A: Expr, epsilon: Sequence[Any]) -> list[Any]:
     """Terms T_0, ..., T_N in the operator form.
 
     Args:
@@ -179,7 +180,7 @@ def corrections(begin: Start, A: Any, epsilon: Sequence[Any]) -> list[Any]:
     return terms
 
 
-def right_side(last: Any, roots: Sequence[Any], A: Any) -> Any:
+def right_side(last: Expr, roots: Sequence[Any], A: Expr) -> Any:
     """G_n from T_(n-1) and from T_j U, j = 1, ..., n-1."""
     right = -(last @ A + A.T @ last)
     for left, other in zip(roots, reversed(roots), strict=True):
@@ -187,7 +188,7 @@ def right_side(last: Any, roots: Sequence[Any], A: Any) -> Any:
     return right
 
 
-def separated(x: Any, A: Any) -> tuple[list[Any], list[Array]]:
+def separated(x: Expr, A: Expr) -> tuple[list[Any], list[Array]]:
     """A(x) as a sum of scalar functions times constant matrices, one function for each independent entry.
 
     Whether analytic entries depend on each other linearly is seen from their values at random states; entries with
@@ -211,7 +212,7 @@ def separated(x: Any, A: Any) -> tuple[list[Any], list[Array]]:
     return [entries[int(i)] for i in basis], list(matrices)
 
 
-def _dependences(entries: Any) -> tuple[NDArray[np.intp], Array]:
+def _dependences(entries: Expr) -> tuple[NDArray[np.intp], Array]:
     """Indices of independent entries, and all the entries as combinations of these, (independent, entries)."""
     from scipy.linalg import qr, solve_triangular
 
@@ -318,7 +319,7 @@ def _plus(one: Monomial, two: Monomial) -> Monomial:
     return tuple(a + b for a, b in zip(one, two, strict=True))
 
 
-def _values(function: Any, seed: int) -> Array:
+def _values(function: Expr, seed: int) -> Array:
     """Values of a function at random states where they are finite, (samples, entries), each row divided by its size."""
     states = random_states(function.size1_in(0), 32 * function.size1_out(0) + 64, seed, SCALES)
     found = np.asarray(function.map(len(states))(states.T).full().T)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import is_whole
 from covocp.base.errors import warn_user
+from covocp.base.expressions import Expr
 from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
@@ -78,7 +79,7 @@ class Choice:
     misfit: float
 
 
-def radius(A0: Any, direction: Any, B: Any, Q: Any, R: Any) -> float:
+def radius(A0: Expr, direction: Expr, B: Expr, Q: Expr, R: Expr) -> float:
     """Radius of convergence of the series in s of A0 + s direction, to about three digits.
 
     Args:
@@ -100,7 +101,9 @@ def radius(A0: Any, direction: Any, B: Any, Q: Any, R: Any) -> float:
 
 
 @checked(warn=truth)
-def convergence(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any, states: Any, *, warn: bool = True) -> Convergence:
+def convergence(
+    x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr, states: Expr, *, warn: bool = True
+) -> Convergence:
     """Whether the series converges at some states, for epsilon = 1.
 
     Args:
@@ -147,14 +150,14 @@ def convergence(x: Any, A0: Any, A: Any, B: Any, Q: Any, R: Any, states: Any, *,
 
 
 def choose(
-    x: Any,
-    A0: Any,
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    states: Any,
-    times: Any,
+    x: Expr,
+    A0: Expr,
+    A: Expr,
+    B: Expr,
+    Q: Expr,
+    R: Expr,
+    states: Expr,
+    times: Expr,
     *,
     terms: int = 3,
     starts: int = 8,
@@ -241,7 +244,7 @@ def _largest(matrices: Array) -> Any:
     return np.linalg.norm(matrices, 2, axis=(-2, -1))
 
 
-def _matrices(state: Any, rest: Any, samples: Array) -> list[Array]:
+def _matrices(state: Expr, rest: Expr, samples: Array) -> list[Array]:
     """A(x) at the samples."""
     inputs: Any = ([state], [rest])
     evaluate = ca.Function("A", *inputs)

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import (
     apply,
     definite_solve,
@@ -31,7 +32,7 @@ Form = Literal["joseph", "standard", "sequential", "information"]
 Missing = Literal["raise", "skip"]
 
 
-def predict(estimate: Any, covariance: Any, transition: Any, noise: Any, *, drift: Any = 0) -> tuple[Any, Any]:
+def predict(estimate: Expr, covariance: Expr, transition: Expr, noise: Expr, *, drift: Expr = 0) -> tuple[Any, Any]:
     """Time update of item 3: x = Phi x + drift, M = Phi P Phi' + Gamma1 R_w Gamma1'.
 
     Args:
@@ -56,23 +57,23 @@ def predict(estimate: Any, covariance: Any, transition: Any, noise: Any, *, drif
     return restored(moved, estimate), restored(spread, covariance)
 
 
-def shift(drift: Any, size: int) -> Any:
+def shift(drift: Expr, size: int) -> Any:
     """What is added to a prediction as a column; the number 0 stands for nothing."""
     nothing = not is_symbolic(drift) and not array("drift", drift).ndim and float(drift) == 0.0
     return ca.DM.zeros(size, 1) if nothing else matrix("drift", drift, (size, 1))
 
 
-def time_update(x: Any, P: Any, phi: Any, noise: Any, drift: Any) -> tuple[Any, Any]:
+def time_update(x: Expr, P: Expr, phi: Expr, noise: Expr, drift: Expr) -> tuple[Any, Any]:
     """Item 3; all are matrices of one kind."""
     return phi @ x + drift, symmetric(phi @ P @ phi.T + noise)
 
 
 def update(
-    estimate: Any,
-    covariance: Any,
-    measurement: Any,
-    H: Any,
-    R: Any,
+    estimate: Expr,
+    covariance: Expr,
+    measurement: Expr,
+    H: Expr,
+    R: Expr,
     *,
     form: Form = "joseph",
     missing: Missing = "raise",
@@ -112,7 +113,7 @@ def update(
     return restored(corrected, estimate), restored(spread, covariance)
 
 
-def joseph(covariance: Any, gain: Any, H: Any, R: Any) -> Any:
+def joseph(covariance: Expr, gain: Expr, H: Expr, R: Expr) -> Any:
     """Covariance after an update with any gain L: (I - L H) M (I - L H)' + L R L', of item 3.
 
     Args:
@@ -135,7 +136,7 @@ def joseph(covariance: Any, gain: Any, H: Any, R: Any) -> Any:
     return restored(spread, covariance)
 
 
-def row_matrix(name: str, value: Any, size: int) -> Any:
+def row_matrix(name: str, value: Expr, size: int) -> Any:
     """A measurement matrix of `size` columns; a flat array of that many numbers is one row."""
     if not isinstance(value, (*SYMBOLIC, ca.DM)):
         numbers = array(name, value)
@@ -143,7 +144,7 @@ def row_matrix(name: str, value: Any, size: int) -> Any:
     return matrix(name, value, (None, size))
 
 
-def reading(name: str, value: Any, size: int, missing: Missing) -> Any:
+def reading(name: str, value: Expr, size: int, missing: Missing) -> Any:
     """A measurement as a column, NaN where numbers are missing and that is allowed.
 
     Raises:
@@ -167,7 +168,7 @@ def reading(name: str, value: Any, size: int, missing: Missing) -> Any:
     return column
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def check_choice(name: str, value: Expr, choices: tuple[str, ...]) -> None:
     """One of some words.
 
     Raises:
@@ -192,7 +193,7 @@ def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
     check_choice("missing", missing, get_args(Missing))
     correct = FORMS[form]
 
-    def measurement_update(x: Any, P: Any, y: Any, H: Any, R: Any) -> tuple[Any, Any]:
+    def measurement_update(x: Expr, P: Expr, y: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
         residual, rows, noise = present(y - H @ x, y, H, R) if missing == "skip" else (y - H @ x, H, R)
         step, spread = correct(P, residual, rows, noise)
         return x + step, semidefinite(spread)
@@ -200,43 +201,43 @@ def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
     return measurement_update
 
 
-def present(residual: Any, y: Any, H: Any, R: Any) -> tuple[Any, Any, Any]:
+def present(residual: Expr, y: Expr, H: Expr, R: Expr) -> tuple[Any, Any, Any]:
     """Residual, H and R without the rows that are missing: these become 0 = 0 x + noise of variance 1, uncorrelated."""
     there = is_there(y)
     kept = diagonal(there)
     return where(there, residual), kept @ H, kept @ R @ kept + diagonal(1 - there)
 
 
-def joseph_form(P: Any, L: Any, H: Any, R: Any) -> Any:
+def joseph_form(P: Expr, L: Expr, H: Expr, R: Expr) -> Any:
     """Covariance of item 3 for any gain."""
     remaining = unit(P, P.shape[0]) - L @ H
     return symmetric(remaining @ P @ remaining.T + L @ R @ L.T)
 
 
-def _gain(P: Any, H: Any, R: Any) -> Any:
+def _gain(P: Expr, H: Expr, R: Expr) -> Any:
     """L = M H'(H M H' + R)^-1."""
     seen = H @ P
     return definite_solve(symmetric(seen @ H.T + R), seen, "covariance of the innovation, H P H' + R,").T
 
 
-def _joseph(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+def _joseph(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     L = _gain(P, H, R)
     return L @ residual, joseph_form(P, L, H, R)
 
 
-def _standard(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+def _standard(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     L = _gain(P, H, R)
     return L @ residual, symmetric(P - L @ (H @ P))
 
 
-def _information(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+def _information(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     size = unit(P, P.shape[0])
     weighted = definite_solve(R, H, "measurement noise R").T
     spread = symmetric(definite_solve(symmetric(definite_solve(P, size, "covariance") + weighted @ H), size, "sum"))
     return spread @ (weighted @ residual), spread
 
 
-def _sequential(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
+def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     """Row by row; the covariance in Joseph form, its products with I - k h written as corrections of rank one."""
     lower, variances = unit_triangular(R, "measurement noise R, whose rows are correlated,")
     rows, residual = triangular_solve(lower, H), triangular_solve(lower, residual)
@@ -253,7 +254,7 @@ def _sequential(P: Any, residual: Any, H: Any, R: Any) -> tuple[Any, Any]:
     return step, P
 
 
-def _check_divisor(spread: Any) -> None:
+def _check_divisor(spread: Expr) -> None:
     """A row without noise of something that is known exactly has no update."""
     if not isinstance(spread, ca.SX) and not spread > 0.0:
         definite_solve(np.atleast_2d(spread), np.atleast_2d(spread), "covariance of the innovation, H P H' + R,")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError, shown
+from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import real_numbers
 
 SYMBOLIC = (ca.SX, ca.MX)
@@ -26,7 +27,7 @@ def is_symbolic(*values: Any) -> bool:
     return any(isinstance(value, SYMBOLIC) for value in values)
 
 
-def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, None)) -> Any:
+def matrix(name: str, value: Given, shape: tuple[int | None, int | None] = (None, None)) -> Any:
     """A value as a CasADi matrix: SX or MX as it is, numbers as DM; one-dimensional arrays become columns.
 
     Args:
@@ -52,7 +53,7 @@ def matrix(name: str, value: Any, shape: tuple[int | None, int | None] = (None, 
     return result
 
 
-def array(name: str, value: Any) -> NDArray[np.float64]:
+def array(name: str, value: Given) -> NDArray[np.float64]:
     """Numbers as an array of floats, NaN and inf among them.
 
     Raises:
@@ -65,7 +66,7 @@ def array(name: str, value: Any) -> NDArray[np.float64]:
         raise wrong_argument(name, "numbers or a CasADi expression", received) from error
 
 
-def square(name: str, value: Any, size: int | None = None) -> Any:
+def square(name: str, value: Given, size: int | None = None) -> Any:
     """A square matrix of a size; see `matrix`.
 
     Raises:
@@ -77,7 +78,7 @@ def square(name: str, value: Any, size: int | None = None) -> Any:
     return result
 
 
-def weight(name: str, value: Any, size: int | None = None, *, definite: bool = False) -> Any:
+def weight(name: str, value: Given, size: int | None = None, *, definite: bool = False) -> Any:
     """A symmetric matrix, numeric ones checked to be positive semidefinite (or definite).
 
     Raises:
@@ -99,7 +100,7 @@ def weight(name: str, value: Any, size: int | None = None, *, definite: bool = F
     return result
 
 
-def numeric(name: str, value: Any) -> NDArray[np.float64]:
+def numeric(name: str, value: Given) -> NDArray[np.float64]:
     """A matrix as an array of two dimensions, for what has no symbolic form.
 
     Raises:
@@ -110,7 +111,7 @@ def numeric(name: str, value: Any) -> NDArray[np.float64]:
     return np.asarray(value.full())
 
 
-def restored(value: Any, like: Any) -> Any:
+def restored(value: Given, like: Expr) -> Any:
     """A result in the kind and shape of an argument: numpy where it is numeric, flat where that was, else as it is."""
     if isinstance(value, SYMBOLIC):
         return value
@@ -121,7 +122,7 @@ def restored(value: Any, like: Any) -> Any:
     return numbers.ravel() if dimensions == 1 else numbers
 
 
-def symmetrised(value: Any) -> Any:
+def symmetrised(value: Given) -> Any:
     """The symmetric part."""
     return 0.5 * (value + value.T)
 

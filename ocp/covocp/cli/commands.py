@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import covocp as co
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, spelling
+from covocp.base.expressions import Given
 from covocp.base.files import check_target
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
@@ -287,7 +288,7 @@ def _export(arguments: argparse.Namespace) -> int:
     return 0 if check.ok else FAILED
 
 
-def _solved(problem: Any, arguments: argparse.Namespace, nominal: Any = None) -> tuple[Any, int]:
+def _solved(problem: Given, arguments: argparse.Namespace, nominal: Given = None) -> tuple[Any, int]:
     """The solution, or the last iterate, and the exit code; a failure is told on the standard error."""
     shared, own = _options(arguments.option, (arguments.method,))
     options = {**shared, **own.get(arguments.method, {})}

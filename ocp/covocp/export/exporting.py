@@ -14,6 +14,7 @@ import casadi as ca
 
 from covocp.base.arguments import checked, mapping, optional, positive, truth
 from covocp.base.errors import ExportError, spelling, warn_user
+from covocp.base.expressions import Given
 from covocp.base.threads import one_at_a_time
 from covocp.export.compiled.building import Sources
 from covocp.export.compiled.folder import check_folder, check_names, package_files, write_folder
@@ -64,14 +65,14 @@ class Content:
     units=optional(mapping),
 )
 def export_c(
-    what: Any,
+    what: Given,
     directory: str | os.PathLike[str],
     *,
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
     overwrite: bool = False,
     period: float | None = None,
-    limits: Any = None,
+    limits: Given = None,
     feedback: bool = True,
     largest_spread: float = LARGEST_SPREAD,
     ranges: Mapping[str, Any] | None = None,
@@ -209,7 +210,7 @@ def _solution(
     precision: str,
     tolerance: float,
     period: float | None,
-    limits: Any,
+    limits: Given,
     feedback: bool,
     largest_spread: float,
 ) -> Content:
@@ -255,7 +256,7 @@ def _problem(
     return Content(laws=(law,), title=f"{problem.name or 'Problem'}: solver ({method}).", linking=linking)
 
 
-def _functions(what: Any, ranges: Mapping[str, Any], units: Mapping[str, str], tolerance: float) -> Content:
+def _functions(what: Given, ranges: Mapping[str, Any], units: Mapping[str, str], tolerance: float) -> Content:
     """One or more functions."""
     functions = [what] if isinstance(what, ca.Function) else what
     listed = isinstance(functions, Sequence) and not isinstance(functions, str) and len(functions) > 0
@@ -291,7 +292,7 @@ def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) 
             )
 
 
-def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def _check_choice(name: str, value: Given, choices: tuple[str, ...]) -> None:
     if not isinstance(value, str) or value not in choices:
         raise ExportError(
             f"The option '{name}' has an unknown value.",
@@ -301,14 +302,14 @@ def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
         )
 
 
-def _positive(name: str, value: Any) -> float:
+def _positive(name: str, value: Given) -> float:
     """A positive, finite number."""
     if positive(value):
         raise _wrong_number(name, "a number > 0" + (" [s]" if name == "period" else ""), value)
     return float(value)
 
 
-def _wrong_number(name: str, expected: str, received: Any) -> ExportError:
+def _wrong_number(name: str, expected: str, received: Given) -> ExportError:
     """An option that is not the number that it must be."""
     headline = f"The option '{name}' is not " + ("a positive number." if "> 0" in expected else "such a number.")
     return ExportError(headline, expected=expected, received=repr(received)[:100], remedy=f"correct {name}=")

@@ -20,15 +20,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
+from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite
 from covocp.base.riccati_rates import inverse
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
+from covocp.statement.interval import Interval, one_sided
 from covocp.statement.statement import Loop, Statement
-from covocp.transcription.rosenbrock import one_sided
-from covocp.transcription.shooting import common_columns, substep_columns
-from covocp.transcription.steps import GAUSS_NODES, KEPT, gauss_matrix, hermite, interval_symbols
+from covocp.transcription.steps import KEPT
 
 # Share of the largest slope below which a direction of the state counts as moved by nothing.
 UNMOVED = 1e-10
@@ -147,7 +148,7 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
     st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
     size = len(st.augmented)
-    common = tuple(np.asarray(ca.DM(c)) for c in _fine_columns(extremal, m))
+    common = tuple(np.asarray(ca.DM(c)) for c in extremal.intervals.substeps(m))
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
     step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
@@ -171,7 +172,7 @@ def loop_substeps(extremal: Extremal) -> int:
     x, u, e, t, duration, p = extremal.columns()
     size = len(st.augmented)
 
-    def each(value: Any) -> Array:
+    def each(value: Expr) -> Array:
         numbers = np.asarray(value.full())
         return numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
 
@@ -218,13 +219,6 @@ def _loop(statement: Statement) -> Loop:
     return statement.loop
 
 
-def _fine_columns(extremal: Extremal, substeps: int) -> tuple[Any, ...]:
-    """Common arguments of the interval functions, a column for each substep."""
-    t = extremal.trajectory
-    common = common_columns(extremal.mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
-    return substep_columns(common, substeps, extremal.mesh.intervals)
-
-
 @lru_cache(maxsize=KEPT)
 def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     """(z at both ends of a substep, *common, parameters of the truth) -> step matrix of [E Z; Z' Xhat], 4n x 4n.
@@ -234,20 +228,14 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     symbolic: Any = statement.symbolic
     nx, size = statement.nx, len(statement.augmented)
     za, zb = (symbolic.sym(name, nx + statement.ne) for name in ("za", "zb"))
-    common = interval_symbols(statement, symbolic)
-    q = symbolic.sym("q", density.size1_in(4))
-    ua, ub, s, ds, duration, p = common
-    h = duration * ds
-
-    def slope(z: Any, u: Any, at: Any) -> Any:
-        return ca.vertcat(*statement.rates(z[:nx], u, z[nx:], duration * at, duration, p)[:2])
-
-    fa, fb = slope(za, ua, s + one_sided(0.0) * ds), slope(zb, ub, s + one_sided(1.0) * ds)
+    common, q = Interval.symbols(statement), symbolic.sym("q", density.size1_in(4))
+    duration, p, h = common.duration, common.parameters, common.h
+    fa, fb = (ca.vertcat(*statement.rates(*common.at(c, z[:nx], z[nx:]))[:2]) for c, z in ((0.0, za), (1.0, zb)))
     block = next(b for b in statement.matrices if b.estimation)
     loop = _loop(statement)
     points = []
     for c in GAUSS_NODES:
-        z, u, t = hermite(za, zb, h * fa, h * fb, c), ua + c * (ub - ua), duration * (s + c * ds)
+        z, u, t = hermite(za, zb, h * fa, h * fb, c), common.control(c), common.time(c)
         F, G = loop.expansion(z[:nx], u, t, duration, p)[:2]
         C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
         K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][block.span], size), (t, duration, p))
@@ -262,7 +250,7 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     return ca.Function("joint_step", outer, [value])
 
 
-def _filter(statement: Statement, x: Any, u: Any, E: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:
     """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
     if statement.measurement is None:
         return E[:, :0], E[:0, :]

@@ -16,12 +16,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, half_indices, unpack
+from covocp.base.quadrature import hermite
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
+from covocp.statement.interval import one_sided
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.rosenbrock import one_sided
-from covocp.transcription.steps import KEPT, hermite, joint_interval, matrices_step, nominal_interval
+from covocp.transcription.steps import KEPT, joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
 # what is positive semidefinite, to the roots of the diagonal at this place.
@@ -174,13 +176,13 @@ class _Steps:
         """Whether rates depend on the time through states and controls alone."""
         return self.extremal.statement.autonomous
 
-    def place(self, k: Any, c: Array) -> Array:
+    def place(self, k: Expr, c: Array) -> Array:
         """Normalised time at the share c of interval k."""
         nodes = self.extremal.mesh.nodes
         begin, end = (nodes[1:], nodes[:-1]) if self.backward else (nodes[:-1], nodes[1:])
         return np.asarray(np.where(c == 1.0, end[k], begin[k] + c * (end[k] - begin[k])))
 
-    def control(self, k: Any, c: Array) -> Array:
+    def control(self, k: Expr, c: Array) -> Array:
         """Controls there, (m, nu)."""
         u = self.extremal.controls
         share = (1.0 - c if self.backward else c)[:, None]
@@ -192,7 +194,7 @@ class _Steps:
         duration, parameters = self.extremal.trajectory.duration, self.extremal.parameters
         return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
 
-    def advance(self, k: Any, c: Array, d: Array, z: Array) -> Array:
+    def advance(self, k: Expr, c: Array, d: Array, z: Array) -> Array:
         """The entries at the share d from those at c."""
         s, after = self.place(k, c), self.place(k, d)
         common = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :], *self.fixed(c.size))
@@ -201,7 +203,7 @@ class _Steps:
             return mapped(function, z.T, *common)[0].T
         return mapped(function, z.T, self.states.at(s).T, self.states.at(after).T, *common)[0].T
 
-    def slope(self, k: Any, c: Array, h: Array, z: Array) -> Array:
+    def slope(self, k: Expr, c: Array, h: Array, z: Array) -> Array:
         """Slopes by the share at c, as their limit from the side of a step h from there."""
         st, nx, s = self.extremal.statement, self.extremal.statement.nx, self.place(k, c)
         duration, parameters = self.fixed(c.size)
@@ -259,7 +261,7 @@ def _variances(statement: Statement, rows: list[int]) -> Any:
 
 @lru_cache(maxsize=KEPT)
 def _advance_function(
-    statement: Statement, step: Any, solver: str, rows: tuple[int, ...], matrices: bool
+    statement: Statement, step: Expr, solver: str, rows: tuple[int, ...], matrices: bool
 ) -> ca.Function:
     """One step of the integrator: (values, [x at both ends,] *common) -> values."""
     if matrices:
@@ -307,7 +309,7 @@ class _Pieces:
     first: Array
     last: Array
 
-    def chosen(self, which: Any) -> _Pieces:
+    def chosen(self, which: Expr) -> _Pieces:
         """Some of them."""
         return _Pieces(**{name: value[which] for name, value in vars(self).items()})
 
@@ -350,7 +352,9 @@ def _march(steps: _Steps) -> Dense:
     return _table(steps, _Pieces.joined(found))
 
 
-def _step(steps: _Steps, k: Any, part: tuple[Array, Array], start: Array, slope: Array) -> tuple[_Pieces, Array, Array]:
+def _step(
+    steps: _Steps, k: Expr, part: tuple[Array, Array], start: Array, slope: Array
+) -> tuple[_Pieces, Array, Array]:
     """A step as two halves: the piece, its error in units of what is allowed (inf: not finite), the slope at its end.
 
     The piece has the slopes of the model at its ends. Where something fast has died away these are large for the least

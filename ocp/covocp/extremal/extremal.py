@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.shooting import interval_columns
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # How a method says, among its counts, that it lost its way: it was stopped, or ended by itself.
@@ -50,6 +53,12 @@ class Extremal:
             np.full((1, count), self.trajectory.duration),
             np.tile(self.parameters[:, None], (1, count)),
         )
+
+    @property
+    def intervals(self) -> Interval:
+        """Its control intervals, a column for each."""
+        t = self.trajectory
+        return interval_columns(self.mesh, ca.DM(t.u.T), t.duration, ca.DM(self.parameters))
 
 
 @dataclass(frozen=True, kw_only=True)

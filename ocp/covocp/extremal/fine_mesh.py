@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import common_columns
 from covocp.transcription.steps import inside_interval
 from covocp.transcription.trajectory import Trajectory
-
-
-def interval_columns(extremal: Extremal) -> tuple[Any, ...]:
-    """Common arguments of the interval functions along an extremal."""
-    t = extremal.trajectory
-    return common_columns(extremal.mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
 
 
 def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
@@ -32,7 +23,7 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
     mesh, n = extremal.mesh, extremal.mesh.intervals
     z = np.hstack([extremal.trajectory.x, extremal.trajectory.e])
     interval = inside_interval(extremal.statement, substeps, mesh.step).map(n)
-    inside = interval(z[:-1].T, z[1:].T, *interval_columns(extremal))
+    inside = interval(z[:-1].T, z[1:].T, *extremal.intervals)
     return np.asarray(inside.full()).T.reshape(n, substeps + 1, z.shape[1])
 
 

@@ -12,21 +12,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.extremal import Extremal
-from covocp.extremal.fine_mesh import fine_trajectory, interval_columns, prolongation, refined
+from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
+from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import terminal_slopes
-from covocp.transcription.rosenbrock import one_sided, part_of
-from covocp.transcription.shooting import common_columns, matrices_along
-from covocp.transcription.steps import KEPT, Step, full_interval, hermite, interval_symbols, nominal_interval
+from covocp.transcription.shooting import interval_columns, matrices_along
+from covocp.transcription.steps import KEPT, Step, full_interval, nominal_interval
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +110,7 @@ def impulses(extremal: Extremal) -> Array:
     jumps = np.hstack([multipliers.states, multipliers.matrices])
     if statement.path.size:
         symbolic: Any = statement.symbolic
-        sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
-        symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
+        symbols = model_symbols(statement)
         weights = symbolic.sym("mu", statement.path.size)
         value = ca.dot(weights, statement.path.function(*symbols))
         slope = (
@@ -141,10 +142,10 @@ def adjoint_interval(statement: Statement, substeps: int, step: Step, *, nominal
     symbolic: Any = statement.symbolic if interval.is_a("SXFunction") else ca.MX
     size = interval.size1_in(0)
     after, keep, known, impulse, z = (symbolic.sym(name, size) for name in ("after", "keep", "known", "impulse", "z"))
-    common = interval_symbols(statement, symbolic)
+    common = Interval.symbols(statement, symbolic)
     end, _, cost = interval(z, *common)
     value = ca.dot(keep * after + known, end) + (0 if nominal else cost)
-    by = (z, common[0], common[1], *([common[4]] if statement.duration.free else []))
+    by = (z, common.start, common.end, *([common.duration] if statement.duration.free else []))
     slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
     return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
 
@@ -172,14 +173,14 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 
-def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Any) -> tuple[Array, Array, float]:
+def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Expr) -> tuple[Array, Array, float]:
     """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
     sweep = interval.mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
     keep, known = (values[:size] for values in _restarts(extremal))
-    stacked = (keep, known, jumps[:-1].T, z[:, :n], *interval_columns(extremal))
+    stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
     outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
     values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
     slopes = np.zeros((mesh.control_nodes, st.nu))
@@ -265,7 +266,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     e0, kicks = ca.MX.sym("e0", statement.ne), ca.MX.sym("kicks", statement.ne, n + 1)
     weights = ca.MX.sym("weights", statement.ne, n + 1)
-    common = common_columns(mesh, u, duration, p)
+    common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
@@ -294,22 +295,15 @@ def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = T
     after = symbolic.sym("after", size)
     points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
     given = [symbolic.sym(name, len(behind)) for name in ("k0", "km", "k1")]
-    common = interval_symbols(statement, symbolic)
-    ua, ub, s, ds, duration, p = common
+    pair = Interval.symbols(statement)
     slope = state_slope(statement, cost=cost, matrices=matrices)
 
-    def rate(costate: Any, c: float) -> Any:
-        z, full = points[round(2 * c)], _with(costate, behind, given[round(2 * c)])
-        u, t = ua + c * (ub - ua), duration * (s + one_sided(c) * ds)
-        return slope(z[:nx], u, z[nx:], t, duration, p, full[:nx], full[nx:])
+    def rate(costate: Expr, c: float) -> Expr:
+        z, full = points[round(2 * (1 - c))], _with(costate, behind, given[round(2 * (1 - c))])
+        return slope(*pair.at(1 - c, z[:nx], z[nx:]), full[:nx], full[nx:])
 
-    h = duration * ds
-    k1 = rate(after, 1.0)
-    k2 = rate(after + h / 2 * k1, 0.5)
-    k3 = rate(after + h / 2 * k2, 0.5)
-    k4 = rate(after + h * k3, 0.0)
-    before = _with(after + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), behind, given[0])
-    return ca.Function("backward", [after, *points, *given, *common], [before])
+    before = _with(classical_step(rate, after, pair.h), behind, given[0])
+    return ca.Function("backward", [after, *points, *given, *pair], [before])
 
 
 def _behind(statement: Statement) -> list[int]:
@@ -317,7 +311,7 @@ def _behind(statement: Statement) -> list[int]:
     return [statement.nx + k for k in statement.entries(statement.behind)]
 
 
-def _with(column: Any, entries: list[int], values: Any) -> Any:
+def _with(column: Expr, entries: list[int], values: Expr) -> Any:
     """A column with some entries replaced."""
     if not entries:
         return column
@@ -338,28 +332,22 @@ def forward_costates(statement: Statement, pairs: int) -> ca.Function:
     """
     nx, behind = statement.nx, _behind(statement)
     start, z = ca.MX.sym("start", len(behind)), ca.MX.sym("z", nx + statement.ne, 2 * pairs + 1)
-    common = interval_symbols(statement, ca.MX)
+    interval = Interval.symbols(statement, ca.MX)
     slope = state_slope(statement)
     value, points = start, [start]
 
-    def rate(costate: Any, point: int) -> Any:
-        full = _with(ca.MX.zeros(nx + statement.ne), behind, costate)
-        c = point / (2 * pairs)
-        u, _, _, _, duration, p = part_of(common, c, c)
-        time = duration * (common[2] + one_sided(c) * common[3])
-        return -slope(z[:nx, point], u, z[nx:, point], time, duration, p, full[:nx], full[nx:])[behind]
+    def rate(pair: int, costate: Expr, c: float) -> Expr:
+        full, point = _with(ca.MX.zeros(nx + statement.ne), behind, costate), round(2 * (pair + c))
+        place = interval.at(point / (2 * pairs), z[:nx, point], z[nx:, point])
+        return -slope(*place, full[:nx], full[nx:])[behind]
 
-    h = common[4] * common[3] / pairs
+    h, slope_there = interval.h / pairs, rate(0, start, 0.0)
     for j in range(pairs):
-        first, middle, last = 2 * j, 2 * j + 1, 2 * j + 2
-        k1 = rate(value, first)
-        k2 = rate(value + h / 2 * k1, middle)
-        k3 = rate(value + h / 2 * k2, middle)
-        k4 = rate(value + h * k3, last)
-        after = value + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        points += [hermite(value, after, h * k1, h * rate(after, last), 0.5), after]
+        after = classical_step(partial(rate, j), value, h, slope_there)
+        before, slope_there = slope_there, rate(j, after, 1.0)
+        points += [hermite(value, after, h * before, h * slope_there, 0.5), after]
         value = after
-    return ca.Function("forward_costates", [start, z, *common], [value, ca.horzcat(*points)])
+    return ca.Function("forward_costates", [start, z, *interval], [value, ca.horzcat(*points)])
 
 
 def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
@@ -387,11 +375,11 @@ def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, 
     after, impulse = ca.MX.sym("after", size, 1 + influences), ca.MX.sym("impulse", size)
     z, given = ca.MX.sym("z", size, 2 * pairs + 1), ca.MX.sym("given", count, 2 * pairs + 1)
     zero = ca.DM.zeros(count, 2 * pairs + 1)
-    common = interval_symbols(statement, ca.MX)
+    interval = Interval.symbols(statement, ca.MX)
     steps = [backward_pair(statement), backward_pair(statement, cost=False, matrices=matrices)]
     columns, passed = ca.horzsplit(after), []
     for j in range(pairs - 1, -1, -1):
-        part = part_of(common, j / pairs, (j + 1) / pairs)
+        part = interval.part(j / pairs, (j + 1) / pairs)
         at = [2 * j, 2 * j + 1, 2 * j + 2]
         columns = [
             steps[min(k, 1)](column, *(v[:, i] for v in (z, zero if k else given) for i in at), *part)
@@ -399,7 +387,7 @@ def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, 
         ]
         passed.append(ca.horzcat(*columns))
     start = ca.horzcat(columns[0] + impulse, *columns[1:])
-    return ca.Function("backward_interval", [after, impulse, z, given, *common], [start, ca.horzcat(*passed[::-1])])
+    return ca.Function("backward_interval", [after, impulse, z, given, *interval], [start, ca.horzcat(*passed[::-1])])
 
 
 def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
@@ -424,27 +412,25 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     start, _ = interval(keep * after + known, *rest)
     sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
-    given, last_given = given_costates(st, values, interval_columns(extremal), pairs)
+    given, last_given = given_costates(st, values, extremal.intervals, pairs)
     points = values[backward].transpose(2, 0, 1).reshape(size, -1)
     stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
     last[: st.nx] += passage_end(extremal, last_given)[0]
     reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
-    result = sweep(
-        last, *stacked, points, reversed_given, *(column[:, backward] for column in interval_columns(extremal))
-    )
+    result = sweep(last, *stacked, points, reversed_given, *extremal.intervals.columns(backward))
     costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
 
 
-def given_costates(statement: Statement, values: Array, common: tuple[Any, ...], pairs: int) -> tuple[Array, Array]:
+def given_costates(statement: Statement, values: Array, common: Interval, pairs: int) -> tuple[Array, Array]:
     """Costates of the matrices that run backward along a trajectory; none where none does.
 
     Args:
         statement: the problem.
         values: x and e at the starts, middles and ends of the pairs of all intervals, (N, 2 pairs + 1, size).
-        common: common arguments of the interval functions, a column for each interval.
+        common: the intervals, a column for each.
         pairs: Runge-Kutta steps an interval.
 
     Returns:

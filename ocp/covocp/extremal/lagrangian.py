@@ -12,13 +12,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import common_columns, matrices_along
+from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, nominal_interval
 
 
@@ -61,7 +62,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     final, final_e, start, end = (ca.MX.sym(name, length) for name, length in lengths.items())
     lengths = {"path": st.path.size, "states": st.nx, "matrices": st.ne}
     path, states, matrices = (ca.MX.sym(name, length, n + 1) for name, length in lengths.items())
-    common = common_columns(mesh, u, duration, p)
+    common = interval_columns(mesh, u, duration, p)
     x = z[: st.nx, :]
     if st.coupled:
         ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
@@ -113,11 +114,11 @@ def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
-    common = common_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
+    common = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
     values = _interval_slopes(st, mesh)(z[:-1].T, *common)
     n, count = z.shape[1], mesh.intervals
 
-    def each(value: Any) -> Array:
+    def each(value: Expr) -> Array:
         numbers = np.asarray(value.full())
         return numbers.reshape(n, count, -1).transpose(1, 0, 2)
 

@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.extremal.closed_loop import ClosedLoop
@@ -157,13 +158,13 @@ def _curved(st: Statement) -> ca.Function:
     return ca.Function("curved", [*six, spread], inner.call([augmented, *six, spread]))
 
 
-def _columns(slopes: Any, states: int, controls: int) -> tuple[Any, Any]:
+def _columns(slopes: Expr, states: int, controls: int) -> tuple[Any, Any]:
     """Slopes by the augmented state and by the controls that are fed back."""
     by_state, by_control = ca.horzsplit(slopes, [0, states, states + controls])
     return by_state, by_control
 
 
-def _bend(values: Any, z: Any, covariance: Any) -> Any:
+def _bend(values: Expr, z: Expr, covariance: Expr) -> Any:
     """tr(v_zz Z) of each of some values v, Z being their arguments' covariance."""
     size = z.shape[0]
     unit = ca.DM.eye(size)

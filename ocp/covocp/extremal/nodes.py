@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack
 from covocp.extremal.extremal import Extremal
-from covocp.transcription.rosenbrock import one_sided
+from covocp.statement.interval import one_sided
 
 
 def rates_along(extremal: Extremal) -> tuple[Array, Array]:
@@ -18,7 +17,7 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
     """
     function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
 
-    def stacked(u: Any, time: Array) -> Array:
+    def stacked(u: Expr, time: Array) -> Array:
         state, matrices, _ = function(x, u, e, time[None, :], *rest)
         return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
 

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
@@ -216,7 +217,7 @@ def _along(extremal: Extremal, costates: Costates) -> tuple[Array, Array, Array,
     st = extremal.statement
     make = hamiltonian(st)
 
-    def select(h: Any, x: Any, u: Any, e: Any, t: Any) -> list[Any]:
+    def select(h: Expr, x: Expr, u: Expr, e: Expr, t: Expr) -> list[Any]:
         return [h, ca.gradient(h, u), ca.hessian(h, u)[0] if st.nu else ca.DM(0, 0)]
 
     function = make("along", select)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import OF_RANGE, Dense, mapped
 from covocp.extremal.extremal import Extremal
@@ -102,7 +102,7 @@ def _sizes(lower: Array, upper: Array, largest: Array) -> Array:
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _values(extremal: Extremal, dense: Dense, k: Any, s: Array) -> Array:
+def _values(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
     """States and path constraints at normalised times s of the intervals k, (K, rows)."""
     st, mesh, u = extremal.statement, extremal.mesh, extremal.controls
     z = dense.at(s)

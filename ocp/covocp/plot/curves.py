@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.threads import cached
 from covocp.solution.sample import Sample
@@ -145,7 +145,7 @@ class Drawn:
             return flat.reshape(self.t.size, *values.shape[1:])
         return np.asarray(PchipInterpolator(self.solution.t, values, axis=0)(self.t))
 
-    def spread(self, key: Any) -> tuple[Array, Array, Array]:
+    def spread(self, key: Given) -> tuple[Array, Array, Array]:
         """Root mean squares at the times, each (K, size): deviation, its error of the estimate, its estimate.
 
         The deviation of an expression g(x, b, u) is g_x dx + g_u du, with dx = x' - e and du = -C x'.
@@ -166,7 +166,7 @@ class Drawn:
         total, error, estimate = (self.between(np.sqrt(np.maximum(v, 0.0))) for v in variances)
         return total, error, estimate
 
-    def _slopes(self, key: Any) -> tuple[Array, Array]:
+    def _slopes(self, key: Given) -> tuple[Array, Array]:
         """Slopes of a name or an expression by the augmented state (K, rows, n) and by the control (K, rows, nu)."""
         solution, augmented = self.solution, self.solution.augmented
         controls = tuple(b for b in solution.blocks if b.kind == "control" and not (solution.loop and b.name == GAIN))
@@ -194,7 +194,7 @@ class Drawn:
         return self.solution.targets[block.span]
 
 
-def shortened(expression: Any) -> str:
+def shortened(expression: Given) -> str:
     """An expression as a label."""
     text = str(expression)
     return text if len(text) <= LONGEST_LABEL else text[: LONGEST_LABEL - 3] + "..."

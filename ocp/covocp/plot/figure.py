@@ -12,6 +12,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, either, optional, positives, sequence, text, texts_by_name, truth
 from covocp.base.errors import ProblemError, no_option
+from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
 from covocp.plot.curves import Panel
 from covocp.plot.legends import fold_title, place_legend
@@ -92,7 +93,7 @@ def plot_solutions(
     labels: Sequence[str] | None = None,
     costates: bool = False,
     gains: bool = False,
-    over: Any = None,
+    over: Given = None,
     sigmas: Sequence[float] = (1.0,),
     units: Mapping[str, str] | None = None,
     title: str | None = None,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, ratio_unit, shortened, unit_of
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
@@ -29,7 +29,7 @@ def knows(solution: Solution, word: str) -> bool:
     return solution.loop is not None
 
 
-def rms(drawn: Sequence[Drawn], key: Any, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
+def rms(drawn: Sequence[Drawn], key: Given, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Root mean squares of the deviations of a symbol or an expression.
 
     Of one closed loop with their parts, of several with the error of the estimate. Of unknown constants, whose actual
@@ -63,7 +63,7 @@ def rms(drawn: Sequence[Drawn], key: Any, blocks: Mapping[str, Block], units: Ma
     ]
 
 
-def _as_block(name: str, expression: Any) -> Block:
+def _as_block(name: str, expression: Given) -> Block:
     return Block(name=name, kind="state", size=expression.shape[0] * expression.shape[1], offset=0)
 
 

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
@@ -51,7 +52,7 @@ def choose_panels(
     *,
     costates: bool,
     gains: bool = False,
-    over: Any = None,
+    over: Given = None,
     units: Mapping[str, str],
 ) -> list[Panel]:
     """The panels of a figure; see `covocp.plot.figure.plot_solutions`.
@@ -102,7 +103,7 @@ def _varies(drawn: Drawn, block: Block) -> bool:
     return deviation is not None and bool(np.any(deviation))
 
 
-def _keys(solutions: list[Solution], name: Any) -> list[Any]:
+def _keys(solutions: list[Solution], name: Given) -> list[Any]:
     """What a name given by the user stands for; a dict gives its entries labels.
 
     Raises:
@@ -113,7 +114,7 @@ def _keys(solutions: list[Solution], name: Any) -> list[Any]:
     return [_resolved(solutions, name)]
 
 
-def _of_key(drawn: list[Drawn], key: Any, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
+def _of_key(drawn: list[Drawn], key: Given, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Panels of one quantity."""
     if isinstance(key, Labelled):
         panels = _of_key(drawn, key.key, blocks, units)
@@ -184,7 +185,7 @@ def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], un
     return _matrix([(d, d.t, d.between(getattr(d.solution.loop, key.word))) for d in drawn], block, units)
 
 
-def _resolved(solutions: list[Solution], key: Any) -> Any:
+def _resolved(solutions: list[Solution], key: Given) -> Any:
     """A name, a pair of names, a quantity, or the expression itself.
 
     Raises:
@@ -213,7 +214,7 @@ def _resolved(solutions: list[Solution], key: Any) -> Any:
     raise error
 
 
-def _uncertain(solutions: list[Solution], word: str, key: Any) -> Any:
+def _uncertain(solutions: list[Solution], word: str, key: Given) -> Any:
     """What a root mean square or a gain may be of.
 
     Raises:
@@ -252,13 +253,13 @@ def _unknown_word(word: str) -> ProblemError:
     )
 
 
-def abscissa_label(solutions: list[Solution], over: Any, units: Mapping[str, str]) -> str:
+def abscissa_label(solutions: list[Solution], over: Given, units: Mapping[str, str]) -> str:
     """Label of an abscissa that is not time."""
     key = _resolved(solutions, over)
     return key + unit_of(key, units) if isinstance(key, str) else shortened(key)
 
 
-def _expression(drawn: list[Drawn], key: Any) -> list[Panel]:
+def _expression(drawn: list[Drawn], key: Given) -> list[Panel]:
     """An expression of the symbols with its band, through its values at the nodes."""
     curves: list[Curve] = []
     count = 1

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.plot.curves import Drawn, Ellipse, Panel, shortened, unit_of
 from covocp.statement.names import block_of
@@ -17,7 +17,7 @@ from covocp.statement.names import block_of
 ELLIPSES = 9
 
 
-def over_panels(drawn: Sequence[Drawn], panels: list[Panel], key: Any, units: Mapping[str, str]) -> list[Panel]:
+def over_panels(drawn: Sequence[Drawn], panels: list[Panel], key: Given, units: Mapping[str, str]) -> list[Panel]:
     """The panels with another quantity than time as abscissa.
 
     Args:
@@ -71,7 +71,7 @@ def _comparable(one: str, other: str, units: Mapping[str, str]) -> bool:
     return one.split("[")[0] == other.split("[")[0]
 
 
-def _ellipses(drawn: Drawn, key: Any, panel: Panel) -> list[Ellipse]:
+def _ellipses(drawn: Drawn, key: Given, panel: Panel) -> list[Ellipse]:
     """Ellipses of two states or unknowns at some nodes, where both are uncertain."""
     rows = [drawn.rows(name) if isinstance(name, str) else [] for name in (key, panel.key)]
     if any(len(own) != 1 for own in rows) or rows[0] == rows[1]:

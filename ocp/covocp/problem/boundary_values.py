@@ -10,10 +10,11 @@ import numpy as np
 
 from covocp.base.checks import check_inside, column, data_column, is_symbolic
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 
 
-def end_value(name: str, what: str, value: Any, lower: Array, upper: Array) -> Any:
+def end_value(name: str, what: str, value: Given, lower: Array, upper: Array) -> Any:
     """An initial or final value of a vector as a column; what is free is NaN in it.
 
     Args:
@@ -34,7 +35,7 @@ def end_value(name: str, what: str, value: Any, lower: Array, upper: Array) -> A
     return data_column(name, f"{what} value", value, lower.size, nan=True)
 
 
-def check_free(name: str, what: str, value: Any) -> None:
+def check_free(name: str, what: str, value: Given) -> None:
     """What is free is None, never NaN: NaN is what a computation that went wrong leaves.
 
     Raises:
@@ -49,7 +50,7 @@ def check_free(name: str, what: str, value: Any) -> None:
         )
 
 
-def _entries(value: Any) -> Iterator[Any]:
+def _entries(value: Given) -> Iterator[Any]:
     """The numbers, and whatever else there is, in a value."""
     if is_symbolic(value):
         value = ca.evalf(value) if value.is_constant() else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -31,19 +32,18 @@ from covocp.base.checks import (
     scale_column,
 )
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
 from covocp.problem.declarations import (
     Constraint,
     Control,
+    Declarations,
     Dynamics,
-    Expansion,
-    Expected,
     Free,
     Gain,
     Guess,
-    Matrix,
     Measurement,
     Parameter,
     Place,
@@ -51,9 +51,8 @@ from covocp.problem.declarations import (
     Unknown,
     declare_matrix,
 )
-from covocp.problem.estimation_covariance import EstimationCovariance, augmented_names
-from covocp.problem.expected_cost import check_first_cost, derive, expected_cost
-from covocp.problem.freeze import freeze
+from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
+from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
 from covocp.problem.measurement_information import stated_noise
 from covocp.statement.statement import Statement
 
@@ -66,6 +65,9 @@ class Problem:
         duration: terminal time [s], or `Free(guess, lower, upper)`.
         name: appears in printouts and plots.
 
+    Attributes:
+        doubts_told: whether it was said what is probably forgotten in it, since the last change.
+
     Raises:
         ProblemError: where the duration is not positive.
     """
@@ -75,40 +77,58 @@ class Problem:
         if not isinstance(duration, Free):
             duration = check_positive("duration", duration, unit="s")
         check_kind(name, str, "give name= in words")
-        self.name = name
-        self.free_duration: Free | None = duration if isinstance(duration, Free) else None
-        self._time = ca.MX.sym("time")
-        self._duration: Any = ca.MX.sym("duration") if isinstance(duration, Free) else duration
-        self.states: list[State] = []
-        self.unknowns: list[Unknown] = []
-        self.parameters: list[Parameter] = []
-        self.controls: list[Control] = []
-        self.matrices: list[Matrix] = []
-        self.rates: dict[str, Dynamics] = {}
-        self.measurements: list[Measurement] = []
-        self.constraints: list[Constraint] = []
-        self.cost: tuple[ca.MX, ca.MX] | None = None
-        self.expected: Expected | None = None
-        self.expansion: Expansion | None = None
-        self._mentioned = False  # whether what may be forgotten in it was said
-        self._frozen: Statement | None = None
+        free = duration if isinstance(duration, Free) else None
+        symbol = ca.MX.sym("duration") if isinstance(duration, Free) else duration
+        self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
+        self._statement: Statement | None = None
+        self.doubts_told = False
+
+    @classmethod
+    def of(cls, declarations: Declarations) -> Problem:
+        """A problem with these declarations."""
+        result = cls(declarations.free_duration or declarations.duration, declarations.name)
+        result._declarations = declarations
+        return result
+
+    @property
+    def declarations(self) -> Declarations:
+        """What is declared so far."""
+        return self._declarations
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self._declarations.name
+
+    # What is declared can be read by its groups.
+    states = property(lambda self: self._declarations.states)
+    unknowns = property(lambda self: self._declarations.unknowns)
+    parameters = property(lambda self: self._declarations.parameters)
+    controls = property(lambda self: self._declarations.controls)
+    matrices = property(lambda self: self._declarations.matrices)
+    rates = property(lambda self: self._declarations.rates)
+    measurements = property(lambda self: self._declarations.measurements)
+    constraints = property(lambda self: self._declarations.constraints)
+    cost = property(lambda self: self._declarations.cost)
+    expected = property(lambda self: self._declarations.expected)
+    expansion = property(lambda self: self._declarations.expansion)
+    free_duration = property(lambda self: self._declarations.free_duration)
 
     def __repr__(self) -> str:
         """What is declared, by name."""
-        groups: tuple[Any, ...] = (self.states, self.unknowns, self.controls, self.matrices)
-        parts = zip(("states", "unknowns", "controls", "matrices"), groups, strict=True)
-        listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in parts if group)
+        groups = ((kind, getattr(self._declarations, kind)) for kind in ("states", "unknowns", "controls", "matrices"))
+        listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in groups if group)
         return f"Problem('{self.name}'{listed})"
 
     @property
     def time(self) -> ca.MX:
         """Symbol of the running time [s]."""
-        return self._time
+        return self._declarations.time
 
     @property
     def duration(self) -> Any:
         """Symbol of the terminal time [s], or its number where it is fixed."""
-        return self._duration
+        return self._declarations.duration
 
     @checked(unit=text)
     def state(
@@ -116,13 +136,13 @@ class Problem:
         name: str,
         shape: int = 1,
         *,
-        initial: Any,
-        final: Any = None,
-        lower: Any = -np.inf,
-        upper: Any = np.inf,
+        initial: Given,
+        final: Given = None,
+        lower: Given = -np.inf,
+        upper: Given = np.inf,
         guess: Guess = None,
-        scale: Any = None,
-        variance: Any = None,
+        scale: Given = None,
+        variance: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a nominal vector state.
@@ -164,11 +184,11 @@ class Problem:
             scale=scale_column(name, scale, size),
             variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
         )
-        self.states.append(declaration)
+        self._change(self._declarations.adding(states=declaration))
         return declaration.symbol
 
     @checked(unit=text)
-    def unknown(self, name: str, mean: Any, variance: Any, *, unit: str = "") -> ca.MX:
+    def unknown(self, name: str, mean: Given, variance: Given, *, unit: str = "") -> ca.MX:
         """Declare a constant unknown parameter: part of the augmented state, not integrated in the nominal.
 
         Args:
@@ -193,11 +213,11 @@ class Problem:
             mean=column(name, "mean", mean, size),
             variance=density_matrix(name, "variance", variance, size),
         )
-        self.unknowns.append(declaration)
+        self._change(self._declarations.adding(unknowns=declaration))
         return declaration.symbol
 
     @checked(unit=text)
-    def parameter(self, name: str, value: Any, *, unit: str = "") -> ca.MX:
+    def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
         """Declare a known number (or vector) that may change from solve to solve without rebuilding.
 
         Raises:
@@ -212,7 +232,7 @@ class Problem:
             unit=unit,
             value=column(name, "value", value, size),
         )
-        self.parameters.append(declaration)
+        self._change(self._declarations.adding(parameters=declaration))
         return declaration.symbol
 
     @checked(unit=text)
@@ -221,10 +241,10 @@ class Problem:
         name: str,
         shape: int = 1,
         *,
-        lower: Any = -np.inf,
-        upper: Any = np.inf,
+        lower: Given = -np.inf,
+        upper: Given = np.inf,
         guess: Guess = 0.0,
-        scale: Any = None,
+        scale: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a control vector with its bounds, guess and scale (as for states), and unit for the axes of plots.
@@ -249,7 +269,7 @@ class Problem:
             guess=guess,
             scale=scale_column(name, scale, size),
         )
-        self.controls.append(declaration)
+        self._change(self._declarations.adding(controls=declaration))
         return declaration.symbol
 
     @checked(unit=text)
@@ -258,10 +278,10 @@ class Problem:
         name: str,
         size: int,
         *,
-        initial: Any,
-        final: Any = None,
+        initial: Given,
+        final: Given = None,
         lower: float | None = None,
-        guess: Any = None,
+        guess: Given = None,
         unit: str = "",
     ) -> ca.MX:
         """Declare a general symmetric matrix state, stored as its half-vector.
@@ -300,10 +320,10 @@ class Problem:
             guess=guess,
             covariance=lower is not None and lower >= 0,
         )
-        self.matrices.append(declaration)
+        self._change(self._declarations.adding(matrices=declaration))
         return declaration.matrix
 
-    def estimation_covariance(self, initial: Any = None) -> EstimationCovariance:
+    def estimation_covariance(self, initial: Given = None) -> EstimationCovariance:
         """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
 
         Its rate is F E + E F' + Q - E M' U^-1 M E, with F and M the Jacobians of dynamics and measurements along the
@@ -318,25 +338,10 @@ class Problem:
         Raises:
             ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
         """
-        entries: list[Any] = [*self.states, *self.unknowns]
-        labels = augmented_names(entries)
-        if not labels:
-            raise ProblemError(
-                "There is nothing to estimate.",
-                expected="states and unknowns declared before estimation_covariance()",
-                received="none",
-                remedy="call estimation_covariance() after the last state() and unknown()",
-            )
-        self._declare("E", len(labels))
-        if initial is None:
-            initial = ca.diagcat(*(entry.variance for entry in entries))
-        declaration = declare_matrix(
-            "E", labels=labels, where=caller(), initial=initial, lower=0.0, covariance=True, estimation=True
-        )
-        self.matrices.append(declaration)
-        return EstimationCovariance(entries, declaration)
+        self._change(with_estimation(self._declarations, initial))
+        return EstimationCovariance(self._declarations.augmented, self._declarations.matrices[-1])
 
-    def dynamics(self, symbol: Any, rate: Any, noise: Any = None) -> None:
+    def dynamics(self, symbol: Given, rate: Given, noise: Given = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
 
         Args:
@@ -348,14 +353,15 @@ class Problem:
         Raises:
             ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
         """
-        name = find_name(symbol, "dynamics", self._declared, (*self.states, *self.matrices))
-        for state in self.states:
+        own = self._declarations
+        name = find_name(symbol, "dynamics", list(own.named), (*own.states, *own.matrices))
+        for state in own.states:
             if state.name == name:
                 value = as_expression(name, "rate", rate, (state.size, 1))
                 density = None if noise is None else density_matrix(name, "noise density", noise, state.size)
                 break
         else:
-            matrix = next((entry for entry in self.matrices if entry.name == name and not entry.estimation), None)
+            matrix = next((entry for entry in own.matrices if entry.name == name and not entry.estimation), None)
             if matrix is None or noise is not None:
                 raise ProblemError(
                     f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
@@ -366,20 +372,20 @@ class Problem:
             full = as_expression(name, "rate", rate, (matrix.size, matrix.size))
             check_symmetric(name, "rate", full)
             value, density = pack_symbolic(full), None
-        if name in self.rates:
+        if name in own.rates:
             raise ProblemError(
                 f"The rate of '{name}' is given twice.",
                 expected="one call of dynamics() for each state",
-                received=f"a first one at {self.rates[name].where}",
+                received=f"a first one at {own.rates[name].where}",
                 remedy="remove one of them",
             )
         one = density is not None and is_scalar(noise)
-        self.rates[name] = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
-        self._frozen = None
+        entry = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
+        self._change(own.adding(rates={name: entry}))
 
     @checked(unit=text)
     def measurement(
-        self, name: str, expression: Any, noise: Any = None, *, information: Any = None, unit: str = ""
+        self, name: str, expression: Given, noise: Given = None, *, information: Given = None, unit: str = ""
     ) -> None:
         """Add a continuous measurement m = expression + v with white noise v.
 
@@ -397,11 +403,10 @@ class Problem:
         value = column_expression(name, "measurement", expression)
         size = self._declare(name, value.shape[0])
         density, inverse = stated_noise(name, noise, information, size)
-        self.measurements.append(
-            Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
-        )
+        entry = Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
+        self._change(self._declarations.adding(measurements=entry))
 
-    def minimize(self, running: Any = 0.0, terminal: Any = 0.0) -> None:
+    def minimize(self, running: Given = 0.0, terminal: Given = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].
 
         Args:
@@ -411,20 +416,20 @@ class Problem:
         Raises:
             ProblemError: not scalar, or given twice.
         """
-        check_first_cost(self, "minimize")
-        self.cost = (
+        check_first_cost(self._declarations, "minimize")
+        cost = (
             as_expression("minimize", "running cost", running, (1, 1)),
             as_expression("minimize", "terminal cost", terminal, (1, 1)),
         )
-        self._frozen = None
+        self._change(replace(self._declarations, cost=cost))
 
     def minimize_expected(
         self,
-        running: Any = 0.0,
-        terminal: Any = 0.0,
+        running: Given = 0.0,
+        terminal: Given = 0.0,
         *,
-        terminal_weight: Any = None,
-        control_weight: Any = None,
+        terminal_weight: Given = None,
+        control_weight: Given = None,
         gain: Gain | None = None,
     ) -> None:
         """State the expected cost <terminal + integral of running> of the actual system under linear feedback.
@@ -444,12 +449,19 @@ class Problem:
         Raises:
             ProblemError: not scalar, cost given twice, weights that do not fit or are negative.
         """
-        check_first_cost(self, "minimize_expected")
-        self.expected = expected_cost(self, running, terminal, terminal_weight, control_weight, gain)
-        self._frozen = None
+        own = self._declarations
+        check_first_cost(own, "minimize_expected")
+        expected = expected_cost(own, running, terminal, terminal_weight, control_weight, gain)
+        self._change(replace(own, expected=expected))
 
     def subject_to(
-        self, expression: Any, *, lower: Any = -np.inf, upper: Any = 0.0, at: Place = "path", name: str | None = None
+        self,
+        expression: Given,
+        *,
+        lower: Given = -np.inf,
+        upper: Given = 0.0,
+        at: Place = "path",
+        name: str | None = None,
     ) -> None:
         """Require lower <= expression <= upper.
 
@@ -468,7 +480,7 @@ class Problem:
         Raises:
             ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place.
         """
-        label = name if name is not None else f"constraint {len(self.constraints) + 1}"
+        label = name if name is not None else f"constraint {len(self._declarations.constraints) + 1}"
         if not isinstance(at, str) or at not in ("path", "initial", "final"):
             raise ProblemError(
                 f"'{label}' has an unknown place.",
@@ -477,12 +489,14 @@ class Problem:
                 remedy="choose one of the three",
             )
         value = column_expression(label, "constraint", expression)
-        constants = [q.symbol for q in self.parameters] + [q.symbol for q in self.unknowns] + [self._time]
+        own = self._declarations
+        constants = [*(q.symbol for q in own.parameters), *(q.symbol for q in own.unknowns), own.time]
         check_constrains(label, value, constants)
         size = self._declare(label, value.shape[0])
         low, high = bound_columns(label, lower, upper, size)
         check_limits(label, low, high)
-        self.constraints.append(Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller()))
+        entry = Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller())
+        self._change(self._declarations.adding(constraints=entry))
 
     def statement(self) -> Statement:
         """The frozen problem that solvers read; built once and kept until something is added.
@@ -490,17 +504,15 @@ class Problem:
         Raises:
             ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
         """
-        if self._frozen is None:
-            self._frozen = freeze(self if self.expected is None else derive(self))
-        return self._frozen
+        if self._statement is None:
+            self._statement = statement_of(self._declarations)
+        return self._statement
 
-    def _declare(self, name: str, size: Any) -> int:
-        """Check that the name is new and the size sensible; forget the frozen statement."""
-        check_name(name, self._declared)
-        self._frozen, self._mentioned = None, False
+    def _declare(self, name: str, size: Given) -> int:
+        """Check that the name is new and the size sensible."""
+        check_name(name, list(self._declarations.named))
         return check_size(name, size)
 
-    @property
-    def _declared(self) -> list[Any]:
-        symbols: list[Any] = [*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices]
-        return [*symbols, *self.measurements, *self.constraints]
+    def _change(self, declarations: Declarations) -> None:
+        """Other declarations from now on: another statement, and other doubts about it."""
+        self._declarations, self._statement, self.doubts_told = declarations, None, False

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.arguments import check_argument, truth
 from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length, unpack_symbolic
 
 Guess = float | Array | Callable[[Array], Any] | None
@@ -143,10 +144,10 @@ def declare_matrix(
     labels: tuple[str, ...],
     where: str,
     unit: str = "",
-    initial: Any = None,
-    final: Any = None,
+    initial: Given = None,
+    final: Given = None,
     lower: float | None = None,
-    guess: Any = None,
+    guess: Given = None,
     covariance: bool = False,
     estimation: bool = False,
     backward: Backward | None = None,
@@ -280,3 +281,45 @@ class Expansion:
     gain: ca.MX
     alternative: ca.MX | None = None
     product: ca.MX | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Declarations:
+    """All that is declared of a problem; another problem is made by replacing some of it.
+
+    time, duration: symbols of the running and of the terminal time; the duration is a number where it is fixed.
+    rates: by the name of the state or the matrix. expansion: of an expected cost that was derived.
+    """
+
+    name: str
+    duration: Any
+    free_duration: Free | None = None
+    time: ca.MX = field(default_factory=lambda: ca.MX.sym("time"))
+    states: tuple[State, ...] = ()
+    unknowns: tuple[Unknown, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    controls: tuple[Control, ...] = ()
+    matrices: tuple[Matrix, ...] = ()
+    rates: Mapping[str, Dynamics] = field(default_factory=dict)
+    measurements: tuple[Measurement, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
+    cost: tuple[ca.MX, ca.MX] | None = None
+    expected: Expected | None = None
+    expansion: Expansion | None = None
+
+    @property
+    def named(self) -> tuple[Any, ...]:
+        """All declarations that have a name."""
+        symbols = (*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices)
+        return (*symbols, *self.measurements, *self.constraints)
+
+    @property
+    def augmented(self) -> list[State | Unknown]:
+        """What is estimated: states, then unknowns; constants that are chosen are not."""
+        return [*(state for state in self.states if state.estimated), *self.unknowns]
+
+    def adding(self, **more: Any) -> Declarations:
+        """These and one more each in some groups, by the names of the groups; rates by name."""
+        rates = {**self.rates, **more.pop("rates", {})}
+        grown: dict[str, Any] = {group: (*getattr(self, group), entry) for group, entry in more.items()}
+        return replace(self, rates=rates, **grown)

@@ -7,10 +7,11 @@ from typing import Any
 
 import casadi as ca
 
-from covocp.base.checks import is_symbolic
+from covocp.base.checks import caller, check_name, is_symbolic
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
-from covocp.problem.declarations import Matrix, State, Unknown
+from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
 
 Entry = State | Unknown
 
@@ -20,6 +21,31 @@ def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
     return tuple(
         entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
     )
+
+
+def with_estimation(declarations: Declarations, initial: Given = None) -> Declarations:
+    """The declarations with the Kalman-Bucy covariance E of the augmented state, the last of the matrices.
+
+    Args:
+        declarations: of a problem.
+        initial: covariance at the start; None: from the variances of states and unknowns.
+
+    Raises:
+        ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
+    """
+    entries = declarations.augmented
+    labels = augmented_names(entries)
+    if not labels:
+        raise ProblemError(
+            "There is nothing to estimate.",
+            expected="states and unknowns declared before estimation_covariance()",
+            received="none",
+            remedy="call estimation_covariance() after the last state() and unknown()",
+        )
+    check_name("E", list(declarations.named))
+    initial = ca.diagcat(*(entry.variance for entry in entries)) if initial is None else initial
+    options = {"initial": initial, "lower": 0.0, "covariance": True, "estimation": True}
+    return declarations.adding(matrices=declare_matrix("E", labels=labels, where=caller(), **options))
 
 
 @methods_one_at_a_time
@@ -45,7 +71,7 @@ class EstimationCovariance:
         """Names of the rows."""
         return self._declaration.labels
 
-    def __getitem__(self, key: Any) -> ca.MX:
+    def __getitem__(self, key: Given) -> ca.MX:
         """Covariance between two symbols or names, shape (size of a, size of b).
 
         Raises:
@@ -65,7 +91,7 @@ class EstimationCovariance:
         rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
         return rows @ self.matrix @ columns.T
 
-    def _rows(self, key: Any) -> Any:
+    def _rows(self, key: Given) -> Any:
         """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
         if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
             row = self.labels.index(key)

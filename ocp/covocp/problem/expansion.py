@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_dynamics, density_matrix
 from covocp.base.errors import ProblemError
-from covocp.problem.declarations import Expansion, Expected
-
-if TYPE_CHECKING:
-    from covocp.problem.builder import Problem
+from covocp.base.expressions import Expr
+from covocp.problem.declarations import Declarations, Expansion, Expected
 
 
-def expand(problem: Problem, expected: Expected) -> Expansion:
+def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
     entries: list[Any] = [*problem.states, *problem.unknowns]
     check_dynamics(problem.states, problem.rates)
@@ -48,7 +46,7 @@ def expand(problem: Problem, expected: Expected) -> Expansion:
     )
 
 
-def measurement_slope(problem: Problem, size: int) -> tuple[Any, Any]:
+def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
     """M and U of all measurements."""
     entries: list[Any] = [*problem.states, *problem.unknowns]
     augmented = [entry.symbol for entry in entries]
@@ -58,7 +56,7 @@ def measurement_slope(problem: Problem, size: int) -> tuple[Any, Any]:
     return _slope(value, augmented), ca.diagcat(*(m.noise for m in problem.measurements))
 
 
-def _slope(expression: Any, symbols: list[Any]) -> Any:
+def _slope(expression: Expr, symbols: list[Any]) -> Any:
     """Jacobian by several symbols, side by side.
 
     An interpolation table expands to scalar operations and its derivative does not, so that of its expansion is taken.
@@ -76,7 +74,7 @@ def _slope(expression: Any, symbols: list[Any]) -> Any:
     return slope
 
 
-def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
+def _weight_matrix(weights: Expr, entries: Sequence[Any], what: str) -> Any:
     """One matrix over some entries from weights by name, a number or a matrix; None without weights."""
     if weights is None:
         return None
@@ -85,7 +83,7 @@ def _weight_matrix(weights: Any, entries: list[Any], what: str) -> Any:
     return density_matrix("minimize_expected", what, weights, sum(e.size for e in entries))
 
 
-def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> Any:
+def _control_weights(problem: Declarations, expected: Expected, curvature: Expr) -> Any:
     """B: the given weights, L_uu where none is given [Schmidt 6.6]; every control needs one."""
     given = expected.control_weight
     if given is None:
@@ -123,7 +121,7 @@ def _control_weights(problem: Problem, expected: Expected, curvature: Any) -> An
     return ca.sparsify(ca.evalf(weights)) if constant else weights
 
 
-def _check_terminal_weights(problem: Problem, end: Any) -> None:
+def _check_terminal_weights(problem: Declarations, end: Expr) -> None:
     """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
     offset = 0
     for state in problem.states:

@@ -24,33 +24,42 @@ So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_expression, as_number, caller, density_matrix, find_name
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
-from covocp.problem.declarations import Backward, Control, Dynamics, Expansion, Expected, Gain, State, declare_matrix
-from covocp.problem.estimation_covariance import augmented_names
+from covocp.problem.declarations import (
+    Backward,
+    Control,
+    Declarations,
+    Dynamics,
+    Expansion,
+    Expected,
+    Gain,
+    State,
+    declare_matrix,
+)
+from covocp.problem.estimation_covariance import augmented_names, with_estimation
 from covocp.problem.expansion import expand, measurement_slope
+from covocp.problem.freeze import freeze
 from covocp.problem.measurement_information import inverse_density
 from covocp.statement.names import name_of, split_entry
-
-if TYPE_CHECKING:
-    from covocp.problem.builder import Problem
+from covocp.statement.statement import Statement
 
 # Names of what the derived problem adds to the user's symbols.
 FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
 
 
 def expected_cost(
-    problem: Problem, running: Any, terminal: Any, terminal_weight: Any, control_weight: Any, gain: Gain | None
+    problem: Declarations, running: Expr, terminal: Expr, terminal_weight: Expr, control_weight: Expr, gain: Gain | None
 ) -> Expected:
     """Check and keep what `Problem.minimize_expected` was given."""
     if gain is not None and not isinstance(gain, Gain):
@@ -71,7 +80,7 @@ def expected_cost(
     )
 
 
-def check_first_cost(problem: Any, call: str) -> None:
+def check_first_cost(problem: Declarations, call: str) -> None:
     """A problem has one cost, stated by `minimize` or by `minimize_expected`."""
     former = "minimize" if problem.cost is not None else "minimize_expected" if problem.expected is not None else ""
     if former:
@@ -85,7 +94,7 @@ def check_first_cost(problem: Any, call: str) -> None:
         )
 
 
-def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
+def _by_name(what: str, weights: Expr, entries: Sequence[Any]) -> Any:
     """Weights given by symbol or name, as matrices by name; a whole matrix, or a number, as it is."""
     if not isinstance(weights, Mapping):
         return weights
@@ -96,7 +105,7 @@ def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
         name = name_of(key, symbols, tuple(sizes), missing_ok=True, sizes=sizes)
         entry = split_entry(name)
         if name in sizes or entry is None:
-            name = find_name(key, what, entries, tuple(entries))
+            name = find_name(key, what, list(entries), tuple(entries))
             weight = density_matrix(name, word, value, sizes[name])
         else:
             name, k = entry
@@ -106,14 +115,19 @@ def _by_name(what: str, weights: Any, entries: list[Any]) -> Any:
     return result
 
 
-def derive(problem: Problem) -> Problem:
+def statement_of(problem: Declarations) -> Statement:
+    """The frozen statement of what is declared; of an expected cost, that of the problem derived from it."""
+    return freeze(problem if problem.expected is None else derive(problem))
+
+
+def derive(problem: Declarations) -> Declarations:
     """The deterministic vector-matrix problem of a problem with an expected cost.
 
     Args:
         problem: with `minimize_expected`.
 
     Returns:
-        A problem on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
+        Declarations on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
 
     Raises:
         ProblemError: the system is deterministic or has no control, it contains matrices, a control has no weight, a
@@ -123,9 +137,9 @@ def derive(problem: Problem) -> Problem:
     assert expected is not None
     _check_random(problem)
     _check_contents(problem, expected)
-    derived = _copied(problem)
+    derived = replace(problem, expected=None)
     if not any(matrix.estimation for matrix in derived.matrices):
-        derived.estimation_covariance()
+        derived = with_estimation(derived)
     _check_free_names(derived)
     expansion = expand(derived, expected)
     E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
@@ -137,24 +151,22 @@ def derive(problem: Problem) -> Problem:
         blocks = [(entry.noise, entry.information) for entry in derived.measurements]
         information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
     if expected.gain is None:
-        S, expansion = _add_feedback(derived, expansion)
+        derived, S, expansion = _with_feedback(derived, expansion)
         fed = S @ expansion.G + expansion.N
         regained = _trace(S, expansion.Q) + _trace(fed @ _inverse(expansion.B) @ fed.T, E)
         expansion = replace(expansion, alternative=expansion.running + regained / 2, product=_trace(S, E) / 2)
         running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
         terminal = expansion.terminal + _trace(expansion.end, E) / 2
     else:
-        X, expansion = _add_free_gain(derived, expansion, expected.gain, information)
+        derived, X, expansion = _with_free_gain(derived, expansion, expected.gain, information)
         C = expansion.gain
         fed = _trace(expansion.B @ C, X @ C.T) - 2 * _trace(expansion.N, C @ X)
         running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
         terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
-    derived.cost = (running, terminal)
-    derived.expansion = expansion
-    return derived
+    return replace(derived, cost=(running, terminal), expansion=expansion)
 
 
-def deterministic(problem: Problem) -> Problem:
+def deterministic(problem: Declarations) -> Declarations:
     """The problem without its noise: what quadratic synthesis takes the nominal from [Schmidt 6.3].
 
     Raises:
@@ -176,35 +188,24 @@ def deterministic(problem: Problem) -> Problem:
             received=str(expected.gain),
             remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
         )
-    plain = _copied(problem)
-    plain.cost = (expected.running, expected.terminal)
     used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
-    plain.matrices = [m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation]
-    entries: list[Any] = [*problem.states, *problem.controls, *plain.matrices]
+    matrices = tuple(m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation)
+    cost = (expected.running, expected.terminal)
+    entries: list[Any] = [*problem.states, *problem.controls, *matrices]
     chosen = {entry.symbol.__hash__() for entry in entries}
     if problem.free_duration is not None:
         chosen.add(problem.duration.__hash__())
-    if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*plain.cost))):
+    if not any(symbol.__hash__() in chosen for symbol in ca.symvar(ca.veccat(*cost))):
         raise ProblemError(
             "The deterministic part of the expected cost depends on nothing that can be chosen.",
             expected="a running or terminal cost of states, controls or the free duration",
             received=f"running = {expected.running}, terminal = {expected.terminal}",
             remedy="evaluate(problem, nominal=...) takes any nominal; or add a small deterministic cost",
         )
-    return plain
+    return replace(problem, cost=cost, expected=None, matrices=matrices)
 
 
-def _copied(problem: Problem) -> Problem:
-    """The same declarations and symbols, in lists of its own."""
-    derived = copy.copy(problem)
-    for name in ("states", "unknowns", "parameters", "controls", "matrices", "measurements", "constraints"):
-        setattr(derived, name, list(getattr(problem, name)))
-    derived.rates = dict(problem.rates)
-    derived.expected, derived._frozen = None, None
-    return derived
-
-
-def _check_random(problem: Problem) -> None:
+def _check_random(problem: Declarations) -> None:
     """Something must be uncertain, or the expected cost is the deterministic one."""
     entries: list[Any] = [*problem.states, *problem.unknowns]
     variances = [entry.variance for entry in entries]
@@ -220,7 +221,7 @@ def _check_random(problem: Problem) -> None:
         )
 
 
-def _check_contents(problem: Problem, expected: Expected) -> None:
+def _check_contents(problem: Declarations, expected: Expected) -> None:
     """There is a control, the actual system contains no matrices, and the weights no symbols of another problem."""
     if not problem.controls:
         raise ProblemError(
@@ -255,9 +256,9 @@ def _check_contents(problem: Problem, expected: Expected) -> None:
                 )
 
 
-def _check_free_names(problem: Problem) -> None:
+def _check_free_names(problem: Declarations) -> None:
     """The names of the derived matrices must not be taken."""
-    for entry in problem._declared:
+    for entry in problem.named:
         if entry.name in (FEEDBACK, ESTIMATE, GAIN):
             raise ProblemError(
                 f"The name '{entry.name}' is taken by minimize_expected().",
@@ -267,12 +268,12 @@ def _check_free_names(problem: Problem) -> None:
             )
 
 
-def _trace(a: Any, b: Any) -> Any:
+def _trace(a: Expr, b: Expr) -> Any:
     """tr(a b)."""
     return ca.dot(ca.densify(a), ca.densify(b.T)) if a.shape[0] else ca.MX(0)
 
 
-def _inverse(density: Any) -> Any:
+def _inverse(density: Expr) -> Any:
     """`inverse`, in scalar operations where it is a full matrix of expressions: CasADi solves those numerically."""
     if density.is_constant() or density.sparsity().is_diag():
         return inverse(density)
@@ -280,7 +281,7 @@ def _inverse(density: Any) -> Any:
     return ca.Function("inverse", [entries], [ca.inv(entries)])(density)
 
 
-def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansion]:
+def _with_feedback(problem: Declarations, expansion: Expansion) -> tuple[Declarations, Any, Expansion]:
     """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
     labels = augmented_names([*problem.states, *problem.unknowns])
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
@@ -288,12 +289,13 @@ def _add_feedback(problem: Problem, expansion: Expansion) -> tuple[Any, Expansio
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
     backward = Backward(end=expansion.end, form=form)
     feedback = declare_matrix(FEEDBACK, labels=labels, where="minimize_expected()", backward=backward)
-    problem.matrices.append(feedback)
     S = feedback.matrix
-    return S, replace(expansion, gain=weight @ (G.T @ S + N.T))
+    return problem.adding(matrices=feedback), S, replace(expansion, gain=weight @ (G.T @ S + N.T))
 
 
-def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, information: Any) -> tuple[Any, Expansion]:
+def _with_free_gain(
+    problem: Declarations, expansion: Expansion, gain: Gain, information: Expr
+) -> tuple[Declarations, Any, Expansion]:
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
     labels = augmented_names([*problem.states, *problem.unknowns])
     size, rows = len(labels), sum(control.size for control in problem.controls)
@@ -318,10 +320,11 @@ def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, informati
     if gain.constant:
         free = ca.MX(ca.DM.nan(where.size, 1))
         nothing = ca.MX(where.size, where.size)
-        problem.states.append(State(**common, initial=free, final=free, variance=nothing, estimated=False))
-        problem.rates[GAIN] = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
+        constants = State(**common, initial=free, final=free, variance=nothing, estimated=False)
+        still = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
+        problem = problem.adding(states=constants, rates={GAIN: still})
     else:
-        problem.controls.append(Control(**common))
+        problem = problem.adding(controls=Control(**common))
     estimate = declare_matrix(
         ESTIMATE,
         labels=labels,
@@ -330,11 +333,10 @@ def _add_free_gain(problem: Problem, expansion: Expansion, gain: Gain, informati
         lower=0.0,
         covariance=True,
     )
-    problem.matrices.append(estimate)
     X, closed = estimate.matrix, expansion.F - expansion.G @ C
     rate = closed @ X + X @ closed.T + information
-    problem.rates[ESTIMATE] = Dynamics(rate=pack_symbolic(rate), noise=None, where="minimize_expected()")
-    return X, replace(expansion, gain=C)
+    growth = Dynamics(rate=pack_symbolic(rate), noise=None, where="minimize_expected()")
+    return problem.adding(matrices=estimate, rates={ESTIMATE: growth}), X, replace(expansion, gain=C)
 
 
 def _gain_entries(gain: Gain, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:

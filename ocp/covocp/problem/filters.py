@@ -16,7 +16,6 @@ from covocp.blocks.updates import Form, Missing
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
-    from covocp.problem.declarations import State, Unknown
     from covocp.statement.statement import Statement
 
 
@@ -98,10 +97,10 @@ def initial_estimate(problem: Problem) -> tuple[Array, Array]:
     for block in statement.matrices:
         if block.estimation:
             return estimate, unpack(starts[2][block.span], block.size)
-    entries: list[State | Unknown] = [*problem.states, *problem.unknowns]
-    variances = ca.diagcat(*(entry.variance for entry in entries))
-    covariance = ca.Function("variances", [entry.symbol for entry in problem.parameters], [variances])
-    values = covariance.call([ca.DM(entry.value) for entry in problem.parameters])
+    own = problem.declarations
+    variances = ca.diagcat(*(entry.variance for entry in own.augmented))
+    covariance = ca.Function("variances", [entry.symbol for entry in own.parameters], [variances])
+    values = covariance.call([ca.DM(entry.value) for entry in own.parameters])
     return estimate, np.asarray(values[0].full())
 
 
@@ -119,7 +118,7 @@ class _System:
             )
         kind: Any = statement.symbolic
         known, means = _parameters(statement)
-        size, controls = len(statement.augmented), sum(entry.size for entry in problem.controls)
+        size, controls = len(statement.augmented), sum(entry.size for entry in problem.declarations.controls)
         estimated = size - means.size
         x, t, u = kind.sym("x", size), kind.sym("t"), kind.sym("u", controls)
         self.symbols = x, kind.sym("P", size, size), u, t
@@ -156,7 +155,7 @@ def _parameters(statement: Statement) -> tuple[Array, Array]:
 def _process_noise(problem: Problem, unknowns: int) -> Any:
     """Density of the process noise of the augmented state, in the user's symbols."""
     noises: list[Any] = []
-    for state in problem.states:
-        density = problem.rates[state.name].noise
+    for state in problem.declarations.states:
+        density = problem.declarations.rates[state.name].noise
         noises.append(ca.MX(state.size, state.size) if density is None else density)
     return ca.diagcat(*noises, ca.MX(unknowns, unknowns))

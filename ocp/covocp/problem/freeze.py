@@ -6,22 +6,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_dynamics
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
-from covocp.problem.declarations import Constraint, Matrix, Place
+from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.estimation_covariance import augmented_names
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement
-
-if TYPE_CHECKING:
-    from covocp.problem.builder import Problem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +39,7 @@ class Stacked:
         return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
 
 
-def freeze(problem: Problem) -> Statement:
+def freeze(problem: Declarations) -> Statement:
     """Build the statement of a problem.
 
     Raises:
@@ -86,7 +84,7 @@ def freeze(problem: Problem) -> Statement:
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
         guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
         scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
-        augmented=augmented_names(_estimated(problem)),
+        augmented=augmented_names(problem.augmented),
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
@@ -97,17 +95,12 @@ def freeze(problem: Problem) -> Statement:
     )
 
 
-def _estimated(problem: Problem) -> list[Any]:
-    """The declarations of the augmented state: states, then unknowns."""
-    return [*(state for state in problem.states if state.estimated), *problem.unknowns]
-
-
 def _all(*groups: Iterable[Any]) -> list[Any]:
     """Declarations of several kinds in one list."""
     return [entry for group in groups for entry in group]
 
 
-def _check_complete(problem: Problem) -> None:
+def _check_complete(problem: Declarations) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
     moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
     check_dynamics(moving, problem.rates)
@@ -131,7 +124,7 @@ def _check_complete(problem: Problem) -> None:
                 received="none of them",
                 remedy="declare a control by control()",
             )
-    entry_augmented = sum(entry.size for entry in _estimated(problem))
+    entry_augmented = sum(entry.size for entry in problem.augmented)
     covariance = next((m for m in problem.matrices if m.estimation), None)
     if covariance is not None and covariance.size != entry_augmented:
         raise ProblemError(
@@ -144,7 +137,7 @@ def _check_complete(problem: Problem) -> None:
     check_readings(problem.measurements, problem.matrices)
 
 
-def _check_symbols(problem: Problem) -> None:
+def _check_symbols(problem: Declarations) -> None:
     """Every symbol in every expression belongs to this problem; the cost depends on something."""
     known = _symbols(problem)
     hashes = {symbol.__hash__() for symbol in known.values()}
@@ -189,7 +182,7 @@ def _check_symbols(problem: Problem) -> None:
         )
 
 
-def _symbols(problem: Problem) -> dict[str, Any]:
+def _symbols(problem: Declarations) -> dict[str, Any]:
     """All symbols by name."""
     entries = _all(problem.states, problem.controls, problem.matrices, problem.unknowns, problem.parameters)
     symbols = {entry.name: entry.symbol for entry in entries} | {"time": problem.time}
@@ -198,7 +191,7 @@ def _symbols(problem: Problem) -> dict[str, Any]:
     return symbols
 
 
-def _stack(problem: Problem) -> Stacked:
+def _stack(problem: Declarations) -> Stacked:
     """Stacked symbols, SX where every expression can be expanded, and the substitution of the user's symbols."""
     groups: list[Any] = [problem.states, problem.controls, problem.matrices, problem.parameters, problem.unknowns]
     own = [entry.symbol for group in groups for entry in group] + [problem.time]
@@ -237,12 +230,12 @@ def _stack(problem: Problem) -> Stacked:
     )
 
 
-def _state_rates(problem: Problem, stacked: Stacked) -> Any:
+def _state_rates(problem: Declarations, stacked: Stacked) -> Any:
     """Rate of the stacked state."""
     return ca.vertcat(*stacked.substitute(*(problem.rates[state.name].rate for state in problem.states)))
 
 
-def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, tuple[Any, ...], Any]:
+def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple[Any, tuple[Any, ...], Any]:
     """Rates of all half-vectors, their Riccati forms where they have one, and the measurement."""
     e = stacked.inputs[2]
     measurement = _measurement(problem, stacked)
@@ -269,14 +262,14 @@ def _matrix_rates(problem: Problem, stacked: Stacked, rates: Any) -> tuple[Any, 
     return ca.vertcat(empty, *values), tuple(forms), function
 
 
-def _augmented_jacobian(stacked: Stacked, expression: Any) -> Any:
+def _augmented_jacobian(stacked: Stacked, expression: Expr) -> Any:
     """Jacobian with respect to the augmented state (states, then unknowns)."""
     x, p = stacked.inputs[0], stacked.inputs[5]
     by_state = ca.jacobian(expression, x)[:, : stacked.estimated]
     return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
 
 
-def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | None:
+def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any] | None:
     """Stacked measurement, its Jacobian M and the noise density U."""
     if not problem.measurements:
         return None
@@ -286,7 +279,7 @@ def _measurement(problem: Problem, stacked: Stacked) -> tuple[Any, Any, Any] | N
     return value, _augmented_jacobian(stacked, value), density
 
 
-def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: Any) -> tuple[Any, Any, Any]:
+def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measurement: Expr) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
     size = stacked.estimated + stacked.unknowns
     constants = ca.DM.zeros(stacked.unknowns, 1)
@@ -307,7 +300,7 @@ def _kalman_form(problem: Problem, stacked: Stacked, rates: Any, measurement: An
     return drift, noise, jacobian.T @ inverse_density(density, blocks, inverse) @ jacobian
 
 
-def _information(problem: Problem, stacked: Stacked) -> ca.Function | None:
+def _information(problem: Declarations, stacked: Stacked) -> ca.Function | None:
     """What is stated as information, one below the other."""
     stated = [ca.diag(entry.information) for entry in problem.measurements if entry.information is not None]
     if not stated:
@@ -315,7 +308,7 @@ def _information(problem: Problem, stacked: Stacked) -> ca.Function | None:
     return stacked.function("information", stacked.substitute(ca.vertcat(*stated)), without=("matrices",))
 
 
-def _noise_varies(problem: Problem) -> bool:
+def _noise_varies(problem: Declarations) -> bool:
     """Whether a noise density depends on more than parameters."""
     densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     densities += [entry.noise for entry in problem.measurements]
@@ -323,7 +316,7 @@ def _noise_varies(problem: Problem) -> bool:
     return any(symbol.__hash__() not in constants for density in densities for symbol in ca.symvar(density))
 
 
-def _blocks(problem: Problem) -> tuple[Block, ...]:
+def _blocks(problem: Declarations) -> tuple[Block, ...]:
     """Where each symbol lies."""
     blocks = []
     parameters = 0
@@ -355,7 +348,7 @@ def _blocks(problem: Problem) -> tuple[Block, ...]:
     return tuple(blocks)
 
 
-def _measured(problem: Problem) -> tuple[Block, ...]:
+def _measured(problem: Declarations) -> tuple[Block, ...]:
     """Where each measurement lies."""
     sizes = [m.expression.shape[0] for m in problem.measurements]
     offsets = np.cumsum([0, *sizes]).tolist()
@@ -365,7 +358,7 @@ def _measured(problem: Problem) -> tuple[Block, ...]:
     )
 
 
-def _duration(problem: Problem) -> Duration:
+def _duration(problem: Declarations) -> Duration:
     """The terminal time."""
     free = problem.free_duration
     if free is None:
@@ -374,7 +367,7 @@ def _duration(problem: Problem) -> Duration:
     return Duration(guess=free.guess, lower=free.lower, upper=free.upper)
 
 
-def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
+def _boundary(problem: Declarations, stacked: Stacked) -> ca.Function:
     """Initial and final values of states and matrices as functions of the parameters."""
     own = [entry.symbol for entry in _all(problem.parameters, problem.unknowns)]
     free = [ca.MX(ca.DM.nan(entry.symbol.shape)) for entry in problem.matrices]
@@ -406,7 +399,7 @@ def _boundary(problem: Problem, stacked: Stacked) -> ca.Function:
     return ca.Function("boundary", [p], values, ["parameters"], names)
 
 
-def _matrix_end(problem: Problem, stacked: Stacked) -> ca.Function | None:
+def _matrix_end(problem: Declarations, stacked: Stacked) -> ca.Function | None:
     """Half-vectors of the matrices that run backward, at the end."""
     ends = [entry.backward.end for entry in problem.matrices if entry.backward is not None]
     if not ends:
@@ -415,7 +408,7 @@ def _matrix_end(problem: Problem, stacked: Stacked) -> ca.Function | None:
     return stacked.function("matrix_end", [values], without=("control", "matrices", "time"))
 
 
-def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
+def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
     """What the feedback of an expected cost sees, as functions."""
     v = problem.expansion
     if v is None:
@@ -438,7 +431,7 @@ def _loop(problem: Problem, stacked: Stacked) -> Loop | None:
     )
 
 
-def _conditions(problem: Problem, stacked: Stacked, at: Place) -> Conditions:
+def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Conditions:
     """The inequalities of one place as one function."""
     chosen: list[Constraint] = [c for c in problem.constraints if c.at == at]
     values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
@@ -452,7 +445,7 @@ def _conditions(problem: Problem, stacked: Stacked, at: Place) -> Conditions:
     )
 
 
-def _bounds(entries: Any) -> tuple[Any, Any]:
+def _bounds(entries: Expr) -> tuple[Any, Any]:
     """Stacked lower and upper bounds."""
     lower = np.concatenate([np.zeros(0), *(entry.lower for entry in entries)])
     upper = np.concatenate([np.zeros(0), *(entry.upper for entry in entries)])
@@ -468,10 +461,10 @@ def _diagonal_bounds(entry: Matrix) -> Any:
     return bounds[columns, rows]
 
 
-def _expression_builder(problem: Problem, stacked: Stacked) -> Callable[[Any], ca.Function]:
+def _expression_builder(problem: Declarations, stacked: Stacked) -> Callable[[Any], ca.Function]:
     """What turns a user's expression into a function of the six stacked inputs."""
 
-    def build(expression: Any) -> ca.Function:
+    def build(expression: Expr) -> ca.Function:
         return stacked.function("expression", stacked.substitute(expression))
 
     return build

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
 
 from covocp.base.checks import check_density, density_matrix
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.problem.declarations import Matrix, Measurement
 
 # The density that stands for no information is the inverse of this: a sensor of such noise tells nothing in double
@@ -16,7 +17,7 @@ from covocp.problem.declarations import Matrix, Measurement
 LEAST = 1e-30
 
 
-def stated_noise(name: str, noise: Any, information: Any, size: int) -> tuple[Any, Any]:
+def stated_noise(name: str, noise: Expr, information: Expr, size: int) -> tuple[Any, Any]:
     """Density of the noise of a measurement, and the information where that was stated (else None); size x size.
 
     Raises:
@@ -48,7 +49,7 @@ def stated_noise(name: str, noise: Any, information: Any, size: int) -> tuple[An
     return ca.diag(1.0 / ca.fmax(diagonal, LEAST)), ca.diag(diagonal)
 
 
-def inverse_density(density: Any, blocks: list[tuple[Any, Any]], invert: Callable[[Any], Any]) -> Any:
+def inverse_density(density: Expr, blocks: list[tuple[Any, Any]], invert: Callable[[Any], Any]) -> Any:
     """U^-1 of all measurements together, without dividing by what was stated as information.
 
     Args:
@@ -61,7 +62,7 @@ def inverse_density(density: Any, blocks: list[tuple[Any, Any]], invert: Callabl
     return ca.diagcat(*(invert(noise) if stated is None else stated for noise, stated in blocks))
 
 
-def check_readings(measurements: list[Measurement], matrices: list[Matrix]) -> None:
+def check_readings(measurements: Sequence[Measurement], matrices: Sequence[Matrix]) -> None:
     """An instrument reads the actual system: what it shows, and its noise, know no covariance."""
     names = {entry.symbol.__hash__(): entry.name for entry in matrices}
     for measurement in measurements:

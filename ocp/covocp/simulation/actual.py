@@ -7,17 +7,20 @@ own unknowns there.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.problem.builder import Problem
+from covocp.problem.declarations import Declarations
+from covocp.problem.estimation_covariance import with_estimation
+from covocp.problem.expected_cost import statement_of
 from covocp.solution.solution import Solution
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Block, Statement
@@ -95,7 +98,7 @@ def design_system(solution: Solution) -> System:
     )
 
 
-def actual_system(design: System, truth: Any) -> System:
+def actual_system(design: System, truth: Given) -> System:
     """The system that is simulated.
 
     Args:
@@ -117,8 +120,8 @@ def actual_system(design: System, truth: Any) -> System:
             received=repr(truth)[:100],
             remedy="correct truth=",
         )
-    _check_measured(design, truth)
-    statement = _statement_of(truth)
+    _check_measured(design, truth.declarations)
+    statement = _statement_of(truth.declarations)
     _check_symbols(design, statement)
     return _from_statement(design, statement, statement.values)
 
@@ -210,19 +213,18 @@ def _from_statement(design: System, statement: Statement, values: Array) -> Syst
     return _system(statement, values, start=start, variance=variance, fed_back=design.fed_back)
 
 
-def _statement_of(truth: Problem) -> Statement:
+def _statement_of(truth: Declarations) -> Statement:
     """The truth as a statement with an estimation covariance; its cost and its constraints do not matter."""
-    plain = copy.copy(truth)
-    plain.matrices = [matrix for matrix in truth.matrices if matrix.estimation]
     moving = {state.name for state in truth.states}
-    plain.rates = {name: entry for name, entry in truth.rates.items() if name in moving}
-    plain.measurements = list(truth.measurements)
-    plain.constraints = []
-    plain.expected, plain.expansion, plain._frozen = None, None, None
-    if not plain.matrices:
-        plain.estimation_covariance()
-    plain.cost = (ca.MX(0), ca.sumsqr(ca.vertcat(*(state.symbol for state in truth.states))))
-    return plain.statement()
+    plain = replace(
+        truth,
+        matrices=tuple(matrix for matrix in truth.matrices if matrix.estimation),
+        rates={name: entry for name, entry in truth.rates.items() if name in moving},
+        constraints=(),
+        expected=None,
+        cost=(ca.MX(0), ca.sumsqr(ca.vertcat(*(state.symbol for state in truth.states)))),
+    )
+    return statement_of(plain if plain.matrices else with_estimation(plain))
 
 
 def _check_symbols(design: System, truth: Statement) -> None:
@@ -242,7 +244,7 @@ def _check_symbols(design: System, truth: Statement) -> None:
             )
 
 
-def _check_measured(design: System, truth: Problem) -> None:
+def _check_measured(design: System, truth: Declarations) -> None:
     """The filter of the design must be fed with what it expects."""
     names = design.statement.measurement_names
     rows = sum(m.expression.shape[0] for m in truth.measurements)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.flown import own_copy, stepped
 from covocp.simulation.plan import Plan
@@ -173,7 +174,7 @@ class _Simulation:
                 z[spans["estimate"], i] = result[controls:]
         measured[:] = 0.0
 
-    def _leave(self, gone: Any, time: float) -> None:
+    def _leave(self, gone: Given, time: float) -> None:
         """Note when runs leave the domain, and where they were before."""
         now = gone & np.isinf(self.left)
         self.left[now], self.last[:, now] = time, self.before[:, now]
@@ -258,7 +259,7 @@ class _Simulation:
         """The rows of the state with flags."""
         return slice(self.plan.spans["asked"].start, self.plan.spans["violated"].stop)
 
-    def _violated(self, on_the_way: Any, stayed: Any) -> tuple[Any, Any]:
+    def _violated(self, on_the_way: Given, stayed: Given) -> tuple[Any, Any]:
         """Who violates each inequality at some instant of its place, and at the end, (runs, rows)."""
         first, last = (flags[:, : self.runs].T for flags in self.seen)
         at_end = last | ~stayed[:, None]

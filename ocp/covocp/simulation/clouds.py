@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.arguments import checked, optional, positives, text, texts_by_name
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
 from covocp.plot.figure import (
@@ -144,7 +145,7 @@ def _chosen(sample: MonteCarlo, names: tuple[Any, ...]) -> tuple[list[tuple[str,
     return components, clouds
 
 
-def _wrong(name: str, expected: str, received: Any) -> ProblemError:
+def _wrong(name: str, expected: str, received: Given) -> ProblemError:
     return ProblemError(
         f"The argument '{name}' of plot_monte_carlo() is wrong.",
         expected=expected,

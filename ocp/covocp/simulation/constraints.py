@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy import special
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.actual import System
 from covocp.simulation.prediction import Prediction
@@ -104,7 +105,7 @@ def _bounds(st: Statement, a: list[Any], sizes: tuple[int, int]) -> list[tuple[s
     return found
 
 
-def violations(run: Run, z: Any, fed: Any, c: dict[str, Any]) -> Any:
+def violations(run: Run, z: Given, fed: Given, c: dict[str, Any]) -> Any:
     """One for each inequality that a run violates, (rows,); what is no number violates it.
 
     Args:
@@ -125,7 +126,7 @@ def violations(run: Run, z: Any, fed: Any, c: dict[str, Any]) -> Any:
     return ca.vertcat(*(beyond(values[i], row.lower, row.upper) for i, row in enumerate(chosen.rows)))
 
 
-def beyond(value: Any, low: float, high: float) -> Any:
+def beyond(value: Given, low: float, high: float) -> Any:
     """One unless a value is inside its limits, but for rounding."""
     inside: Any = 1.0
     if np.isfinite(low):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.constraints import Place, Row
 from covocp.simulation.sampling import share_band
@@ -46,7 +46,7 @@ class Count:
 
 
 def count(
-    rows: tuple[Row, ...], violated: Any, at_end: Any, violating: Array, promise: Array, t: Array, level: float
+    rows: tuple[Row, ...], violated: Given, at_end: Given, violating: Array, promise: Array, t: Array, level: float
 ) -> tuple[Count, ...]:
     """The counts of all inequalities.
 

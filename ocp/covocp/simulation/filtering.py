@@ -18,13 +18,14 @@ from typing import Any
 
 import casadi as ca
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.updates import updating
 from covocp.simulation.run_parts import Run, control_of, estimate_of, factor, part, replaced, system_at
 
 
-def corrected(run: Run, z: Any, c: dict[str, Any], noise: Any, h: Any, *, late: bool) -> Any:
+def corrected(run: Run, z: Given, c: dict[str, Any], noise: Given, h: Given, *, late: bool) -> Any:
     """The state of a run after the reading of half a step.
 
     Args:
@@ -54,7 +55,7 @@ def corrected(run: Run, z: Any, c: dict[str, Any], noise: Any, h: Any, *, late: 
     return replaced(replaced(z, run.spans["estimate"], estimate), run.spans["E"], pack_symbolic(spread))
 
 
-def moved_covariance(run: Run, z: Any, ahead: Any, sides: list[dict[str, Any]], h: Any) -> Any:
+def moved_covariance(run: Run, z: Given, ahead: Given, sides: list[dict[str, Any]], h: Given) -> Any:
     """Half-vector of the extended filter's covariance after the motion of a step, before its second reading.
 
     Args:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.actual import System
 from covocp.simulation.request import wrong_argument
@@ -38,7 +39,7 @@ class Flown:
     estimates: bool
 
 
-def flown_law(law: Any, period: Any, design: System, duration: float) -> Flown | None:
+def flown_law(law: Given, period: Given, design: System, duration: float) -> Flown | None:
     """A law that was checked by a first step.
 
     Args:
@@ -64,7 +65,7 @@ def flown_law(law: Any, period: Any, design: System, duration: float) -> Flown |
     return Flown(law=law, period=chosen, times=times, estimates=_estimate(first) is not None)
 
 
-def _check_kind(law: Any, design: System) -> None:
+def _check_kind(law: Given, design: System) -> None:
     """Refuse what cannot be a law, and problems without feedback."""
     if not design.fed_back:
         expected = "None: nothing is fed back where the cost is deterministic"
@@ -77,7 +78,7 @@ def _check_kind(law: Any, design: System) -> None:
         raise wrong_argument("law", expected, law, "give it a method step")
 
 
-def _period(law: Any, period: Any, duration: float) -> float:
+def _period(law: Given, period: Given, duration: float) -> float:
     """Time between two steps: as given, which must not contradict the law's own."""
     own = getattr(law, "period", None)
     chosen: Any = own if period is None else period
@@ -91,7 +92,7 @@ def _period(law: Any, period: Any, duration: float) -> float:
     return float(chosen)
 
 
-def _first_step(law: Any, design: System) -> Any:
+def _first_step(law: Given, design: System) -> Any:
     """A copy of the law that answered at time zero with numbers of the right size."""
     try:
         first = own_copy(law)
@@ -116,7 +117,7 @@ def _first_step(law: Any, design: System) -> Any:
     return first
 
 
-def own_copy(law: Any) -> Any:
+def own_copy(law: Given) -> Any:
     """A law of a run's own, at its start."""
     own = copy.deepcopy(law)
     if callable(getattr(own, "init", None)):
@@ -128,7 +129,7 @@ class LawFailedError(Exception):
     """A law raised in flight: says in which run, when and what."""
 
 
-def stepped(own: Any, measurement: Array, time: float, controls: int, estimates: int, run: int) -> Array:
+def stepped(own: Given, measurement: Array, time: float, controls: int, estimates: int, run: int) -> Array:
     """Control and estimate of one step, stacked; NaN where the law gives something else than numbers of that size.
 
     Raises:
@@ -152,12 +153,12 @@ def sample_indices(flown: Flown | None, grid: Grid) -> Any:
     return np.searchsorted(grid.t, flown.times - WHOLE * flown.period) if flown else np.zeros(0, dtype=int)
 
 
-def column_of(value: Any) -> Array:
+def column_of(value: Given) -> Array:
     """Numbers as the user gave them, flat."""
     return np.asarray(value, dtype=float).ravel()
 
 
-def _estimate(law: Any) -> Array | None:
+def _estimate(law: Given) -> Array | None:
     """What a law says of the deviation from the nominal."""
     estimate = getattr(law, "estimate", None)
     return None if estimate is None or callable(estimate) else column_of(estimate)

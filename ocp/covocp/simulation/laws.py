@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
 from covocp.base.errors import CovocpError, ProblemError, shown
+from covocp.base.expressions import Given
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
@@ -70,7 +71,7 @@ class LawSimulation:
     diverged: NDArray[np.bool_]
 
 
-def _of_state_and_control(value: Any) -> str:
+def _of_state_and_control(value: Given) -> str:
     """A function of state and control."""
     fits = isinstance(value, ca.Function) and (value.n_in(), value.n_out()) == (2, 1)
     return "" if fits else "a casadi.Function of (x, u)"
@@ -168,7 +169,7 @@ def gain_filter(
     size = start.size
     rows, sums = _rows("H", H, size), _rows("integrate", [] if integrate is None else integrate, size)
 
-    def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
+    def rate(state: Given, t: Given, u: Given, y: Given) -> Any:
         estimate = state[:size]
         gained = _value(gain, estimate, t)
         innovation = y - _times(rows, estimate)
@@ -214,7 +215,7 @@ def extended_filter(
     noise = values.numeric("V", values.weight("V", V, len(rows), definite=True))
     weighted = np.linalg.solve(noise, rows).T
 
-    def rate(state: Any, t: Any, u: Any, y: Any) -> Any:
+    def rate(state: Given, t: Given, u: Given, y: Given) -> Any:
         estimate = ca.SX.sym("estimate", size)
         slope = dynamics(estimate, u)
         tangent = ca.substitute(ca.jacobian(slope, estimate), estimate, state[:size])
@@ -247,12 +248,12 @@ class _Loop:
         own = np.zeros(0) if self.observer is None else self.observer.initial
         return np.concatenate([initial, own, [0.0]])
 
-    def control(self, state: Any, t: Any) -> Any:
+    def control(self, state: Given, t: Given) -> Any:
         if self.observer is None:
             return _value(self.law, state[: self.size], t)
         return _value(self.law, state[self.size : self.size + self.observer.size], t)
 
-    def rate(self, state: Any, t: Any, process: Any = 0.0, measurement: Any = 0.0) -> Any:
+    def rate(self, state: Given, t: Given, process: Given = 0.0, measurement: Given = 0.0) -> Any:
         x, u = state[: self.size], self.control(state, t)
         parts = [_value(self.plant, x, u) + process]
         if self.observer is not None:
@@ -357,7 +358,7 @@ def _columns(function: Columns, state: Array, t: float, *shocks: Array) -> Array
 def _runge_kutta(rate: ca.Function, h: float) -> Law:
     """One classical step with the noise held."""
 
-    def advance(state: Any, t: Any, process: Any, measurement: Any) -> Any:
+    def advance(state: Given, t: Given, process: Given, measurement: Given) -> Any:
         one = rate(state, t, process, measurement)
         two = rate(state + 0.5 * h * one, t + 0.5 * h, process, measurement)
         three = rate(state + 0.5 * h * two, t + 0.5 * h, process, measurement)
@@ -392,7 +393,7 @@ def _value(function: Law, *arguments: Any) -> Any:
     return numbers.ravel() if numbers.ndim < 2 or numbers.shape[1] == 1 else numbers
 
 
-def _times(matrix: Array, vector: Any) -> Any:
+def _times(matrix: Array, vector: Given) -> Any:
     return ca.DM(matrix) @ vector if isinstance(vector, ca.SX) else matrix @ vector
 
 
@@ -402,12 +403,12 @@ def _stack(*parts: Any) -> Any:
     return np.concatenate([np.ravel(part) for part in parts])
 
 
-def _numbers(name: str, given: Any) -> Array:
+def _numbers(name: str, given: Given) -> Array:
     """Finite numbers in a row."""
     return values.numeric(name, values.matrix(name, given)).ravel()
 
 
-def _rows(name: str, given: Any, size: int) -> Array:
+def _rows(name: str, given: Given, size: int) -> Array:
     """Rows of finite numbers, (r, size); a row may be given by itself."""
     numbers = values.numeric(name, values.matrix(name, given))
     if numbers.shape[1] == 1 and numbers.shape[0] == size:

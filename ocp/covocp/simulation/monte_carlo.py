@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,8 @@ from covocp.base.arguments import checked, one_of
 from covocp.base.arguments import truth as a_truth
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
+from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.constraints import Rows
@@ -142,18 +143,18 @@ class MonteCarlo:
         """Share of the runs that left the domain."""
         return float(1.0 - self.stayed.mean())
 
-    def mean(self, key: Any) -> Array:
+    def mean(self, key: Given) -> Array:
         """Sample mean of the actual values of a state, an unknown or a control, (K,) or (K, size)."""
         rows, block = self.rows(key)
         nominal = self.nominal_control if block.kind == "control" else self.nominal
         return self._shaped(nominal[:, block_rows(rows, block, self.size)] + self.moments.mean[:, rows], block)
 
-    def bias(self, key: Any) -> Array:
+    def bias(self, key: Given) -> Array:
         """Sample mean of the deviation from the nominal, (K,) or (K, size)."""
         rows, block = self.rows(key)
         return self._shaped(self.moments.mean[:, rows], block)
 
-    def mean_band(self, key: Any) -> tuple[Array, Array]:
+    def mean_band(self, key: Given) -> tuple[Array, Array]:
         """Confidence band of the mean, (low, high)."""
         rows, block = self.rows(key)
         variance = np.diagonal(self.moments.product, axis1=1, axis2=2)[:, rows] - self.moments.mean[:, rows] ** 2
@@ -162,7 +163,7 @@ class MonteCarlo:
         return self._shaped(low, block), self._shaped(high, block)
 
     @checked("covariance()", about=one_of("nominal", "mean"))
-    def covariance(self, a: Any, b: Any = None, *, about: str = "nominal") -> Array:
+    def covariance(self, a: Given, b: Given = None, *, about: str = "nominal") -> Array:
         """Sample covariance of the deviations of two symbols, (K, size of a, size of b).
 
         Args:
@@ -177,13 +178,13 @@ class MonteCarlo:
         mean = self.moments.mean
         return np.asarray(product - mean[:, one, None] * mean[:, None, two])
 
-    def deviation(self, key: Any, *, about: str = "nominal") -> Array:
+    def deviation(self, key: Given, *, about: str = "nominal") -> Array:
         """Sample standard deviation, (K,) or (K, size), in the unit of the symbol; see `covariance`."""
         _, block = self.rows(key)
         variance = np.diagonal(self.covariance(key, about=about), axis1=1, axis2=2)
         return self._shaped(np.sqrt(np.maximum(variance, 0.0)), block)
 
-    def deviation_band(self, key: Any) -> tuple[Array, Array]:
+    def deviation_band(self, key: Given) -> tuple[Array, Array]:
         """Confidence band of the standard deviation about the nominal, (low, high)."""
         rows, block = self.rows(key)
         square = np.diagonal(self.moments.product, axis1=1, axis2=2)[:, rows]
@@ -191,14 +192,14 @@ class MonteCarlo:
         low, high = mean_square_band(square, freedom, self.level)
         return self._shaped(np.sqrt(low), block), self._shaped(np.sqrt(high), block)
 
-    def predicted_deviation(self, key: Any) -> Array:
+    def predicted_deviation(self, key: Given) -> Array:
         """Standard deviation about the nominal that linear theory predicts, (K,) or (K, size)."""
         rows, block = self.rows(key)
         predicted = self.predicted_control if block.kind == "control" else self.predicted
         squares = np.diagonal(predicted, axis1=1, axis2=2)[:, block_rows(rows, block, self.size)]
         return self._shaped(np.sqrt(squares.clip(0.0)), block)
 
-    def error_covariance(self, a: Any, b: Any = None) -> Array:
+    def error_covariance(self, a: Given, b: Given = None) -> Array:
         """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b).
 
         Raises:
@@ -217,18 +218,18 @@ class MonteCarlo:
         cross = product[:, n : 2 * n, :n]
         return np.asarray((actual + estimate - cross - cross.transpose(0, 2, 1))[:, one, two])
 
-    def terminal(self, key: Any) -> Array:
+    def terminal(self, key: Given) -> Array:
         """Deviations of all runs at the end, (R,) or (R, size)."""
         rows, block = self.rows(key, controls=False)
         return self._shaped(self.deviations[:, rows], block)
 
-    def robust_deviation(self, key: Any) -> Array:
+    def robust_deviation(self, key: Given) -> Array:
         """Deviation at the end from the median of all runs, those that left the domain too; () or (size,)."""
         rows, block = self.rows(key, controls=False)
         values = robust_deviation(self.deviations[:, rows])
         return np.asarray(values[0] if block.size == 1 else values)
 
-    def share_beyond(self, key: Any, value: Any) -> float:
+    def share_beyond(self, key: Given, value: Given) -> float:
         """Share of the runs whose deviation at the end is larger than a value in some component.
 
         A run that left the domain counts as beyond.
@@ -298,16 +299,16 @@ class MonteCarlo:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the runs; see `covocp.simulation.clouds.plot_monte_carlo`."""
-        module = importlib.import_module("covocp.simulation.clouds")
-        importlib.import_module("covocp.plot.figure").check_plot_options(options, module.plot_monte_carlo)
+        module = later("simulation.clouds")
+        later("plot.figure").check_plot_options(options, module.plot_monte_carlo)
         return module.plot_monte_carlo(self, *names, **options)  # type: ignore[no-any-return]
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(importlib.import_module("covocp.simulation.report").summary(self))
+        return str(later("simulation.report").summary(self))
 
     @checked(controls=a_truth)
-    def rows(self, key: Any, *, controls: bool = True) -> tuple[slice, Block]:
+    def rows(self, key: Given, *, controls: bool = True) -> tuple[slice, Block]:
         """Where a symbol, or an entry of one, lies among the rows (2n + m) of `moments`, and its block.
 
         Raises:

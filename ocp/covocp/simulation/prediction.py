@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.actual import System
 from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
@@ -67,7 +68,7 @@ class Prediction:
         """Mean square of the estimate of the deviation, (K, n, n)."""
         return self._about_nominal(np.hstack([np.zeros((self.size, self.size)), np.eye(self.size)]))
 
-    def at(self, rows: Any) -> Prediction:
+    def at(self, rows: Given) -> Prediction:
         """The prediction at some of its times; the fastest rates stay those of all intervals."""
         return replace(self, mean=self.mean[rows], covariance=self.covariance[rows])
 
@@ -135,7 +136,7 @@ def _joint(design: System, actual: System) -> ca.Function:
 
 
 def _evaluate(
-    solution: Solution, joint: ca.Function, t: Array, interval: Any, actual: System, n: int
+    solution: Solution, joint: ca.Function, t: Array, interval: Given, actual: System, n: int
 ) -> tuple[Array, Array, Array]:
     """Drift (K, 2n, 2n), noise (K, 2n, 2n) and offset (K, 2n) at some times."""
     columns = nominal_at(solution, t, interval).columns(solution.duration, solution.parameters)

@@ -7,6 +7,7 @@ from typing import Any
 
 from covocp.base.arguments import MOST, is_whole, positive
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.simulation.schedule import Filter
 from covocp.simulation.vectorised import padded
 
@@ -48,7 +49,7 @@ class Request:
         return [(first, min(first + width, int(self.runs))) for first in range(0, int(self.runs), width)]
 
 
-def wrong_argument(name: str, expected: str, received: Any, remedy: str | None = None) -> ProblemError:
+def wrong_argument(name: str, expected: str, received: Given, remedy: str | None = None) -> ProblemError:
     """An argument of `simulate` that means nothing."""
     return ProblemError(
         f"The argument '{name}' of simulate() is wrong.",

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
 from covocp.simulation.actual import System
 from covocp.simulation.flown import Flown
@@ -129,7 +130,7 @@ def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) 
     )
 
 
-def factor(covariance: Any) -> Any:
+def factor(covariance: Given) -> Any:
     """Lower triangular L with L L' = covariance, DM, SX or MX; the columns of zero pivots are zero."""
     size = covariance.shape[0]
     L: list[list[Any]] = [[0.0] * size for _ in range(size)]
@@ -141,7 +142,9 @@ def factor(covariance: Any) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in L))
 
 
-def system_at(run: Run, system: System, augmented: tuple[Any, Any], u: Any, c: dict[str, Any], t: Any = None) -> Any:
+def system_at(
+    run: Run, system: System, augmented: tuple[Any, Any], u: Given, c: dict[str, Any], t: Given = None
+) -> Any:
     """What `System.linear` returns for a state and unknowns; rows that no run has are those of the nominal."""
     x, unknowns = augmented
     design, parameters = run.setting.design, system.parameters
@@ -152,18 +155,18 @@ def system_at(run: Run, system: System, augmented: tuple[Any, Any], u: Any, c: d
     return system.linear(state, part(u, 0, system.statement.nu), time, duration, ca.vertcat(known, unknowns))
 
 
-def part(column: Any, first: int, last: int | None = None) -> Any:
+def part(column: Given, first: int, last: int | None = None) -> Any:
     """Some rows of a column; (0, 1) where there are none, which slicing a single number does not give."""
     size = int(column.shape[0])
     return ca.vertsplit(column, [0, first, size if last is None else last, size])[1]
 
 
-def replaced(column: Any, rows: slice, values: Any) -> Any:
+def replaced(column: Given, rows: slice, values: Given) -> Any:
     """A column with other values in some rows."""
     return ca.vertcat(part(column, 0, rows.start), values, part(column, rows.stop))
 
 
-def estimated_deviation(run: Run, z: Any, c: dict[str, Any]) -> Any:
+def estimated_deviation(run: Run, z: Given, c: dict[str, Any]) -> Any:
     """The estimate of the deviation from the nominal, (n,)."""
     estimate = z[run.spans["estimate"]]
     return estimate - nominal_column(run, c) if run.setting.filter == "extended" else estimate
@@ -175,13 +178,13 @@ def nominal_column(run: Run, c: dict[str, Any]) -> Any:
     return ca.vertcat(part(c["x"], 0, design.states), ca.DM(design.start[design.states :]))
 
 
-def deviations(run: Run, z: Any, c: dict[str, Any]) -> Any:
+def deviations(run: Run, z: Given, c: dict[str, Any]) -> Any:
     """Deviation from the nominal and the filter's estimate of it, (2n,)."""
     actual = ca.vertcat(z[run.spans["x"]], run.own)
     return ca.densify(ca.vertcat(actual - nominal_column(run, c), estimated_deviation(run, z, c)))
 
 
-def control_of(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any]:
+def control_of(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
     """The control that the feedback asks for, and the one that there is, both of the fed-back rows."""
     if run.setting.flown:
         asked = part(z, run.spans["held"].start)
@@ -194,7 +197,7 @@ def control_of(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any]:
     return asked, ca.vertcat(run.symbolic(0, 1), *applied)
 
 
-def estimate_of(run: Run, z: Any) -> tuple[Any, Any]:
+def estimate_of(run: Run, z: Given) -> tuple[Any, Any]:
     """State and unknowns as the extended filter has them."""
     y, states = z[run.spans["estimate"]], run.setting.design.states
     return part(y, 0, states), part(y, states)

@@ -27,6 +27,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
 from covocp.simulation.constraints import Place, beyond, counted_rows, violations
 from covocp.simulation.filtering import corrected, moved_covariance
@@ -46,7 +47,7 @@ def start_of(run: Run) -> Array:
     return z
 
 
-def step_function(run: Run, constant: Array, varying: Any) -> ca.Function:
+def step_function(run: Run, constant: Array, varying: Given) -> ca.Function:
     """One step of a run.
 
     Args:
@@ -107,7 +108,7 @@ def finish_function(run: Run) -> ca.Function | None:
         return None
     known = solution.parameters[: solution.parameters.size - design.unknowns]
 
-    def terminal(augmented: Any) -> Any:
+    def terminal(augmented: Given) -> Any:
         state = ca.vertcat(part(augmented, 0, design.states), ca.DM(end[design.states :]))
         return loop.terminal(state, solution.duration, ca.vertcat(ca.DM(known), part(augmented, design.states)))
 
@@ -121,7 +122,7 @@ def finish_function(run: Run) -> ca.Function | None:
     return ca.Function("finish", [run.z, run.own], [ca.densify(cost)])
 
 
-def _drift(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any]:
+def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
     """Rate of the moving part of the state, the whole control applied."""
     setting, design, x = run.setting, run.setting.design, z[run.spans["x"]]
     _, fed = control_of(run, z, c)
@@ -144,7 +145,7 @@ def _drift(run: Run, z: Any, c: dict[str, Any]) -> tuple[Any, Any]:
     return ca.vertcat(*parts), u
 
 
-def _noise(run: Run, z: Any, u: Any, sides: list[dict[str, Any]], h: Any) -> Any:
+def _noise(run: Run, z: Given, u: Given, sides: list[dict[str, Any]], h: Given) -> Any:
     """Factor of the noise of x, per root second; below it that of what a law measures, (rows, noises of the motion)."""
     setting, design = run.setting, run.setting.design
     t = sides[0]["t"] + h / 2

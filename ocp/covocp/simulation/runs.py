@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError, SolveError, warn_user
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
@@ -46,13 +47,13 @@ def simulate(
     runs: int,
     seed: int,
     *,
-    truth: Any = None,
-    law: Any = None,
+    truth: Given = None,
+    law: Given = None,
     period: float | None = None,
     executor: Any = None,
     filter: Filter = "perturbation",
     step: float | None = None,
-    limits: Any = None,
+    limits: Given = None,
     store: int = 101,
     paths: int = 20,
     batch: int | None = None,
@@ -160,7 +161,7 @@ def _design(solution: Solution) -> System:
     return design
 
 
-def _limits(design: System, limits: Any) -> Limits:
+def _limits(design: System, limits: Given) -> Limits:
     """What the actual control can do, and what counts as all that there is."""
     lower, upper = control_limits(design.statement, design.fed_back, limits)
     least, most = (bound[: design.fed_back] for bound in design.statement.control_bounds)
@@ -259,7 +260,7 @@ def _result(
     nominal: Nominal,
     predictions: tuple[Prediction, ...],
     harvest: Harvest,
-    truth: Any,
+    truth: Given,
 ) -> MonteCarlo:
     """The batches put together."""
     design, solution, (expected, true) = setting.design, setting.solution, predictions
@@ -322,7 +323,7 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     return {**values, "moments": moments_of(batches)}
 
 
-def _predicted_costs(solution: Solution, truth: Any) -> tuple[float, float]:
+def _predicted_costs(solution: Solution, truth: Given) -> tuple[float, float]:
     """Expected cost by the design, and by linear theory for the truth; NaN where that knows other dynamics."""
     if truth is None:
         return solution.cost, solution.cost
@@ -332,7 +333,7 @@ def _predicted_costs(solution: Solution, truth: Any) -> tuple[float, float]:
         return solution.cost, np.nan
 
 
-def _in_words(truth: Any) -> str:
+def _in_words(truth: Given) -> str:
     """The truth in a few words; "" where it is the design's system."""
     if truth is None:
         return ""

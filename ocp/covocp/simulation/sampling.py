@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.simulation.batches import Batch
 
@@ -48,7 +49,7 @@ def moments_of(batches: Sequence[Batch]) -> Moments:
     return Moments(count=count, mean=mean("mean"), product=mean("product"), cube=mean("cube"), fourth=mean("fourth"))
 
 
-def degrees_of_freedom(count: Any, square: Any, fourth: Any) -> Any:
+def degrees_of_freedom(count: Given, square: Given, fourth: Given) -> Any:
     """Degrees of freedom of the chi-square law of a mean square, from the mean fourth power."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         kurtosis = fourth / np.square(square)
@@ -56,7 +57,7 @@ def degrees_of_freedom(count: Any, square: Any, fourth: Any) -> Any:
         return np.minimum(count, 2.0 * count / np.maximum(kurtosis - 1.0, np.finfo(float).tiny))
 
 
-def mean_square_band(square: Any, freedom: Any, level: float) -> tuple[Any, Any]:
+def mean_square_band(square: Given, freedom: Given, level: float) -> tuple[Any, Any]:
     """Confidence band of a mean square, (low, high) of the shape of `square`."""
     tail = (1.0 - level) / 2.0
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -65,7 +66,7 @@ def mean_square_band(square: Any, freedom: Any, level: float) -> tuple[Any, Any]
     return low, high
 
 
-def mean_band(mean: Any, variance: Any, count: Any, level: float) -> tuple[Any, Any]:
+def mean_band(mean: Given, variance: Given, count: Given, level: float) -> tuple[Any, Any]:
     """Confidence band of a mean by Student's law: the deviation is that of the same few runs.
 
     Args:
@@ -81,7 +82,7 @@ def mean_band(mean: Any, variance: Any, count: Any, level: float) -> tuple[Any, 
     return mean - width, mean + width
 
 
-def share_band(count: Any, runs: int, level: float) -> tuple[Any, Any]:
+def share_band(count: Given, runs: int, level: float) -> tuple[Any, Any]:
     """Confidence band of a probability of which `count` of some runs were hit, exact (Clopper and Pearson)."""
     hits, tail = np.asarray(count, dtype=float), (1.0 - level) / 2.0
     low = np.where(hits > 0, special.betaincinv(np.maximum(hits, 1.0), runs - hits + 1.0, tail), 0.0)

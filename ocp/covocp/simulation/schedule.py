@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
@@ -47,7 +48,7 @@ class Grid:
         """Lengths of the steps [s], (N,)."""
         return np.asarray(np.diff(self.t))
 
-    def divided(self, parts: Any) -> Grid:
+    def divided(self, parts: Given) -> Grid:
         """Each step divided into equal parts, a number or one for each step."""
         counts = np.broadcast_to(np.asarray(parts, dtype=int), (self.steps,))
         step = np.repeat(np.arange(self.steps), counts)
@@ -55,7 +56,7 @@ class Grid:
         starts = self.t[step] + self.h[step] * (inside / counts[step])
         return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step])
 
-    def parts(self, length: Any) -> Any:
+    def parts(self, length: Given) -> Any:
         """Into how many parts each step must be divided so that none is longer than `length`."""
         needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
         if not float(np.sum(needed)) <= MOST_STEPS:
@@ -82,7 +83,7 @@ def base_grid(solution: Solution, points: int, step: float | None = None, sample
     return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 
 
-def stored_times(grid: Grid, points: int, samples: Any) -> tuple[Array, Any]:
+def stored_times(grid: Grid, points: int, samples: Given) -> tuple[Array, Any]:
     """The grid's nearest times to `points` equally spread ones, and the intervals of the mesh that begin there.
 
     The first and the last are among them; where there are samples (indices of the grid), only these else.
@@ -112,7 +113,7 @@ class Nominal:
         return (self.x.T, self.u.T, self.e.T, self.t[None, :], *fixed)
 
 
-def nominal_at(solution: Solution, t: Array, interval: Any) -> Nominal:
+def nominal_at(solution: Solution, t: Array, interval: Given) -> Nominal:
     """The nominal at some times, its control that of the given interval, which matters where it jumps."""
     x, e = _states_at(solution, t)
     return Nominal(x=x, u=_controls_at(solution, t, interval), e=e, t=t)
@@ -126,7 +127,7 @@ def _states_at(solution: Solution, t: Array) -> tuple[Array, Array]:
     return x, np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
 
 
-def _controls_at(solution: Solution, t: Array, interval: Any) -> Array:
+def _controls_at(solution: Solution, t: Array, interval: Given) -> Array:
     """Controls (K, nu) of the given intervals."""
     nodes, u = solution.t, solution.controls
     if solution.mesh.control == "constant":
@@ -154,7 +155,7 @@ class Coefficients:
         """Entries of the column."""
         return int(self.function.size1_out(0))
 
-    def split(self, column: Any) -> dict[str, Any]:
+    def split(self, column: Given) -> dict[str, Any]:
         """The parts of a symbolic column by name."""
         sizes = [rows * columns for rows, columns in self.shapes.values()]
         pieces = ca.vertsplit(column, np.cumsum([0, *sizes]).tolist())
@@ -191,23 +192,23 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
     )
 
 
-def estimation_half(statement: Any, e: Any) -> Any:
+def estimation_half(statement: Given, e: Given) -> Any:
     """Half-vector of the estimation covariance out of all of them."""
     return e[next(b for b in statement.matrices if b.estimation).span]
 
 
-def filter_gain(half: Any, size: int, M: Any, U: Any) -> Any:
+def filter_gain(half: Given, size: int, M: Given, U: Given) -> Any:
     """Kalman gain K = E M' U^-1, (n, r), of the half-vector of E [Schmidt 2.5-3]; no columns without measurements."""
     E = unpack_symbolic(half, size)
     return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)
 
 
-def early_gain(E: Any, M: Any, U: Any, h: Any) -> Any:
+def early_gain(E: Given, M: Given, U: Given, h: Given) -> Any:
     """Gain E M'(M E M' + 2 U/h)^-1, (n, r), of what half a step measures, E known before it; bounded at any h."""
     if not M.shape[0]:
         return type(E).zeros(E.shape[0], 0)
 
-    def law(E: Any, M: Any, U: Any, h: Any) -> tuple[Any]:
+    def law(E: Given, M: Given, U: Given, h: Given) -> tuple[Any]:
         seen = h * (M @ E)
         return (definite_solve(symmetric(seen @ M.T) + 2 * U, seen, "noise of the innovation").T,)
 

@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 from scipy import special
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 
 # Widths are multiples of this, so that no column falls into the remainder of a vector loop.
@@ -175,7 +176,7 @@ def _mapped(function: ca.Function, width: int, shared: tuple[int, ...]) -> Colum
     for i, array in enumerate(results):
         buffer.set_res(i, memoryview(array))  # type: ignore[arg-type]
 
-    def run(_keep: Any = (buffer, mapped)) -> None:
+    def run(_keep: Given = (buffer, mapped)) -> None:
         evaluate()
 
     return Columns(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.errors import CovocpError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.extremal.path_limits import NOTED
 from covocp.statement.statement import Block, entry_names
@@ -457,7 +458,7 @@ def _intervals(count: int, stats: Mapping[str, Any]) -> str:
     return f"{_counted(asked, 'interval')}, graded to {count} {places}"
 
 
-def _starts(costs: Any) -> str:
+def _starts(costs: Given) -> str:
     """What the starts of a multistart found."""
     found = np.sort(costs[np.isfinite(costs)])
     text = f"best of {costs.size} starts"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.statement.names import entry_values, name_of
 
@@ -20,7 +21,7 @@ class Sample:
     values: Mapping[str, Array] = field(repr=False)
     symbols: Mapping[str, Any] = field(repr=False)
 
-    def __getitem__(self, key: Any) -> Array:
+    def __getitem__(self, key: Given) -> Array:
         """The value of a symbol, a name, or an entry of a vector."""
         given = np.ndim(self.t)
         sizes = {n: v.shape[-1] if v.ndim > given else 1 for n, v in self.values.items() if v.ndim <= given + 1}
@@ -32,7 +33,7 @@ class Sample:
         return f"Sample({', '.join(f'{name} = {_in_line(value)}' for name, value in shown.items())})"
 
 
-def _in_line(value: Any) -> str:
+def _in_line(value: Given) -> str:
     """Numbers on one line, six digits; of large arrays the corners."""
     text = np.array2string(
         np.asarray(value, dtype=float),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,8 @@ import numpy as np
 
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import CovocpError, ProblemError
+from covocp.base.expressions import Given
+from covocp.base.later import later
 from covocp.base.matrices import (
     Array,
     is_semidefinite,
@@ -254,7 +255,7 @@ class Solution:
             raise unknown_name(name, tuple(b.name for b in self.blocks))
         return found
 
-    def _name(self, key: Any, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
+    def _name(self, key: Given, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
         """Name of a symbol, a name or an entry among some blocks; None: among all values."""
         names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
         sizes = sizes_of(self.blocks if blocks is None else blocks)
@@ -286,7 +287,7 @@ class Solution:
             result[b.name] = values[:, 0] if b.size == 1 else values
         return result
 
-    def __getitem__(self, key: Any) -> Array:
+    def __getitem__(self, key: Given) -> Array:
         """Values at the nodes of a symbol, a name, an entry of one, or an expression of the problem's symbols.
 
         Raises:
@@ -306,7 +307,7 @@ class Solution:
         shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
         return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
 
-    def at(self, t: Any) -> Sample:
+    def at(self, t: Given) -> Sample:
         """Values at other times than the nodes.
 
         States and matrices as the integrator computes them between the nodes (`dense`), controls as they were
@@ -361,7 +362,7 @@ class Solution:
         """The same of the states alone, which costs less where there are matrices."""
         return dense_output(self.extremal, matrices=False)
 
-    def costate(self, symbol: Any) -> Array:
+    def costate(self, symbol: Given) -> Array:
         """Costate of a state or its entry, (K,) or (K, n), or of a matrix, the symmetric P of (K, n, n).
 
         Raises:
@@ -382,7 +383,7 @@ class Solution:
         values = self.costates.state[:, b.span]
         return np.asarray(values[:, 0] if b.size == 1 else values)
 
-    def multiplier(self, key: Any) -> Array:
+    def multiplier(self, key: Given) -> Array:
         """Multiplier of a constraint, by its name, or of the terminal values of a state or a matrix.
 
         The multiplier of an inequality is positive at its upper bound: the cost falls by it for one unit more room. For
@@ -410,7 +411,7 @@ class Solution:
         values = self.multipliers.final[b.span]
         return np.asarray(values[0] if b.size == 1 else values)
 
-    def covariance(self, a: Any, b: Any = None) -> Array:
+    def covariance(self, a: Given, b: Given = None) -> Array:
         """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).
 
         That of the errors of the estimate where nothing is fed back, E + Xhat (and Z, where the statistics are not
@@ -435,13 +436,13 @@ class Solution:
         rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
         return np.asarray(full[:, rows, columns])
 
-    def deviation(self, symbol: Any) -> Array:
+    def deviation(self, symbol: Given) -> Array:
         """Standard deviation of a state, an unknown or an entry of one, (K,) or (K, n), in its unit."""
         variances = np.diagonal(self.covariance(symbol), axis1=1, axis2=2)
         values = np.sqrt(np.maximum(variances, 0.0))
         return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
 
-    def _augmented_span(self, key: Any) -> slice:
+    def _augmented_span(self, key: Given) -> slice:
         offset = 0
         both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
         candidates = tuple(q for q in both if entry_names((q,))[0] in self.augmented)  # constants of a gain have no row
@@ -489,16 +490,17 @@ class Solution:
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.figure.plot_solutions`."""
-        _later("plot.figure").check_plot_options(options)
-        return _later("plot.figure").plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
+        figures = later("plot.figure")
+        figures.check_plot_options(options)
+        return figures.plot_solutions([self], *names, **options)  # type: ignore[no-any-return]
 
     def save(self, path: str | Path) -> Path:
         """Write the solution to a .npz or .json file; see `covocp.solution.storage.save`."""
-        return _later("solution.storage").save(self, path)  # type: ignore[no-any-return]
+        return later("solution.storage").save(self, path)  # type: ignore[no-any-return]
 
     def to_xarray(self) -> Any:
         """The solution as an xarray.Dataset; see `covocp.solution.storage.to_xarray`."""
-        return _later("solution.storage").to_xarray(self)
+        return later("solution.storage").to_xarray(self)
 
     def __repr__(self) -> str:
         """One line: what a console shows of a solution that nobody prints is no page of numbers."""
@@ -506,7 +508,7 @@ class Solution:
 
     def __str__(self) -> str:
         """The summary that print shows."""
-        return str(_later("solution.report").summary(self))
+        return str(later("solution.report").summary(self))
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -520,8 +522,3 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
         return dict(terms)
     nominal = {name: loop.cost[name] for name in ("terminal", "running")}
     return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
-
-
-def _later(module: str) -> Any:
-    """A module that is built on solutions; imported when it is used."""
-    return importlib.import_module(f"covocp.{module}")

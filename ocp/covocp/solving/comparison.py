@@ -13,6 +13,7 @@ import numpy as np
 
 from covocp.base.arguments import check_argument, checked, either, mapping, optional, sequence, text, truth
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, spelling
+from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
 from covocp.solution.report import number, render_table, wrapped
@@ -145,7 +146,7 @@ def compare(
     methods: Sequence[Any] = DEFAULT,
     *,
     intervals: int = 100,
-    guess: Any = None,
+    guess: Given = None,
     progress: bool = True,
     method_options: Mapping[str, Mapping[str, Any]] | None = None,
     **options: Any,
@@ -237,7 +238,7 @@ def _runs(
     return runs
 
 
-def _triple(entry: Any) -> tuple[str, str, dict[str, Any]]:
+def _triple(entry: Given) -> tuple[str, str, dict[str, Any]]:
     """(label, method, options) of an entry that is not a name."""
     if isinstance(entry, tuple) and len(entry) == 3 and isinstance(entry[2], Mapping):
         return str(entry[0]), str(entry[1]), dict(entry[2])

@@ -14,6 +14,7 @@ import numpy as np
 
 from covocp.base.checks import as_number, check_density, check_kind
 from covocp.base.errors import ProblemError, evaluating, no_option
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import Statistics, close_loop, densities
@@ -41,8 +42,8 @@ SAME = 1e-9
 def evaluate(
     problem: Problem | Solution,
     *,
-    nominal: Any = None,
-    truth: Any = None,
+    nominal: Given = None,
+    truth: Given = None,
     intervals: int = 100,
     parameters: Mapping[str, Any] | None = None,
     **options: Any,
@@ -81,7 +82,7 @@ def evaluate(
 
 
 def _along(
-    problem: Problem, nominal: Any, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
+    problem: Problem, nominal: Given, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
 ) -> Solution:
     """The problem along a nominal."""
     check_kind(problem, Problem, "evaluate(problem, nominal=...), or evaluate(solution, truth=...)")
@@ -145,7 +146,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
-def _controls(statement: Statement, mesh: Mesh, nominal: Any, asked: int) -> tuple[Array, float]:
+def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> tuple[Array, float]:
     """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
     nodes, duration = mesh.nodes, statement.duration.guess
     at = nodes if mesh.control == "linear" else 0.5 * (nodes[1:] + nodes[:-1])
@@ -192,7 +193,7 @@ def _not_given(name: str, received: str) -> ProblemError:
     )
 
 
-def _under(solution: Solution, truth: Any) -> Solution:
+def _under(solution: Solution, truth: Given) -> Solution:
     """The solution with the covariances and the cost of other statistics, and the gains of its design."""
     if solution.loop is None:
         raise ProblemError(
@@ -219,7 +220,7 @@ def _under(solution: Solution, truth: Any) -> Solution:
     )
 
 
-def true_statistics(extremal: Extremal, truth: Any) -> Statistics:
+def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
     """Initial covariance and noise densities of a truth.
 
     Raises:

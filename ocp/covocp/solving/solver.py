@@ -23,6 +23,7 @@ from covocp.base.errors import (
     warn_user,
     without_warnings,
 )
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
@@ -31,7 +32,7 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
-from covocp.problem.expected_cost import deterministic
+from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
@@ -77,7 +78,7 @@ def method_options(method: str) -> dict[str, Any]:
     return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
 
 
-def check_problem(problem: Any) -> None:
+def check_problem(problem: Given) -> None:
     """What is solved or compared must be a problem.
 
     Raises:
@@ -144,7 +145,7 @@ class Solver:
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
-        solved = self.statement if nominal == "combined" else deterministic(problem).statement()
+        solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
@@ -156,7 +157,7 @@ class Solver:
         self,
         parameters: Mapping[str, Any] | None = None,
         *,
-        guess: Any = None,
+        guess: Given = None,
         progress: bool = True,
         allow_failure: bool = False,
         starts: int = STARTS,
@@ -426,7 +427,7 @@ def solve(
     method: str = "ipopt",
     *,
     intervals: int = 100,
-    guess: Any = None,
+    guess: Given = None,
     nominal: str = "combined",
     progress: bool = True,
     allow_failure: bool = False,

@@ -9,12 +9,14 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import warn_user
+from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
 from covocp.statement.names import chosen_entry
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
+    from covocp.problem.declarations import Declarations
 
 # A guess with fewer rows than this share of the nodes is a row of waypoints.
 WAYPOINTS = 0.5
@@ -22,12 +24,11 @@ WAYPOINTS = 0.5
 
 def mention_forgotten(problem: Problem) -> None:
     """Warn of what is probably forgotten in a problem that is to be solved or evaluated; once for each statement."""
-    if problem._mentioned:
+    if problem.doubts_told:
         return
-    problem._mentioned = True
-    _mention_nothing_learnt(problem)
-    _mention_unused_measurements(problem)
-    _mention_spread_noise(problem)
+    problem.doubts_told = True
+    for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise):
+        mention(problem.declarations)
 
 
 def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
@@ -55,7 +56,7 @@ def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
             )
 
 
-def _mention_nothing_learnt(problem: Problem) -> None:
+def _mention_nothing_learnt(problem: Declarations) -> None:
     """A cost or a condition of the variance of an unknown that no measurement depends on: it never changes."""
     E = next((matrix for matrix in problem.matrices if matrix.estimation), None)
     if E is None or not problem.unknowns:
@@ -89,7 +90,7 @@ def _mention_nothing_learnt(problem: Problem) -> None:
             return
 
 
-def _seen(problem: Problem) -> set[int]:
+def _seen(problem: Declarations) -> set[int]:
     """Hashes of the symbols that measurements depend on, at once or through the rates of states."""
     rates = {s.symbol.__hash__(): problem.rates[s.name].rate for s in problem.states if s.name in problem.rates}
     seen: set[int] = set()
@@ -102,7 +103,7 @@ def _seen(problem: Problem) -> set[int]:
     return seen
 
 
-def _correlated(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+def _correlated(initial: Given, unseen: set[int], rows: Given, columns: Given) -> bool:
     """Whether the first covariance joins what is not measured with the rest, or may do so."""
     if initial is None or ca.symvar(initial):
         return initial is not None and initial.nnz() > 0 and not _block_diagonal(initial, unseen, rows, columns)
@@ -110,7 +111,7 @@ def _correlated(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool
     return any(v != 0 and (i in unseen) != (j in unseen) for v, i, j in zip(values, rows, columns, strict=True))
 
 
-def _block_diagonal(initial: Any, unseen: set[int], rows: Any, columns: Any) -> bool:
+def _block_diagonal(initial: Given, unseen: set[int], rows: Given, columns: Given) -> bool:
     """Whether a symbolic first covariance has no entries between two groups of rows."""
     sparsity = (initial if isinstance(initial, ca.MX) else ca.sparsify(initial)).sparsity()
     present = set(sparsity.row())
@@ -119,7 +120,7 @@ def _block_diagonal(initial: Any, unseen: set[int], rows: Any, columns: Any) -> 
     )
 
 
-def _mention_unused_measurements(problem: Problem) -> None:
+def _mention_unused_measurements(problem: Declarations) -> None:
     """Measurements without a covariance of errors, an expected cost or a matrix of the user's own."""
     if problem.measurements and problem.expected is None and not problem.matrices:
         names = ", ".join(f"'{m.name}'" for m in problem.measurements)
@@ -130,7 +131,7 @@ def _mention_unused_measurements(problem: Problem) -> None:
         )
 
 
-def _mention_spread_noise(problem: Problem) -> None:
+def _mention_spread_noise(problem: Declarations) -> None:
     """One noise density for all rows of a state of which some row is the rate of another: position and velocity."""
     for state in problem.states:
         entry = problem.rates.get(state.name)
@@ -148,7 +149,7 @@ def _mention_spread_noise(problem: Problem) -> None:
             )
 
 
-def _is_another(rate: Any, symbol: Any, row: int) -> bool:
+def _is_another(rate: Given, symbol: Given, row: int) -> bool:
     """Whether a rate is just another entry of the same state."""
     found = chosen_entry(rate, symbol)
     return found >= 0 and found != row

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.errors import ProblemError, spelling
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
@@ -20,12 +21,12 @@ from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 
-def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Guess:
+def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Guess:
     """The first of `make_guesses`."""
     return next(make_guesses(statement, mesh, parameters, guess))
 
 
-def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Any) -> Iterator[Guess]:
+def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Iterator[Guess]:
     """Guesses on a mesh from what the user gave, the best first; the others are made when they are asked for.
 
     Raises:

@@ -12,6 +12,7 @@ import numpy as np
 
 from covocp.base.checks import bound_columns, check_bounds, column
 from covocp.base.errors import ProblemError, spelling
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length, unpack_indices
 from covocp.statement.statement import Block, Statement
 
@@ -20,7 +21,7 @@ ENTRY = re.compile(r"(?P<vector>.+)\[(?P<entry>\d+)\]")
 
 
 def name_of(
-    key: Any,
+    key: Given,
     symbols: Mapping[str, Any],
     names: tuple[str, ...],
     *,
@@ -89,7 +90,7 @@ def entry_values(values: Mapping[str, Array], name: str) -> Array:
     return np.asarray(values[entry[0]][..., entry[1]])
 
 
-def _entry_name(key: Any, symbols: Mapping[str, Any], sizes: Mapping[str, int]) -> str:
+def _entry_name(key: Given, symbols: Mapping[str, Any], sizes: Mapping[str, int]) -> str:
     """Name of an entry of a vector, given as such or as the expression `p[0]`; "" where it is none."""
     vector, k = "", -1
     if isinstance(key, str) and (entry := split_entry(key)) is not None:
@@ -104,7 +105,7 @@ def _entry_name(key: Any, symbols: Mapping[str, Any], sizes: Mapping[str, int]) 
     return vector if sizes[vector] == 1 else f"{vector}[{k}]"
 
 
-def chosen_entry(key: Any, vector: Any) -> int:
+def chosen_entry(key: Given, vector: Given) -> int:
     """Which entry of a vector an expression is, -1 where it is something else."""
     if [s.__hash__() for s in ca.symvar(key)] != [vector.__hash__()]:
         return -1
@@ -119,7 +120,7 @@ def chosen_entry(key: Any, vector: Any) -> int:
     return int(rows[0]) if offset == 0.0 else -1
 
 
-def _no_such_entry(key: Any, sizes: Mapping[str, int]) -> ProblemError | None:
+def _no_such_entry(key: Given, sizes: Mapping[str, int]) -> ProblemError | None:
     """The error for an entry that a vector does not have; None where no such vector is named."""
     entry = split_entry(key) if isinstance(key, str) else None
     if entry is None or entry[0] not in sizes:
@@ -175,7 +176,7 @@ def _not_given(name: str, statement: Statement, some: bool) -> str:
     return f"give one of these; {declared}" if some else declared
 
 
-def _is_matrix_of(key: Any, half: Any) -> bool:
+def _is_matrix_of(key: Given, half: Given) -> bool:
     """Whether an expression is the full matrix of a half-vector's symbol."""
     size = int(key.shape[0])
     if size != key.shape[1] or half.shape[0] != half_length(size) or key.is_symbolic():
@@ -187,7 +188,7 @@ def _is_matrix_of(key: Any, half: Any) -> bool:
     return np.array_equal(np.asarray(ca.Function("probe", [half], [key])(probe).full()), probe[unpack_indices(size)])
 
 
-def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
+def unknown_name(key: Given, names: tuple[str, ...]) -> ProblemError:
     """The error for something that is not in the solution."""
     return ProblemError(
         f"'{key}' is not in this solution.",
@@ -197,7 +198,7 @@ def unknown_name(key: Any, names: tuple[str, ...]) -> ProblemError:
     )
 
 
-def control_limits(statement: Statement, count: int, given: Any) -> Limits:
+def control_limits(statement: Statement, count: int, given: Given) -> Limits:
     """What the actual control can do, lower and upper limits, (count,) each; infinite where nothing limits it.
 
     Args:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_indices, half_length
 from covocp.base.threads import cached
 
@@ -69,7 +70,7 @@ class Conditions:
         """Number of rows."""
         return len(self.names)
 
-    def columns(self, at_columns: tuple[Any, Any, Any, Any], duration: Any, parameters: Any) -> Any:
+    def columns(self, at_columns: tuple[Any, Any, Any, Any], duration: Expr, parameters: Expr) -> Any:
         """The values for columns of (x, u, matrices, time); matrices that no row reads are no part of the expression.
 
         Else every slope of these values would carry the propagation of the covariances along.

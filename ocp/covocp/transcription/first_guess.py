@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, pack, real_numbers, unpack
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
 from covocp.transcription.nlp import Scales
-from covocp.transcription.shooting import common_columns, matrices_along
+from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, nominal_interval
 from covocp.transcription.trajectory import Trajectory
 
@@ -44,7 +46,7 @@ def controls_guess(statement: Statement, nodes: Array, control: str, sign: float
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1)
 
 
-def is_plain(guess: Any) -> bool:
+def is_plain(guess: Given) -> bool:
     """Whether a guess is one number, which says little: it may be steered and bent."""
     return not callable(guess) and np.ndim(0.0 if guess is None else guess) == 0
 
@@ -61,7 +63,7 @@ def control_scale(statement: Statement, block: Block, values: Array) -> Array:
     return np.where(scale > 0, scale, 1.0)
 
 
-def evaluate_guess(block: Block, guess: Any, at: Array) -> Array:
+def evaluate_guess(block: Block, guess: Given, at: Array) -> Array:
     """A guess (number, array over the nodes, function of s) as an array (len(at), size).
 
     Raises:
@@ -130,7 +132,7 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
     return np.where(np.isnan(x0), default, x0), e0
 
 
-def matrix_guess(block: Block, guess: Any) -> Array:
+def matrix_guess(block: Block, guess: Given) -> Array:
     """Half-vector of the guess of a matrix; a number means that multiple of the identity.
 
     Raises:
@@ -221,7 +223,7 @@ def simulate_states(
     """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
     first = np.concatenate([start, e0]) if statement.coupled else start
     run = _simulation(statement, mesh)
-    ends = np.asarray(run(first, *common_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0].full())
+    ends = np.asarray(run(first, *interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0].full())
     values = np.vstack([start, ends[: statement.nx].T])
     if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:
         lower, upper = statement.state_bounds
@@ -252,7 +254,7 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     x = ca.MX.sym("x", statement.nx, mesh.intervals + 1)
     u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
-    common = common_columns(mesh, u, duration, p)
+    common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p)
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])
@@ -309,7 +311,7 @@ def _largest(values: NDArray[np.complex128]) -> float:
 @lru_cache(maxsize=KEPT)
 def state_jacobian(statement: Statement) -> ca.Function:
     """f_x as a function of the six arguments."""
-    symbols = _six_symbols(statement)
+    symbols = model_symbols(statement)
     if statement.nominal is None:
         rate = statement.rates(*symbols)[0]
     else:
@@ -319,14 +321,8 @@ def state_jacobian(statement: Statement) -> ca.Function:
 
 def _matrix_jacobian(statement: Statement) -> ca.Function:
     """V_e as a function of the six arguments."""
-    symbols = _six_symbols(statement)
+    symbols = model_symbols(statement)
     return ca.Function("jacobian", symbols, [ca.jacobian(statement.rates(*symbols)[1], symbols[2])])
-
-
-def _six_symbols(statement: Statement) -> list[Any]:
-    symbolic: Any = statement.symbolic
-    sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
-    return [symbolic.sym(f"a{i}", n) for i, n in enumerate(sizes)]
 
 
 def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:

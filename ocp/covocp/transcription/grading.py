@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts, stiffness
@@ -25,7 +26,7 @@ from covocp.transcription.starts import own_start
 from covocp.transcription.trajectory import Trajectory
 
 # Change of ln E in a part of an interval: ratio 1.5 of neighbouring parts. Ratio 2 leaves errors of the expected cost
-# of 5e-5 to 1.4e-3, this one of 1e-5 to 3e-4 (benchmarks/defaults_expected_cost.py).
+# of 5e-5 to 1.4e-3, this one of 1e-5 to 3e-4 (benchmarks/measurements/expected_cost.py).
 CHANGE = 0.4
 # An interval is divided where more than this many parts are asked for: where the time scale is below the interval.
 DIVIDED = 1.5
@@ -148,7 +149,7 @@ def _steepness(
     return _Steepness(times=times, rates=rates, poles=poles)
 
 
-def _first_value(statement: Statement, guess: Trajectory, parameters: Array, block: Any) -> Array:
+def _first_value(statement: Statement, guess: Trajectory, parameters: Array, block: Expr) -> Array:
     """E(0), or S(T) along the guess."""
     if not block.backward:
         return unpack(guess.e[0, block.span], block.size)
@@ -159,7 +160,7 @@ def _first_value(statement: Statement, guess: Trajectory, parameters: Array, blo
 
 
 def _forms(
-    form: Any, size: int, guess: Trajectory, parameters: Array, times: Array, backward: bool
+    form: Expr, size: int, guess: Trajectory, parameters: Array, times: Array, backward: bool
 ) -> tuple[Array, Array, Array]:
     """F, Q, W in the direction of travel at some distances from the end, along the guess; (points, n, n) each."""
     duration = guess.duration

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import NUMERIC_RUN, common_columns, shoot
+from covocp.transcription.shooting import NUMERIC_RUN, interval_columns, shoot
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
 
@@ -63,7 +63,7 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
 def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Array:
     """The state at the end, (nx,), of one run from the start along the same controls with shorter steps."""
     divided, u = _divided(mesh, trajectory.u, parts)
-    common = common_columns(divided, ca.DM(u.T), trajectory.duration, ca.DM(parameters))
+    common = interval_columns(divided, ca.DM(u.T), trajectory.duration, ca.DM(parameters))
     advance = nominal_interval(statement, mesh.substeps, mesh.step)
     value: Any = ca.DM(trajectory.x[0])
     count = divided.intervals

@@ -9,6 +9,7 @@ import numpy as np
 
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import ProblemError, spelling
+from covocp.base.expressions import Given
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
@@ -313,7 +314,7 @@ def _choose_covariance_step(statement: Statement, options: Options) -> Step:
 def _choose_eliminated(statement: Statement, options: Options) -> bool:
     """Whether the matrices are eliminated: always where they can be and no path constraint on a few entries needs them.
 
-    Eliminated is faster for every problem of benchmarks/formulations.py, down to a single scalar variance.
+    Eliminated is faster for every problem of benchmarks/measurements/formulations.py, down to a single scalar variance.
     """
     if not statement.matrices:
         return True
@@ -353,7 +354,7 @@ def _bounded_matrices(statement: Statement) -> list[str]:
     return names
 
 
-def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
+def _whole(name: str, value: Given, expected: str = "1, 2, 3, ...") -> None:
     if not is_whole(value):
         raise ProblemError(
             f"The option '{name}' must be a positive whole number.",
@@ -363,7 +364,7 @@ def _whole(name: str, value: Any, expected: str = "1, 2, 3, ...") -> None:
         )
 
 
-def _choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def _choice(name: str, value: Given, choices: tuple[str, ...]) -> None:
     if not isinstance(value, str) or value not in choices:
         raise ProblemError(
             f"The option '{name}' has an unknown value.",

@@ -17,7 +17,9 @@ from typing import Any
 
 import casadi as ca
 
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
+from covocp.statement.interval import Interval, one_sided
 from covocp.statement.statement import Statement
 
 GAMMA = 0.25
@@ -47,17 +49,6 @@ DENSE = (
 # States up to which a step is written out in scalar operations, its linear systems too.
 SCALAR_STATES = 6
 KEPT = 16
-# Share of a step by which its ends are moved inside where the model is told the time, see `one_sided`.
-SIDE = 1e-10
-
-
-def one_sided(c: float) -> float:
-    """A share of a step as the model is told it: the ends as their limits from inside.
-
-    A rate that jumps where two steps meet (a change of phase at a node) has its left limit on the left and its right
-    limit on the right, whichever comparison says it and however the time of the node is rounded.
-    """
-    return min(max(c, SIDE), 1.0 - SIDE)
 
 
 @lru_cache(maxsize=KEPT)
@@ -78,38 +69,33 @@ def implicit_step(statement: Statement, fractions: tuple[float, ...]) -> ca.Func
     nx = statement.nx
     scalar = statement.symbolic is ca.SX and nx <= SCALAR_STATES
     kind: Any = ca.SX if scalar else ca.MX
-    x, ua, ub, s, ds, duration, p = symbols = step_symbols(statement, kind)
+    x, interval = kind.sym("x", nx), Interval.symbols(statement, kind)
     value, c, side = kind.sym("value", nx), kind.sym("c"), kind.sym("side")
-    rate = nominal(value, ua + c * (ub - ua), duration * (s + (c + side) * ds), duration, p)[0]
-    at = ca.Function("at", [value, c, side, *symbols[1:]], [rate])
-    slopes = ca.Function("slopes", [value, c, side, *symbols[1:]], [ca.jacobian(rate, value), ca.jacobian(rate, c)])
-    h = duration * ds
-    slope, in_time = slopes(x, 0.0, one_sided(0.0), *symbols[1:])
+    time = interval.duration * (interval.s + (c + side) * interval.ds)
+    rate = nominal(value, interval.control(c), time, interval.duration, interval.parameters)[0]
+    at = ca.Function("at", [value, c, side, *interval], [rate])
+    slopes = ca.Function("slopes", [value, c, side, *interval], [ca.jacobian(rate, value), ca.jacobian(rate, c)])
+    h = interval.h
+    slope, in_time = slopes(x, 0.0, one_sided(0.0), *interval)
     solve = _solver(ca.DM.eye(nx) / (GAMMA * h) - slope, scalar)
     moves: list[Any] = []
     for node, by_time, stage, coupling in zip(NODES, SLOPES_IN_TIME, STAGES, COUPLINGS, strict=True):
         point = x + sum((a * move for a, move in zip(stage, moves, strict=True)), kind.zeros(nx))
-        right = at(point, node, one_sided(node) - node, *symbols[1:]) + by_time * in_time
+        right = at(point, node, one_sided(node) - node, *interval) + by_time * in_time
         right += sum((a * move for a, move in zip(coupling, moves, strict=True)), kind.zeros(nx)) / h
         moves.append(solve(right))
     end = point + moves[-1]
     second, third = (sum(a * move for a, move in zip(row, moves[:5], strict=True)) for row in DENSE)
     inside = [(1 - c) * x + c * (end + (1 - c) * (second + c * third)) for c in fractions]
-    return ca.Function("implicit_step", list(symbols), [end, ca.horzcat(kind(nx, 0), *inside)])
+    return ca.Function("implicit_step", [x, *interval], [end, ca.horzcat(kind(nx, 0), *inside)])
 
 
-def _solver(matrix: Any, scalar: bool) -> Any:
+def _solver(matrix: Expr, scalar: bool) -> Any:
     """right -> matrix^-1 right: factorised once where it is written out, else by what C code has too."""
     if not scalar:
         return lambda right: linear_solve(matrix, right, COMPILED_SOLVER)
     unitary, upper = ca.qr(ca.densify(matrix))
     return lambda right: ca.solve(upper, unitary.T @ right)
-
-
-def step_symbols(statement: Statement, kind: Any) -> tuple[Any, ...]:
-    """Symbols of the arguments of a step of the nominal."""
-    sizes = {"x": statement.nx, "ua": statement.nu, "ub": statement.nu, "s": 1, "ds": 1, "T": 1, "p": statement.np}
-    return tuple(kind.sym(name, size) for name, size in sizes.items())
 
 
 @lru_cache(maxsize=KEPT)
@@ -128,18 +114,16 @@ def implicit_interval(statement: Statement, substeps: int, nodes: tuple[float, .
     nominal: Any = statement.nominal
     step = implicit_step(statement, nodes)
     kind: Any = ca.SX if step.is_a("SXFunction") else ca.MX
-    start, *common = step_symbols(statement, kind)
+    start, interval = kind.sym("x", statement.nx), Interval.symbols(statement, kind)
     x, states, total = start, [], kind.zeros(1)
     for j in range(substeps):
-        part = part_of(tuple(common), j / substeps, (j + 1) / substeps)
+        part = interval.part(j / substeps, (j + 1) / substeps)
         x, inside = step(x, *part)
-        for k, c in enumerate(nodes):
-            u, _, s, _, duration, p = part_of(part, c, c)
-            total += nominal(inside[:, k], u, duration * s, duration, p)[1] / (substeps * len(nodes))
+        total += sum(nominal(*part.at(c, inside[:, k]))[1] for k, c in enumerate(nodes)) / (substeps * len(nodes))
         states.append(x)
-    length = common[3] * common[4]
     options = {"is_diff_in": [True] * 3 + [False, False, statement.duration.free, False]}  # as explicit steps
-    return ca.Function("implicit_interval", [start, *common], [x, ca.horzcat(*states), length * total], options)
+    outputs = [x, ca.horzcat(*states), interval.h * total]
+    return ca.Function("implicit_interval", [start, *interval], outputs, options)
 
 
 @lru_cache(maxsize=KEPT)
@@ -147,22 +131,14 @@ def between(statement: Statement, fractions: tuple[float, ...]) -> ca.Function:
     """States inside a step, by the step's own polynomial.
 
     Returns:
-        (state at either end, state at the other, *common) -> states at the fractions of the way from the first,
+        (state at either end, state at the other, *interval) -> states at the fractions of the way from the first,
         (nx, len(fractions)). A step that is turned round (ds < 0) is taken from its later end, as it was.
     """
     count = len(fractions)
     step = implicit_step(statement, (*fractions, *(1.0 - c for c in fractions)))
     kind: Any = ca.SX if step.is_a("SXFunction") else ca.MX
-    xa, *common = step_symbols(statement, kind)
-    xb = kind.sym("xb", statement.nx)
-    ua, ub, s, ds, duration, p = common
-    ahead = ds > 0
-    first, second, third = (ca.if_else(ahead, a, b) for a, b in ((xa, xb), (ua, ub), (ub, ua)))
-    inside = step(first, second, third, ca.if_else(ahead, s, s + ds), ca.fabs(ds), duration, p)[1]
-    return ca.Function("between", [xa, xb, *common], [ca.if_else(ahead, inside[:, :count], inside[:, count:])])
-
-
-def part_of(common: tuple[Any, ...], c: Any, d: Any) -> tuple[Any, ...]:
-    """The common arguments of the part [c, d] of an interval, 0 <= c <= d <= 1."""
-    ua, ub, s, ds, duration, p = common
-    return ua + c * (ub - ua), ua + d * (ub - ua), s + c * ds, (d - c) * ds, duration, p
+    xa, xb, interval = kind.sym("x", statement.nx), kind.sym("xb", statement.nx), Interval.symbols(statement, kind)
+    ahead = interval.ds > 0
+    forward = Interval(*(ca.if_else(ahead, a, b) for a, b in zip(interval, interval.turned(), strict=True)))
+    inside = step(ca.if_else(ahead, xa, xb), *forward)[1]
+    return ca.Function("between", [xa, xb, *interval], [ca.if_else(ahead, inside[:, :count], inside[:, count:])])

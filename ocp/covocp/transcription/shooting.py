@@ -7,12 +7,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
+from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
-    early,
     full_interval,
-    interval_symbols,
     joint_interval,
     nominal_interval,
     propagate_step,
@@ -25,33 +25,33 @@ from covocp.transcription.steps import (
 NUMERIC_RUN = 10
 
 
-def repeat(column: Any, count: int) -> Any:
+def repeat(column: Expr, count: int) -> Any:
     """A column repeated; one without entries stays without."""
     return ca.repmat(column, 1, count) if column.shape[0] else ca.DM(0, count)
 
 
-def control_ends(mesh: Mesh, u: Any) -> tuple[Any, Any]:
+def control_ends(mesh: Mesh, u: Expr) -> tuple[Any, Any]:
     """Controls at the starts and the ends of the intervals, a column each."""
     return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
 
 
-def common_columns(mesh: Mesh, u: Any, duration: Any, parameters: Any) -> tuple[Any, ...]:
-    """The common arguments of the interval functions, a column for each interval."""
+def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> Interval:
+    """The intervals of a mesh, a column for each."""
     n = mesh.intervals
     start, end = control_ends(mesh, u)
     s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
-    return start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n)
+    return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n))
 
 
-def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
+def shoot(statement: Statement, mesh: Mesh, variables: Expr) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
-    common = common_columns(mesh, variables.u, variables.duration, variables.parameters)
+    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
         start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
         advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
     else:
         start, advance = variables.x, nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = _segments(mesh, advance, start, common)
+    ends, fine, cost = _segments(mesh, advance, start, intervals)
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
     gaps = ends[:, last] - start[:, 1:]
@@ -65,7 +65,7 @@ def shoot(statement: Statement, mesh: Mesh, variables: Any) -> dict[str, Any]:
     if not mesh.eliminated or statement.coupled:
         return result | {"e": nodes[nx:, :]}
     e0 = None if variables.e is None else variables.e[:, 0]
-    passage = passages(statement, mesh, result["x"], fine, common, variables.parameters, e0)
+    passage = passages(statement, mesh, result["x"], fine, intervals, variables.parameters, e0)
     if inside:
         result["e_inside"] = passage[1][:, inside]
     return result | {"e": passage[0], "cost": cost + passage[2]}
@@ -77,7 +77,7 @@ def _inside(mesh: Mesh) -> list[int]:
     return [k * m + j * stride - 1 for k in range(n) for j in range(1, mesh.points)]
 
 
-def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval) -> tuple[Any, Any, Any]:
     """Run all segments: values at the ends of the intervals, at the substeps, running costs; mapped by equal length."""
     ends: list[Any] = []
     fine: list[Any] = []
@@ -88,14 +88,14 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Any, common: tuple[Any, .
         function = advance if length == 1 else advance.mapaccum("segment", length)
         function = function.map(count) if count > 1 else function
         span = slice(first_interval, first_interval + count * length)
-        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in common))
+        outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in intervals))
         for collected, value in zip((ends, fine, costs), outputs, strict=True):
             collected.append(value)
         first_segment, first_interval = first_segment + count, span.stop
     return ca.horzcat(*ends), ca.horzcat(*fine), ca.horzcat(*costs)
 
 
-def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
+def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
     """Values at all nodes: variables where segments start and at the end, computed ones between."""
     if len(mesh.segments) == mesh.intervals:
         return start  # each node starts a segment
@@ -108,12 +108,12 @@ def _node_values(mesh: Mesh, start: Any, ends: Any) -> Any:
 def matrices_along(
     statement: Statement,
     mesh: Mesh,
-    x: Any,
-    fine: Any,
-    common: tuple[Any, ...],
-    parameters: Any,
-    e0: Any = None,
-    kicks: Any = None,
+    x: Expr,
+    fine: Expr,
+    intervals: Interval,
+    parameters: Expr,
+    e0: Expr = None,
+    kicks: Expr = None,
 ) -> tuple[Any, Any]:
     """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
 
@@ -122,7 +122,7 @@ def matrices_along(
         mesh: nodes, substeps, covariance step.
         x: states at the nodes, (nx, N + 1).
         fine: states at the ends of all substeps, (nx, N substeps).
-        common: common arguments of the interval functions, a column for each interval.
+        intervals: the intervals, a column for each.
         parameters: of the statement.
         e0: half-vectors at the start; None: the statement's.
         kicks: added to the half-vectors as they pass the nodes, (ne, N + 1): slopes by them are costates. None:
@@ -131,49 +131,49 @@ def matrices_along(
     Returns:
         Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
     """
-    e, _, cost = passages(statement, mesh, x, fine, common, parameters, e0, kicks)
+    e, _, cost = passages(statement, mesh, x, fine, intervals, parameters, e0, kicks)
     return e, cost
 
 
 def passages(
     statement: Statement,
     mesh: Mesh,
-    x: Any,
-    fine: Any,
-    common: tuple[Any, ...],
-    parameters: Any,
-    e0: Any = None,
-    kicks: Any = None,
+    x: Expr,
+    fine: Expr,
+    intervals: Interval,
+    parameters: Expr,
+    e0: Expr = None,
+    kicks: Expr = None,
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
     n, m = mesh.intervals, mesh.substeps
     e0 = statement.boundary(parameters)[2] if e0 is None else e0
     starts = x[:, :n]
     if mesh.step == "rk4" and not statement.behind:
-        ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, common)
+        ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     before = starts
     if m > 1:
-        before = ca.vertcat(starts, ca.reshape(fine, statement.nx * m, n)[: statement.nx * (m - 1), :])
-        before = ca.reshape(before, statement.nx, n * m)
-    columns = (before, fine, *substep_columns(common, m, n))
+        inside: Expr = ca.reshape(fine, statement.nx * m, n)
+        before = ca.reshape(ca.vertcat(starts, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
+    columns = (before, fine, *intervals.substeps(m))
     first = e0[statement.entries(statement.ahead)]
     passed = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
     if statement.matrix_end is not None:
-        last = statement.matrix_end(x[:, -1], common[4][:, -1], parameters)
+        last = statement.matrix_end(x[:, -1], intervals.duration[:, -1], parameters)
         other = _backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind))
         entries = np.argsort(statement.entries(statement.ahead) + statement.entries(statement.behind)).tolist()
         passed = tuple(ca.vertcat(a, b)[entries, :] for a, b in zip(passed, other, strict=True))
     e, begins, halves = passed
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
-    return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *common))
+    return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))
 
 
 def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:
     """Running cost of each interval where it depends on the matrices; of a closed loop by parts in the first half."""
     n, m = mesh.intervals, mesh.substeps
-    half = int(np.sum(early(mesh.nodes[:-1], np.diff(mesh.nodes)))) if statement.behind else 0
+    half = int(np.sum(mesh.nodes[:-1] + np.diff(mesh.nodes) / 2 < 0.5)) if statement.behind else 0
     costs = []
     for span, by_parts in ((range(half), True), (range(half, n), False)):
         if len(span):
@@ -184,12 +184,12 @@ def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> 
     return ca.horzcat(*costs)
 
 
-def _of(kicks: Any, statement: Statement, positions: tuple[int, ...]) -> Any:
+def _of(kicks: Expr, statement: Statement, positions: tuple[int, ...]) -> Any:
     """The rows of the kicks that belong to some of the matrices."""
     return None if kicks is None else kicks[statement.entries(positions), :]
 
 
-def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+def _forward(statement: Statement, mesh: Mesh, first: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
     """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
     n, m = mesh.intervals, mesh.substeps
     later = None
@@ -200,7 +200,7 @@ def _forward(statement: Statement, mesh: Mesh, first: Any, columns: tuple[Any, .
     return nodes, nodes[:, :n], arrived
 
 
-def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, ...], kicks: Any) -> tuple[Any, ...]:
+def _backward(statement: Statement, mesh: Mesh, last: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
     """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
     n, m = mesh.intervals, mesh.substeps
     before, after, start, end, s, ds, duration, parameters = columns
@@ -214,7 +214,7 @@ def _backward(statement: Statement, mesh: Mesh, last: Any, columns: tuple[Any, .
 
 
 def _sequence(
-    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Any, columns: tuple[Any, ...], kicks: Any
+    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Expr, columns: tuple[Any, ...], kicks: Expr
 ) -> tuple[Any, Any]:
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
@@ -237,7 +237,7 @@ def _sequence(
     return before, passed
 
 
-def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int) -> Any:
+def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> Any:
     """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
     if not isinstance(arguments[0], ca.DM):
         return step.mapaccum("propagate", count)(first, *arguments)
@@ -251,52 +251,32 @@ def _accumulated(step: ca.Function, first: Any, arguments: list[Any], count: int
     return ca.horzcat(*passed)
 
 
-def single_shooting(statement: Statement, mesh: Mesh, u: Any, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """States and half-vectors at the nodes and running costs as functions of the controls and (x0, e0, T, p)."""
     x0, e0, duration, p = start
-    common = common_columns(mesh, u, duration, p)
+    intervals = interval_columns(mesh, u, duration, p)
     if statement.coupled:
         interval = full_interval(statement, mesh.substeps, mesh.step)
-        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *common)
+        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *intervals)
         nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
         return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
     nominal = nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *common)
+    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *intervals)
     x = ca.horzcat(x0, ends)
     if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, p, e0)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0)
     return x, e, cost + matrix_cost
 
 
-def substep_columns(common: tuple[Any, ...], m: int, n: int) -> tuple[Any, ...]:
-    """The common arguments for each substep, a column each."""
-    if m == 1:
-        return common
-    start, end, s, ds, duration, parameters = common
-
-    def interleave(columns: list[Any]) -> Any:
-        return ca.reshape(ca.vertcat(*columns), columns[0].shape[0], n * m)
-
-    at = [start + (j / m) * (end - start) for j in range(m + 1)]
-    return (
-        interleave(at[:m]),
-        interleave(at[1:]),
-        interleave([s + (j / m) * ds for j in range(m)]),
-        interleave([ds / m] * m),
-        interleave([duration] * m),
-        interleave([parameters] * m),
-    )
-
-
 def _runge_kutta_along(
-    statement: Statement, mesh: Mesh, e0: Any, starts: Any, common: tuple[Any, ...]
+    statement: Statement, mesh: Mesh, e0: Expr, starts: Expr, intervals: Interval
 ) -> tuple[Any, ...]:
     """The rk4 covariance step in sequence, restarted at the nominal of each node: at the ends, the substeps, cost."""
     interval = joint_interval(statement, mesh.substeps)
     symbolic: Any = statement.symbolic
     x, e = symbolic.sym("x", statement.nx), symbolic.sym("e", statement.ne)
-    rest = interval_symbols(statement, symbolic)
+    rest = Interval.symbols(statement)
     end, inner, cost = interval(ca.vertcat(x, e), *rest)
     step = ca.Function("matrix_step", [e, x, *rest], [end[statement.nx :], inner[statement.nx :, :], cost])
-    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *common))
+    return tuple(step.mapaccum("propagate", mesh.intervals)(e0, starts, *intervals))

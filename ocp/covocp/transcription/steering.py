@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import common_columns
+from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import KEPT, nominal_interval
 
 STEERING_STEPS = 4
@@ -90,7 +90,7 @@ def _along(statement: Statement, mesh: Mesh) -> ca.Function:
     x0, duration, p = ca.MX.sym("x0", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
     run = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("simulate", mesh.intervals)
-    ends, _, cost = run(x0, *common_columns(mesh, u, duration, p))
+    ends, _, cost = run(x0, *interval_columns(mesh, u, duration, p))
     return ca.Function("along", [x0, u, duration, p], [ends, ca.sum2(cost)])
 
 

@@ -9,11 +9,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import common_columns, shoot, substep_columns
+from covocp.transcription.shooting import interval_columns, shoot
 
 
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
@@ -128,7 +129,7 @@ def _backward_ends(statement: Statement, scales: Scales, variables: _Variables, 
     )
 
 
-def _gap_rows(kind: str, gaps: Any, scale: Array, names: tuple[str, ...]) -> Rows:
+def _gap_rows(kind: str, gaps: Expr, scale: Array, names: tuple[str, ...]) -> Rows:
     """Continuity at the ends of the segments."""
     count = gaps.shape[1]
     return Rows(
@@ -141,7 +142,7 @@ def _gap_rows(kind: str, gaps: Any, scale: Array, names: tuple[str, ...]) -> Row
     )
 
 
-def _interior_bounds(statement: Statement, mesh: Mesh, scales: Scales, x: Any) -> list[Rows]:
+def _interior_bounds(statement: Statement, mesh: Mesh, scales: Scales, x: Expr) -> list[Rows]:
     """Bounds on states at the nodes inside the segments, where they are not variables."""
     bounded = statement.bounded_states
     inside = sorted(set(range(mesh.intervals + 1)) - set(mesh.starts))
@@ -150,7 +151,7 @@ def _interior_bounds(statement: Statement, mesh: Mesh, scales: Scales, x: Any) -
     return [_bound_rows("state_bounds", statement, scales, x[bounded, inside])]
 
 
-def _bound_rows(kind: str, statement: Statement, scales: Scales, values: Any) -> Rows:
+def _bound_rows(kind: str, statement: Statement, scales: Scales, values: Expr) -> Rows:
     """Bounds on the bounded states at some places, a column each."""
     bounded, count = statement.bounded_states, values.shape[1]
     scale = scales.x[bounded]
@@ -174,12 +175,11 @@ def _inside_rows(
         rows.append(_bound_rows("bounds_inside", statement, scales, nodes["x_inside"][statement.bounded_states, :]))
     path = statement.path
     if path.size:
-        start, _, s, *_ = substep_columns(
-            common_columns(mesh, variables.u, variables.duration, variables.parameters), mesh.points, n
-        )
         at = [k * mesh.points + j for k in range(n) for j in range(1, mesh.points)]
+        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+        points = intervals.substeps(mesh.points).columns(at)
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
-        places = (nodes["x_inside"], start[:, at], e, variables.duration * s[:, at])
+        places = (nodes["x_inside"], points.start, e, variables.duration * points.s)
         rows.append(
             Rows(
                 kind="path_inside",
@@ -194,7 +194,7 @@ def _inside_rows(
     return rows
 
 
-def _final_matrices(statement: Statement, scales: Scales, last: Any) -> list[Rows]:
+def _final_matrices(statement: Statement, scales: Scales, last: Expr) -> list[Rows]:
     """Terminal conditions on entries of eliminated matrices; their targets are set for each solve."""
     known = np.flatnonzero(~np.isnan(statement.boundary_values(statement.values)[3]))
     if not known.size:
@@ -213,7 +213,7 @@ def _final_matrices(statement: Statement, scales: Scales, last: Any) -> list[Row
     ]
 
 
-def _split_jacobian(variables: _Variables, rows: tuple[Rows, ...], g: Any) -> ca.Function | None:
+def _split_jacobian(variables: _Variables, rows: tuple[Rows, ...], g: Expr) -> ca.Function | None:
     """Jacobian of g where it has dense rows: those by their own adjoint sweeps, the rest with its sparsity."""
     dense = [entry.expression for entry in rows if entry.dense]
     if not dense:

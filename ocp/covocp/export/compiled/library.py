@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from covocp.base.errors import ExportError, shown, spelling
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, real_numbers
 from covocp.base.threads import TURN
 from covocp.export.laws.law import CODES, STATUSES, Law, Port, span, stacked_size
@@ -139,7 +140,7 @@ class Library:
     def _buffer(self, size: int) -> Any:
         return (self._real * max(1, size))()
 
-    def _pointer(self, buffer: Any, offset: int) -> Any:
+    def _pointer(self, buffer: Given, offset: int) -> Any:
         return ctypes.byref(buffer, offset * ctypes.sizeof(self._real))
 
     def _workspace(self, law: Law) -> Any:
@@ -309,7 +310,7 @@ class Controller(Call):
         ports = self.law.outputs
         return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in ports}
 
-    def step(self, measurement: Any, time: float) -> Array:
+    def step(self, measurement: Given, time: float) -> Array:
         """The control for a measurement at a time.
 
         Args:
@@ -329,7 +330,7 @@ class Controller(Call):
         self.status = NAMES[status]
         return results[self._control]
 
-    def __call__(self, measurement: Any, time: float) -> Array:
+    def __call__(self, measurement: Given, time: float) -> Array:
         """The same as `step`."""
         return self.step(measurement, time)
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from covocp.base.arguments import MOST, checked, is_whole, positive, text, texts
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
 from covocp.export.compiled.building import TIMEOUT, Build, Sources, build
 from covocp.export.compiled.library import Laws, Library, laws_of
@@ -313,7 +314,7 @@ class CPackage:
         machine = (time.perf_counter() - begin) / count
         return Timing(c=in_c, python=1e9 * python, virtual_machine=1e9 * machine)
 
-    def _wrong(self, what: str, expected: str, received: Any) -> ExportError:
+    def _wrong(self, what: str, expected: str, received: Given) -> ExportError:
         return ExportError(
             f"The {what} of the package '{self.name}' {'do' if what in PLURAL else 'does'} not fit.",
             expected=expected,

@@ -21,15 +21,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.base.matrices import Array
+from covocp.base.quadrature import GAUSS_NODES
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.trajectory import times
 from covocp.statement.statement import Statement, entry_names
-from covocp.transcription.steps import GAUSS_NODES
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8
@@ -100,7 +101,7 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     )
 
 
-def finite(estimate: Any, feedback: Any) -> Any:
+def finite(estimate: Expr, feedback: Expr) -> Any:
     """Whether an estimate and the control that follows from it may be used; false for NaN, which mmax leaves out."""
     return ca.sum1(ca.fabs(estimate)) + ca.sum1(ca.fabs(feedback)) <= LARGEST
 
@@ -176,13 +177,13 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Arr
     return np.concatenate(list(zeros.values()))
 
 
-def solved(matrix: Any, right: Any) -> Any:
+def solved(matrix: Expr, right: Expr) -> Any:
     """matrix^-1 right: written out in scalars where the expressions are SX, by QR factors otherwise."""
     return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else linear_solve(matrix, right, COMPILED_SOLVER)
 
 
 def _predict(
-    design: Design, given: tuple[Any, Any, Any], nominal: list[Nominal], at: list[Any], h: Any
+    design: Design, given: tuple[Any, Any, Any], nominal: list[Nominal], at: list[Any], h: Expr
 ) -> tuple[Any, Any]:
     """Estimate and covariance of its error before the measurement, computed in units of typical deviations.
 
@@ -223,7 +224,7 @@ def _predict(
 
 
 def _corrected(
-    design: Design, predicted: tuple[Any, Any], given: tuple[Any, Any, Any], now: Nominal, time: Any
+    design: Design, predicted: tuple[Any, Any], given: tuple[Any, Any, Any], now: Nominal, time: Expr
 ) -> tuple[Any, ...]:
     """Estimate after the measurement, feedback gain, filter gain, whether a row of the measurement is missing.
 

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
@@ -59,7 +60,7 @@ class Design:
         return self.statement.symbolic
 
 
-def design_of(solution: Solution, limits: Any) -> Design:
+def design_of(solution: Solution, limits: Given) -> Design:
     """The closed loop of a solution.
 
     Args:

@@ -13,10 +13,11 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.quadrature import hermite
 from covocp.export.laws.law import LARGEST, status_of
 from covocp.solution.solution import Solution
-from covocp.transcription.steps import hermite
 
 # Times this far outside, relative to the duration, count as inside: sums of steps end there.
 MARGINS = {"double": 1e-9, "single": 1e-6}
@@ -75,7 +76,7 @@ class History:
         """The last time [s]."""
         return float(self.nodes[-1])
 
-    def clock(self, time: Any, fallback: Any = 0.0) -> Clock:
+    def clock(self, time: Expr, fallback: Expr = 0.0) -> Clock:
         """A time made safe; one that is not finite becomes `fallback`."""
         finite = ca.fabs(time) <= LARGEST
         known = ca.if_else(finite, time, fallback)
@@ -86,7 +87,7 @@ class History:
         conditions = [(ca.logic_not(finite), "TIME_NOT_FINITE"), (before, "TIME_BEFORE"), (after, "TIME_AFTER")]
         return Clock(time=inside, within=within, conditions=conditions)
 
-    def at(self, time: Any) -> Nominal:
+    def at(self, time: Expr) -> Nominal:
         """The nominal at a time within [0, T], an MX expression."""
         k = _piece(self.knots, time)
         knots = ca.MX(ca.DM(self.knots))
@@ -138,7 +139,7 @@ def history(solution: Solution, precision: str) -> History:
     )
 
 
-def _piece(table: Array, time: Any) -> Any:
+def _piece(table: Array, time: Expr) -> Any:
     """Index of the piece between two entries of a table of times that contains a time, from 0."""
     pieces, duration = table.size - 1, float(table[-1])
     guess = np.floor(table * (pieces / duration) + 0.5)
@@ -179,7 +180,7 @@ def _resolved(knots: Array, values: Array, slopes: tuple[Array, Array], least: f
     return knots[chosen], values[chosen], first, last
 
 
-def _column(table: Array, k: Any) -> Any:
+def _column(table: Array, k: Expr) -> Any:
     """A row of a table as a column; without entries where it has none."""
     return ca.MX(ca.DM(table.T))[:, k] if table.shape[1] else ca.MX(0, 1)
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 
 Kind = Literal["function", "sample", "controller", "solver"]
@@ -185,13 +186,13 @@ def stacked_size(ports: tuple[Port, ...]) -> int:
     return sum(port.size for port in ports)
 
 
-def flat(value: Any) -> Any:
+def flat(value: Given) -> Any:
     """A matrix as a dense column, row by row."""
     dense = ca.densify(value)
     return dense if dense.shape[1] == 1 else ca.vec(dense.T)
 
 
-def shaped(column: Any, rows: int, columns: int) -> Any:
+def shaped(column: Given, rows: int, columns: int) -> Any:
     """The matrix of a flat column."""
     return column if columns == 1 else ca.reshape(column, columns, rows).T
 

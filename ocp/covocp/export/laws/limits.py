@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import warn_user
+from covocp.base.expressions import Expr
 from covocp.export.laws.history import History
 from covocp.export.text.names import identifier
 from covocp.statement.names import Limits
@@ -17,7 +18,7 @@ from covocp.statement.statement import Statement, entry_names
 ROUNDING = 1e-6
 
 
-def clipped(value: Any, limits: Limits) -> Any:
+def clipped(value: Expr, limits: Limits) -> Any:
     """A control within its limits, an expression."""
     rows = []
     for i, (low, high) in enumerate(zip(*(bound.tolist() for bound in limits), strict=True)):

@@ -8,10 +8,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.base.quadrature import GAUSS_NODES
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
-from covocp.transcription.steps import GAUSS_NODES
 
 # Times that differ by less than this share of a period are the same.
 WHOLE = 1e-9
@@ -26,7 +27,7 @@ def nominal_values(tables: History, t: Array) -> tuple[Array, Array, Array]:
     return x, u, e
 
 
-def stacked(value: Any, count: int) -> Array:
+def stacked(value: Expr, count: int) -> Array:
     """Matrices beside each other as (count, rows, columns)."""
     array = np.asarray(value.full())
     return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)

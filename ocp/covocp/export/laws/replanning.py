@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_length, pack, unpack
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
-from covocp.problem.declarations import Free, Matrix, Parameter, State
-from covocp.problem.estimation_covariance import augmented_names
+from covocp.problem.declarations import Declarations, Free, Parameter
+from covocp.problem.estimation_covariance import with_estimation
+from covocp.problem.expected_cost import statement_of
+from covocp.statement.statement import Statement
 
 # Shortest and longest duration of a plan, in units of that of the problem.
 DURATIONS = (1e-3, 1e3)
@@ -42,12 +44,12 @@ class Replannable:
     """A problem, twice, and the arguments of its solver.
 
     Attributes:
-        problem: with initial values as parameters, the duration a variable where it is an argument.
+        statement: with initial values as parameters, the duration a variable where it is an argument.
         fixed: the same with the fixed duration: what a reference is solved for.
         entries: arguments of the solver.
     """
 
-    problem: Problem
+    statement: Statement
     fixed: Problem
     entries: tuple[Entry, ...]
 
@@ -59,19 +61,19 @@ def replannable(problem: Problem) -> Replannable:
     covariance too), a fixed duration "duration", unless something depends on the time explicitly. Free initial values
     and a free duration stay free.
     """
-    own = _copied(problem)
-    statement = problem.statement()
+    statement, own = problem.statement(), problem.declarations
     start, _, matrices, _ = statement.boundary_values(statement.values)
     taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
     entries: list[Entry] = []
-    _estimated(own)
-    for position, state in enumerate(problem.states):
+    if own.expected is not None and not any(matrix.estimation for matrix in own.matrices):
+        own = with_estimation(own)  # so that its start can be a parameter
+    for position, state in enumerate(own.states):
         block = next(b for b in statement.states if b.name == state.name)
-        own.states[position] = _with_start(own, state, start[block.span], taken, entries)
+        own = _with_start(own, position, start[block.span], taken, entries)
     for position, matrix in enumerate(own.matrices):
         block = next(b for b in statement.matrices if b.name == matrix.name)
         if matrix.backward is None and not np.isnan(matrices[block.span]).any():
-            own.matrices[position] = _with_matrix(own, matrix, matrices[block.span], taken, entries)
+            own = _with_matrix(own, position, matrices[block.span], taken, entries)
     for block in (*statement.of_kind("parameter"), *statement.of_kind("unknown")):
         value = statement.values[block.span]
         about = "parameter" if block.kind == "parameter" else "mean of the unknown"
@@ -79,57 +81,41 @@ def replannable(problem: Problem) -> Replannable:
             name=identifier(block.name, taken), rows=block.size, unit=block.unit, about=f"{about} '{block.name}'"
         )
         entries.append(Entry(port=port, parameter=block.name, value=value, deviation=0.02 * np.abs(value)))
-    moving = copy.copy(own)
-    if problem.free_duration is None and statement.autonomous and not _timed(problem):
-        T = float(problem.duration)
-        moving.free_duration = Free(T, DURATIONS[0] * T, DURATIONS[1] * T)
-        moving._duration = ca.MX.sym("duration")
+    moving = own
+    if own.free_duration is None and statement.autonomous and not _timed(own):
+        T = float(own.duration)
+        free = Free(T, DURATIONS[0] * T, DURATIONS[1] * T)
+        moving = replace(own, free_duration=free, duration=ca.MX.sym("duration"))
         port = Port(name="duration", unit="s", about="from now to the end")
         entries.append(Entry(port=port, parameter="", value=np.array([T]), deviation=np.array([0.02 * T])))
-    return Replannable(problem=moving, fixed=own, entries=tuple(entries))
+    return Replannable(statement=statement_of(moving), fixed=Problem.of(own), entries=tuple(entries))
 
 
-def _copied(problem: Problem) -> Problem:
-    """The same declarations and symbols, in lists of its own."""
-    result = copy.copy(problem)
-    result.states, result.matrices = list(problem.states), list(problem.matrices)
-    result.parameters = list(problem.parameters)
-    result._frozen = None
-    return result
-
-
-def _estimated(problem: Problem) -> None:
-    """Where an expected cost implies the estimation covariance, declare it, so that its start can be a parameter."""
-    if problem.expected is not None and not any(matrix.estimation for matrix in problem.matrices):
-        problem.estimation_covariance()
-
-
-def _timed(problem: Problem) -> bool:
+def _timed(problem: Declarations) -> bool:
     """Whether a constraint or a measurement contains the time."""
     expressions = [c.expression for c in problem.constraints]
     expressions += [value for m in problem.measurements for value in (m.expression, m.noise)]
     return any(ca.depends_on(expression, problem.time) for expression in expressions)
 
 
-def _parameter(problem: Problem, name: str, value: Array, unit: str, taken: set[str]) -> tuple[str, Any]:
-    """A new parameter: its name and its symbol."""
+def _parameter(problem: Declarations, name: str, value: Array, unit: str, taken: set[str]) -> Parameter:
+    """A new parameter."""
     declared: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
-    symbols = {entry.name for entry in declared}
-    unique = identifier(name, taken | symbols)
+    unique = identifier(name, taken | {entry.name for entry in declared})
     taken.add(unique)
     symbol = ca.MX.sym(unique, value.size)
-    problem.parameters.append(
-        Parameter(name=unique, symbol=symbol, size=value.size, where="the export", unit=unit, value=value)
-    )
-    return unique, symbol
+    return Parameter(name=unique, symbol=symbol, size=value.size, where="the export", unit=unit, value=value)
 
 
-def _with_start(problem: Problem, state: State, start: Array, taken: set[str], entries: list[Entry]) -> State:
-    """A state whose known initial values are parameters."""
-    known = np.flatnonzero(~np.isnan(start))
+def _with_start(
+    problem: Declarations, position: int, start: Array, taken: set[str], entries: list[Entry]
+) -> Declarations:
+    """The declarations with the known initial values of a state as a parameter."""
+    state, known = problem.states[position], np.flatnonzero(~np.isnan(start))
     if not known.size:
-        return state
-    name, symbol = _parameter(problem, f"initial_{state.name}", start[known], state.unit, taken)
+        return problem
+    own = _parameter(problem, f"initial_{state.name}", start[known], state.unit, taken)
+    name, symbol = own.name, own.symbol
     rows = [symbol[known.tolist().index(i)] if i in known else ca.MX(np.nan) for i in range(state.size)]
     about = f"initial value of '{state.name}'"
     about += "" if known.size == state.size else f", its entries {', '.join(map(str, known.tolist()))}"
@@ -139,18 +125,29 @@ def _with_start(problem: Problem, state: State, start: Array, taken: set[str], e
     deviation = np.maximum(deviation, 0.005 * np.abs(start[known]))
     port = Port(name=name, rows=known.size, unit=state.unit, about=about)
     entries.append(Entry(port=port, parameter=name, value=start[known], deviation=deviation))
-    return replace(state, initial=ca.vertcat(*rows))
+    return _started(problem.adding(parameters=own), "states", position, ca.vertcat(*rows))
 
 
-def _with_matrix(problem: Problem, matrix: Matrix, half: Array, taken: set[str], entries: list[Entry]) -> Matrix:
-    """A matrix whose initial value is a parameter."""
-    name, symbol = _parameter(problem, f"initial_{matrix.name}", half, matrix.unit, taken)
-    labels = augmented_names([*problem.states, *problem.unknowns]) if matrix.estimation else matrix.labels
+def _started(problem: Declarations, group: str, position: int, initial: Expr) -> Declarations:
+    """The declarations with another initial value of one entry of a group."""
+    found = list(getattr(problem, group))
+    found[position] = replace(found[position], initial=initial)
+    changed: dict[str, Any] = {group: tuple(found)}
+    return replace(problem, **changed)
+
+
+def _with_matrix(
+    problem: Declarations, position: int, half: Array, taken: set[str], entries: list[Entry]
+) -> Declarations:
+    """The declarations with the initial value of a matrix as a parameter."""
+    matrix = problem.matrices[position]
+    own = _parameter(problem, f"initial_{matrix.name}", half, matrix.unit, taken)
+    name, labels = own.name, matrix.labels
     value = unpack(half, matrix.size)
     about = f"initial value of the matrix '{matrix.name}', rows {', '.join(labels)}"
     port = Port(name=name, rows=matrix.size, columns=matrix.size, unit=matrix.unit, about=about)
     entries.append(Entry(port=port, parameter=name, value=value.ravel(), deviation=np.zeros(value.size)))
-    return replace(matrix, initial=symbol)
+    return _started(problem.adding(parameters=own), "matrices", position, own.symbol)
 
 
 def stacked(entries: tuple[Entry, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
@@ -166,7 +163,7 @@ def stacked(entries: tuple[Entry, ...], values: dict[str, Any], names: tuple[str
     return result
 
 
-def _half(column: Any, size: int) -> Any:
+def _half(column: Expr, size: int) -> Any:
     """Half-vector of a flat symmetric matrix, numbers or an expression; its symmetric part."""
     if isinstance(column, np.ndarray):
         return pack(column.reshape(size, size))

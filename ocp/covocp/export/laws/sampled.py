@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
@@ -77,7 +78,7 @@ class Samples:
         """K."""
         return int(self.parts["u"].shape[0]) - 1
 
-    def at(self, k: Any) -> dict[str, Any]:
+    def at(self, k: Expr) -> dict[str, Any]:
         """The matrices of a sample, MX expressions; flat by columns as CasADi has them, so that none is turned."""
         flat_rows = np.hstack([part.transpose(0, 2, 1).reshape(part.shape[0], -1) for part in self.parts.values()])
         column = ca.MX(ca.DM(flat_rows.T))[:, k]
@@ -150,7 +151,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     )
 
 
-def _gain_of_rows(at: dict[str, Any], present: Any, missing: Any) -> Any:
+def _gain_of_rows(at: dict[str, Any], present: Expr, missing: Expr) -> Any:
     """L of the rows that are there, the columns of the others zero; a system is solved only where some are missing."""
     n, r = at["L"].shape
     if r == 1:

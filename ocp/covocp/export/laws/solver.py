@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ExportError, spelling
+from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.export.compiled.linking import PLUGINS, Linking
@@ -153,7 +154,7 @@ def _task(problem: Problem, options: dict[str, Any]) -> _Task:
     """Reference solution and transcription."""
     made = replannable(problem)
     solution = Solver(made.fixed, **options).solve(progress=False)
-    statement = made.problem.statement()
+    statement = made.statement
     mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
     scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
     if mesh.eliminated and statement.matrices:
@@ -258,7 +259,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     return Law(
         name="solve",
         kind="solver",
-        about=ABOUT if task.made.fixed.expected is None else (*ABOUT, NOMINAL),
+        about=ABOUT if task.made.fixed.declarations.expected is None else (*ABOUT, NOMINAL),
         core=core,
         inputs=ports,
         outputs=(*(port for port, _ in outputs), Port(name="status")),
@@ -272,7 +273,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
 
 
 def _results(
-    task: _Task, variables: Any, evaluated: Sequence[Any], residuals: tuple[Any, Any]
+    task: _Task, variables: Given, evaluated: Sequence[Any], residuals: tuple[Any, Any]
 ) -> list[tuple[Port, Any]]:
     """Results of the solver with their values: times, controls, states, cost, residuals, variables."""
     nlp = task.nlp
@@ -301,7 +302,7 @@ def _where(what: str, nlp: NLP) -> str:
     return "interval" if what == "control" and nlp.mesh.control == "constant" else "node"
 
 
-def _bounds(task: _Task, p: Any, duration: Any) -> dict[str, Any]:
+def _bounds(task: _Task, p: Given, duration: Given) -> dict[str, Any]:
     """Bounds of the NLP as expressions of the parameters: `NLP.bounds` with symbols where values are prescribed."""
     nlp, st, mesh = task.nlp, task.nlp.statement, task.nlp.mesh
     numbers = nlp.bounds(st.values)
@@ -344,7 +345,7 @@ def _narrowed(bounds: dict[str, Any]) -> dict[str, Any]:
 
 
 def _residuals(
-    task: _Task, result: Mapping[str, Any], g: Any, p: Any, bounds: Mapping[str, Any], duration: Any
+    task: _Task, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
 ) -> tuple[Any, Any]:
     """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
     nlp = task.nlp

@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack_symbolic
 from covocp.export.laws.history import History, time_status
 from covocp.export.laws.law import Law, Port, flat
@@ -71,7 +72,7 @@ def block_port(block: Block, taken: set[str]) -> Port:
     return Port(name=identifier(block.name, taken), rows=block.size, unit=block.unit, about=f"{about} '{block.name}'")
 
 
-def _value(block: Block, nominal: Any) -> Any:
+def _value(block: Block, nominal: Given) -> Any:
     """The expression of a symbol."""
     column = {"state": nominal.x, "control": nominal.u, "matrix": nominal.e}[block.kind]
     ends = [0, block.span.start, block.span.stop, int(column.shape[0])]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 from covocp.base.errors import ExportError
+from covocp.base.expressions import Given
 
 LONGEST = 40
 # Of C up to C23, then of C++, whose users include the header.
@@ -37,7 +37,7 @@ self point workspace status memcpy all_finite
 TAKEN = frozenset(_TAKEN.split())
 
 
-def check_name(name: Any) -> str:
+def check_name(name: Given) -> str:
     """The name of a package: an identifier in C and C++, and a file name.
 
     Raises:

@@ -6,7 +6,7 @@ step); the errors are relative to the range of each entry of the states and the 
 solution is as accurate as at them, and default steps are as short as that asks for: all errors should be below 1e-4.
 "Told" is whether a warning came; the mesh error is that of the cost.
 
-    python benchmarks/defaults_between_nodes.py [motor]
+    python benchmarks/measurements/between_nodes.py [motor]
 
 With "motor" the current limit of a motor with unknown constants is followed along the differential equation as well
 (some minutes).

@@ -1,7 +1,7 @@
 """How long does a step take in C? Controllers, filters, laws and a solver, against CasADi's virtual machine and Python.
 
-    python benchmarks/export.py             measures and writes docs/export_times.md
-    python benchmarks/export.py --quick     a tenth of a second for each number; prints only
+    python benchmarks/peers/export.py             measures and writes docs/export_times.md
+    python benchmarks/peers/export.py --quick     a tenth of a second for each number; prints only
 
 Nanoseconds of one call, medians of five measurements. The targets are a step of the first-order controller below 1
 microsecond and of the Mars controller below 20; what misses its target is printed, the exit code is always 0.
@@ -29,7 +29,7 @@ from covocp.models import agile_aircraft, mars_entry, unknown_lag
 
 REPEATS = 5
 TARGETS = {("first-order controller", "step"): 1e3, ("Mars controller", "step"): 20e3}  # ns
-DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "export_times.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "export_times.md"
 
 
 def packages(folder: Path) -> dict[str, Callable[[], CPackage]]:
@@ -110,9 +110,9 @@ def main() -> None:
     print("\n".join(verdicts))
     if quick:
         return
-    conditions = f"""Written by `benchmarks/export.py`: medians of {REPEATS} measurements of one call, at points where
-nothing is wrong. Virtual machine: CasADi's function without what Python adds. Object and stack are those of the whole
-package.
+    conditions = f"""Written by `benchmarks/peers/export.py`: medians of {REPEATS} measurements of one call, at points
+where nothing is wrong. Virtual machine: CasADi's function without what Python adds. Object and stack are those of the
+whole package.
 
 - commit {git("rev-parse", "--short=12", "HEAD") or "unknown"}, {datetime.date.today().isoformat()}
 - {version("casadi")}, {version("numpy")}, gcc -O2

@@ -1,8 +1,8 @@
 """How fast is the core? Everything in one run on one machine, against peers written in plain CasADi and against rockit.
 
-    python benchmarks/core.py               all, medians of five runs in random order; writes docs/benchmarks.*
-    python benchmarks/core.py --quick       one run of each, small sizes; prints only
-    python benchmarks/core.py --only b      one part: a (oscillator), b (chain of masses), c (building, import)
+    python benchmarks/peers/core.py               all, medians of five runs in random order; writes docs/benchmarks.*
+    python benchmarks/peers/core.py --quick       one run of each, small sizes; prints only
+    python benchmarks/peers/core.py --only b      one part: a (oscillator), b (chain of masses), c (building, import)
 
 Every case runs in a process of its own (case.py), so that first solves are compared and each has its own peak memory.
 The exit code is always 0; what misses its target is printed. rockit comes with the `benchmark` extra; without it those

@@ -1,6 +1,6 @@
 """Promised and flown deviations of ten closed loops with steep ends: in Python and by the compiled C, two ways each.
 
-The random linear systems of `defaults_expected_cost` whose default mesh was graded at both ends. Each controller is
+The random linear systems of `expected_cost` whose default mesh was graded at both ends. Each controller is
 exported for any times and for samples of a period, compiled, and called once a period: short enough that the largest
 feedback pole times the period is POLE. The law is linear, so the joint covariance of plant, estimate and held control
 follows exactly from what the compiled function answers to unit estimates, controls and measurements at each call, and
@@ -8,7 +8,7 @@ from the matrix exponential of the plant with its measurement averaged over the 
 the gains as they are interpolated between the nodes. Printed are the largest factors between the standard deviations,
 as flown and as promised, at the end and anywhere at the nodes.
 
-    python benchmarks/defaults_flown.py
+    python benchmarks/measurements/flown.py
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from defaults_expected_cost import System, problem, random_system
+from expected_cost import System, problem, random_system
 from scipy.linalg import expm
 
 import covocp as co

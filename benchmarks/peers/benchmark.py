@@ -12,7 +12,7 @@ from cases import Case, measure
 from targets import Figure, figures_table
 
 # This process imports neither CasADi nor matplotlib before the end: on Linux a child's peak counts its parent's size.
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 REPEATS = 5
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmark import Run
 from cases import Case
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 COLUMNS = {"build": ".3f", "solve": ".3f", "iterations": ".0f", "cost": ".8g", "memory": ".0f"}
 
 
@@ -62,7 +62,7 @@ def git(*arguments: str) -> str:
 def conditions(run: Run, script: str, packages: Sequence[str]) -> str:
     """Where and how it was measured."""
     changed = " with changes" if git("status", "--porcelain", "--", "ocp", "solvers", "models", "benchmarks") else ""
-    return f"""Written by `benchmarks/{script}` in one run on one machine: medians of {run.repeats} runs in random
+    return f"""Written by `benchmarks/peers/{script}` in one run on one machine: medians of {run.repeats} runs in random
 order, each in a process of its own; a case that takes over 30 s runs once. Times are those of a first solve as a user
 waits for it, building included, imports left out. The peak memory is that of the whole process.
 

@@ -1,6 +1,6 @@
 """Do ordinary problems converge from the default start, and to the best of many starts?
 
-    python benchmarks/defaults_starts.py [--starts 20] [--only vehicles|overhead]
+    python benchmarks/measurements/starts.py [--starts 20] [--only vehicles|overhead]
 
 Thirty vehicles of constant speed that turn to a point: 5 to 95 % of their reach in that direction, all directions, four
 bounds of the turn rate, half of them with a beacon whose distance they measure. The default start against the best of
@@ -21,7 +21,7 @@ import numpy as np
 import covocp as co
 from covocp.transcription.starts import own_start
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from vehicles import DURATION, SPEED, vehicle
 
 BOUNDS = (0.1, 0.2, 0.5, np.inf)

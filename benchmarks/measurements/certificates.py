@@ -1,6 +1,6 @@
 """Certificates against finer meshes: none may be contradicted beyond its gap; and what certifying takes.
 
-    python benchmarks/defaults_certificates.py            # prints two tables in Markdown
+    python benchmarks/measurements/certificates.py            # prints two tables in Markdown
 
 Identification problems on meshes of 1 to 100 intervals, held and linear controls. For each the best cost known is that
 of 400 intervals (linear controls), less its own estimated mesh error; a certificate is contradicted where the solution

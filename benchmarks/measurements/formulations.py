@@ -1,7 +1,7 @@
 """Where the border between the two formulations lies: eliminated matrices against half-vector states, first solves.
 
 Each problem is solved by both formulations, in random order, with everything else at its default; the medians of five
-go into docs/formulations.md. `ocp/mesh.py` takes its rule from this table.
+go into docs/formulations.md. `transcription/mesh.py` takes its rule from this table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from covocp.models import (
     unknown_lag,
 )
 
-OUTPUT = Path(__file__).parent.parent / "docs" / "formulations.md"
+OUTPUT = Path(__file__).parents[2] / "docs" / "formulations.md"
 FORMULATIONS = ("eliminated", "states")
 CASES: dict[str, tuple[Callable[[], co.Problem], int]] = {
     "noisy integrator": (lambda: noisy_integrator.problem(1.0, 0.0), 100),
@@ -65,7 +65,7 @@ def main() -> None:
         "# Eliminated covariances against covariances as states",
         "",
         f"First solves with default options, medians of {repeats} in random order, seconds (iterations).",
-        "Written by `benchmarks/formulations.py`.",
+        "Written by `benchmarks/measurements/formulations.py`.",
         "",
         "| problem | entries | eliminated | states | ratio | difference of the costs |",
         "|---|---|---|---|---|---|",

@@ -1,7 +1,7 @@
 """θ-D against the Riccati equation solved at every step: time of one control of the agile aircraft, in one run.
 
-    python benchmarks/theta_d.py            prints a table; needs a C compiler for the compiled rows
-    python benchmarks/theta_d.py --quick    fewer repetitions
+    python benchmarks/peers/theta_d.py            prints a table; needs a C compiler for the compiled rows
+    python benchmarks/peers/theta_d.py --quick    fewer repetitions
 
 Every law gets the same states in the same order; each time is the median over batches, per call, and the batches of the
 laws take turns. Target: the compiled θ-D law is at least 100 times faster than scipy's `solve_continuous_are`.

@@ -8,7 +8,7 @@ both Riccati equations integrated by scipy. 40 of them, 2 to 4 states, priors of
 state, sensors of densities 1e-4 to 1, terminal weights up to 1e4, 100 intervals. Right is an error of the cost below
 1e-3, or a warning with an error within a factor of 3 of the true one.
 
-    python benchmarks/defaults_expected_cost.py [seeds]
+    python benchmarks/measurements/expected_cost.py [seeds]
 """
 
 from __future__ import annotations

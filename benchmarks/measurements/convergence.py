@@ -5,7 +5,7 @@
   restart with a tolerance of 1e-10 gains nothing, and the value is among those found from other starts.
 - *Random problems* (tests/random_problems.py): restart, both formulations, both methods.
 
-`python defaults_convergence.py [--only plants premature random] [--seeds 200] [--gradient 50] [--starts 200]`
+`convergence.py [--only plants premature random] [--seeds 200] [--gradient 50] [--starts 200]`
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 import covocp as co
 from covocp.models import brachistochrone, chord_test, damped_oscillator, noisy_integrator, unknown_gain, unknown_lag
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from random_problems import draw
 
 SIX: dict[str, Callable[[], co.Problem]] = {

@@ -1,8 +1,8 @@
 """How fast is the closed loop? Mars entry, section 6.12, Monte Carlo; against an expert's script and a plain loop.
 
-    python benchmarks/closed_loop.py            all, medians of five; writes docs/benchmarks_closed_loop.md
-    python benchmarks/closed_loop.py --quick    one run of each, coarse mesh and few runs; prints only
-    python benchmarks/closed_loop.py --only c   one part: a (Mars entry), b (section 6.12), c (Monte Carlo of Mars)
+    python benchmarks/peers/closed_loop.py            all, medians of five; writes docs/benchmarks_closed_loop.md
+    python benchmarks/peers/closed_loop.py --quick    one run of each, coarse mesh and few runs; prints only
+    python benchmarks/peers/closed_loop.py --only c   one part: a (Mars entry), b (section 6.12), c (Monte Carlo)
 
 Every case runs in a process of its own (case.py), so that first solves are compared and each has its own peak memory.
 The exit code is always 0; what misses its target is printed.

@@ -1,6 +1,6 @@
 """Simulations with default settings: time of the extended filter, coverage of a mean's band, counts of constraints.
 
-    python benchmarks/defaults_simulation.py
+    python benchmarks/measurements/simulation.py
 
 Prints markdown tables. The counts are those of a loop of Euler and Maruyama that knows the gains only (the problem of
 `tests/ocp/test_simulate_constraints.py`, at a finer step and with more runs).
@@ -79,7 +79,7 @@ def bands() -> None:
 
 def counts() -> None:
     """Shares of the runs that violate each constraint, beside those of an independent loop."""
-    sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / part) for part in ("", "ocp")]
+    sys.path[:0] = [str(Path(__file__).parents[2] / "tests" / part) for part in ("", "simulation")]
     import test_simulate_constraints as brute
 
     brute.RUNS = 20_000

@@ -1,0 +1,11 @@
+"""Names for what CasADi's type stubs cannot say."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+# SX, MX or DM, and where a function is evaluated with numbers an array: the stubs know no type that all of them share,
+# and no operators between them.
+Expr: TypeAlias = Any
+# What a user gave: of any type until it is checked, and then refused or read.
+Given: TypeAlias = Any

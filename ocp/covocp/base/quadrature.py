@@ -1,0 +1,71 @@
+"""Steps and rules of integration, written once: Runge-Kutta, Gauss, Simpson, Hermite; numbers and expressions alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.base.linear_solve import linear_solve
+
+# Nodes of the two-stage Gauss method, shares of a step, both of weight 1/2.
+GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
+
+
+def classical_step(rate: Callable[[Any, float], Any], value: Expr, h: Expr, first: Expr = None) -> Any:
+    """One step of the classical Runge-Kutta method.
+
+    Args:
+        rate: (value, share of the step) -> slope.
+        value: at the start.
+        h: length of the step.
+        first: the slope at the start, where it is known already.
+    """
+    k1 = rate(value, 0.0) if first is None else first
+    k2 = rate(value + h / 2 * k1, 0.5)
+    k3 = rate(value + h / 2 * k2, 0.5)
+    k4 = rate(value + h * k3, 1.0)
+    return value + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr) -> Any:
+    """Cubic Hermite polynomial at c in [0, 1]; slopes per unit of c."""
+    return (
+        (1 + 2 * c) * (1 - c) ** 2 * start
+        + c * (1 - c) ** 2 * slope_start
+        + c**2 * (3 - 2 * c) * end
+        + c**2 * (c - 1) * slope_end
+    )
+
+
+def simpson_weight(j: int, count: int) -> float:
+    """Weight of point j of `count` equal steps, an even number, in the integral over [0, 1] by Simpson's rule."""
+    return (1 if j in (0, count) else 4 if j % 2 else 2) / (3 * count)
+
+
+def gauss_matrix(points: Expr, size: int, solver: str) -> Expr:
+    """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
+
+    With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a
+    solve, and inserting it leaves one system of size 2n instead of 4n:
+
+        [(I - g h H2)(I - g h H1) - a h/2 (H1 + H2)] Y1 = I - g h H2.
+
+    Its matrix is regular where the Gauss method is (for constant H it is I - hH/2 + (hH)^2/12), and its factors keep
+    the sparsity of F.
+
+    Args:
+        points: h H at the two nodes.
+        size: n, half the rows of H.
+        solver: of the linear system.
+    """
+    first, second = points
+    g = np.sqrt(3.0) / 6.0
+    a = 0.5 - 2.0 * g
+    unit = ca.DM.eye(2 * size)
+    left, right = unit - g * second, unit - g * first
+    stage = linear_solve(left @ right - a / 2 * (first + second), ca.densify(left), solver)
+    return unit + (right @ stage - unit) / a
