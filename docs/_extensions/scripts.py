@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from PIL import Image
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx_gallery.scrapers import figure_rst
@@ -85,6 +86,7 @@ HOWTO = (
 ORDER = [name for *_, names in GALLERY for name in names]
 HEADER = "GALLERY_HEADER.rst"
 PRINTED = "rst-class:: sphx-glr-script-out"
+NARROW = 5.0  # inches
 NO_PICTURE = COPIES / "no_picture.png"
 
 
@@ -106,8 +108,15 @@ def written_pictures(block: Any, variables: dict[str, Any], settings: dict[str, 
     for picture in sorted(folder.glob("*.png"), key=lambda path: path.stat().st_mtime_ns):
         place = next(variables["image_path_iterator"])
         shutil.move(picture, place)
-        text += str(figure_rst([place], settings["src_dir"]))
+        shown = str(figure_rst([place], settings["src_dir"]))
+        text += shown.replace("sphx-glr-single-img", "sphx-glr-single-img narrow") if is_narrow(place) else shown
     return text
+
+
+def is_narrow(picture: str) -> bool:
+    """Whether a picture is meant to be narrow: drawn large, its letters would be larger than those of the text."""
+    with Image.open(picture) as image:
+        return float(image.width / image.info.get("dpi", (100, 100))[0]) < NARROW
 
 
 def tidy(settings: dict[str, Any], script: str | None) -> None:

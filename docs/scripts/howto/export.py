@@ -23,7 +23,6 @@ from covocp.models import unknown_lag
 compiler = shutil.which("cc") is not None
 solution = co.solve(unknown_lag.steering(parameter_variance=0.01), progress=False)
 package = co.export_c(solution, "lag", period=0.05, limits={"u": (-4.0, 4.0)})
-print(package)
 print("files:", ", ".join(sorted(path.name for path in Path("lag").iterdir())))
 
 # %%
@@ -52,7 +51,7 @@ updated = kalman.update(x, P, y, row, 0.2, missing="skip")
 predict = ca.Function("predict", [x, P], predicted, ["x", "P"], ["estimate", "covariance"])
 update = ca.Function("update", [x, P, y], updated, ["x", "P", "y"], ["estimate", "covariance"])
 tracker = co.export_c([predict, update], "tracker", units={"x": "m, m/s", "y": "m"})
-print(tracker.check() if compiler else tracker)
+print(tracker.check() if compiler else sorted(path.name for path in tracker.directory.iterdir()))
 
 # %%
 # A solver
@@ -64,7 +63,6 @@ planner = co.export_c(unknown_lag.problem(weight=10.0), "planner", intervals=20)
 if compiler:
     plan = planner.python().solve(initial_x=0.2, duration=8.0)
     print(f"status {plan['status']}, cost {plan['cost']:.6f}")
-print(planner)
 
 # %%
 # :doc:`/export` has all options, what is checked, and what has no C code. In the shell: ``covocp export

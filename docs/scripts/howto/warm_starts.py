@@ -11,6 +11,7 @@ A `Solver` is built once. Parameters change from solve to solve, and an earlier 
 # What may change is declared as a parameter; means of unknowns are parameters as well.
 
 import covocp as co
+from covocp.plot import plot_solutions
 
 ocp = co.Problem(duration=10.0, name="lag with a weight")
 x = ocp.state("x", initial=0.0, final=1.0, variance=1.0)
@@ -23,12 +24,15 @@ E = ocp.estimation_covariance()
 ocp.minimize(running=0.5 * u**2, terminal=weight * E[b, b])
 
 solver = co.Solver(ocp, intervals=100)
-previous = None
+previous, solutions = None, {}
 for value in (10.0, 8.0, 6.0, 4.0):
     cold = solver.solve({"weight": value}, progress=False)
     previous = solver.solve({"weight": value}, guess=previous, progress=False)
     print(f"weight {value:4}: cost {previous.cost:.6f}, {previous.stats['iterations']} iterations warm", end="")
     print(f", {cold.stats['iterations']} cold")
+    solutions[f"weight {value:g}"] = previous
+
+plot_solutions(list(solutions.values()), "x", "u", E[b, b], labels=list(solutions), path="weights.png")
 
 # %%
 # Other meshes

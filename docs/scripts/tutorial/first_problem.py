@@ -137,7 +137,7 @@ runs.plot(path="runs.png")
 # `export_c` writes nominal, gains, filter and feedback law as C99 without dynamic memory: one step for each sample.
 
 package = co.export_c(design, "lag_c", period=0.05)
-print(package)
+print(", ".join(sorted(path.name for path in package.directory.iterdir())))
 
 # %%
 # Where there is a C compiler, ``check`` builds the package and compares it with Python at random points, at the ends
