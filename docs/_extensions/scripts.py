@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
-from sphinx_gallery.scrapers import figure_rst
 
 DOCS = Path(__file__).resolve().parent.parent
 EXAMPLES = DOCS.parent / "examples"
@@ -86,7 +85,7 @@ HOWTO = (
 ORDER = [name for *_, names in GALLERY for name in names]
 HEADER = "GALLERY_HEADER.rst"
 PRINTED = "rst-class:: sphx-glr-script-out"
-NARROW = 5.0  # inches
+FULL_WIDTH = 9.0  # of a picture that fills the width of a page [inch]
 NO_PICTURE = COPIES / "no_picture.png"
 
 
@@ -106,17 +105,21 @@ def written_pictures(block: Any, variables: dict[str, Any], settings: dict[str, 
     """The PNG files that the last lines of a script wrote, oldest first, one below the other."""
     folder, text = Path(variables["src_file"]).parent, ""
     for picture in sorted(folder.glob("*.png"), key=lambda path: path.stat().st_mtime_ns):
-        place = next(variables["image_path_iterator"])
+        place = Path(next(variables["image_path_iterator"]))
         shutil.move(picture, place)
-        shown = str(figure_rst([place], settings["src_dir"]))
-        text += shown.replace("sphx-glr-single-img", "sphx-glr-single-img narrow") if is_narrow(place) else shown
+        address = place.resolve().relative_to(settings["src_dir"]).as_posix()
+        words = picture.stem.replace("_", " ")
+        text += (
+            f"\n.. image:: /{address}\n   :alt: {words}\n   :width: {share(place)}%\n   :class: sphx-glr-single-img\n"
+        )
     return text
 
 
-def is_narrow(picture: str) -> bool:
-    """Whether a picture is meant to be narrow: drawn large, its letters would be larger than those of the text."""
+def share(picture: Path) -> int:
+    """Percent of the width of a page at which the letters of all pictures have the same size."""
     with Image.open(picture) as image:
-        return float(image.width / image.info.get("dpi", (100, 100))[0]) < NARROW
+        inches = image.width / image.info.get("dpi", (100, 100))[0]
+    return min(100, round(100 * inches / FULL_WIDTH))
 
 
 def tidy(settings: dict[str, Any], script: str | None) -> None:

@@ -32,7 +32,8 @@ for value in (10.0, 8.0, 6.0, 4.0):
     print(f", {cold.stats['iterations']} cold")
     solutions[f"weight {value:g}"] = previous
 
-plot_solutions(list(solutions.values()), "x", "u", E[b, b], labels=list(solutions), path="weights.png")
+panels = {"x": "x", "u": "u", "variance of b": E[b, b]}
+plot_solutions(list(solutions.values()), panels, labels=list(solutions), path="weights.png")
 
 # %%
 # Other meshes
