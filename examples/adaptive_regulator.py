@@ -1,8 +1,13 @@
-"""Indirect adaptive control: least squares learns the plant while a regulator designed for the estimate controls it.
+"""Indirect adaptive control
+=========================
 
-y+ = a1 y + a2 y- + b u + noise. The law knows neither a1, a2 nor b, and at sample 150 they change. Each sample:
-least squares with forgetting, then `riccati.lqr` for the estimate as if it were the truth (certainty equivalence).
-The regulator leaves little to learn from, so the estimates drift; they stay where they give nearly the best gain.
+Least squares learns the plant while a regulator designed for the estimate controls it::
+
+    y+ = a1 y + a2 y- + b u + noise
+
+The law knows neither a1, a2 nor b, and at sample 150 they change. Each sample: least squares with forgetting, then
+`riccati.lqr` for the estimate as if it were the truth (certainty equivalence). The regulator leaves little to learn
+from, so the estimates drift; they stay where they give nearly the best gain.
 """
 
 import matplotlib.pyplot as plt

@@ -1,4 +1,8 @@
-"""A covariance of 78 entries: five masses in a row, stiffness and damping identified by pushing the first."""
+"""A covariance of 78 entries
+==========================
+
+Five masses in a row: stiffness and damping are identified by pushing the first.
+"""
 
 import covocp as co
 from covocp.models import mass_chain

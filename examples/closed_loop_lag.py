@@ -1,4 +1,7 @@
-"""A lag with unknown time constant, steered by feedback from its filter, three ways (thesis 6.12).
+"""A lag with unknown time constant in closed loop
+===============================================
+
+It is steered by feedback from its filter, three ways (thesis 6.12).
 
 The gain of the combined design is one of the linear covariance model: with a variance of 5 a third of the lags is
 unstable, which linear gains cannot hold. `monte_carlo.py` shows where the linear model is right.

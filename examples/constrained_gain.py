@@ -1,4 +1,8 @@
-"""Feedback gains that are simpler than the best ones: without the unknown's estimate, constant, or both."""
+"""Feedback gains that are simpler than the best ones
+==================================================
+
+Without the unknown's estimate, constant, or both.
+"""
 
 import covocp as co
 from covocp.plot import plot_solutions

@@ -1,4 +1,8 @@
-"""Identify damping or stiffness of an oscillator while moving it (thesis 5.4): the input decides what is learnt."""
+"""Damping or stiffness of an oscillator
+=====================================
+
+One or the other is identified while the oscillator is moved (thesis 5.4): the input decides what is learnt.
+"""
 
 import covocp as co
 from covocp.models import damped_oscillator

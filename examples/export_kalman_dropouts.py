@@ -1,4 +1,8 @@
-"""A Kalman filter with missing readings as C: predict and update of a point that moves, one reading in three lost."""
+"""A Kalman filter with missing readings as C
+==========================================
+
+Predict and update of a point that moves, one reading in three lost.
+"""
 
 import tempfile
 from pathlib import Path

@@ -1,4 +1,8 @@
-"""Filter and feedback of the first-order lag as C: exported, compiled, compared, flown against the actual lag."""
+"""Filter and feedback of the first-order lag as C
+===============================================
+
+Exported, compiled, compared with Python, and flown against the actual lag.
+"""
 
 import tempfile
 from pathlib import Path

@@ -1,4 +1,8 @@
-"""Mars entry: nominal, filter and feedback as C; for samples of half a second, and for any time between steps."""
+"""Mars entry as C
+===============
+
+Nominal, filter and feedback; for samples of half a second, and for any time between steps.
+"""
 
 import tempfile
 from pathlib import Path

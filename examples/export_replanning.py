@@ -1,7 +1,9 @@
-"""A solver in C that plans again and again: from where the lag is, for the time that is left, with what is known.
+"""A solver in C that plans again and again
+========================================
 
-The plan identifies the time constant. Each second C is given the state, the covariance of the estimate and the
-remaining time, starts from the plan before, and returns a new one.
+From where the lag is, for the time that is left, with what is known: the plan identifies the time constant. Each
+second C is given the state, the covariance of the estimate and the remaining time, starts from the plan before, and
+returns a new one.
 """
 
 import subprocess

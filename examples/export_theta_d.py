@@ -1,4 +1,8 @@
-"""θ-D servo and filter of the agile aircraft as C, in the loop over the whole of scenario 2, against Python."""
+"""θ-D servo and filter of the agile aircraft as C
+===============================================
+
+In the loop over the whole of scenario 2, against Python.
+"""
 
 import tempfile
 from pathlib import Path
@@ -8,8 +12,8 @@ import numpy as np
 
 import covocp as co
 from covocp.blocks import theta_d
-from covocp.law_simulation import gain_filter
 from covocp.models import agile_aircraft
+from covocp.simulation.laws import gain_filter
 
 PATH = [0.0, 0.0, 0.0, 1.0, 0.0]  # the path angle is followed
 PAPER = {"k": agile_aircraft.FACTOR, "l": agile_aircraft.DECAY}

@@ -1,4 +1,8 @@
-"""Learn the time constant to a given accuracy with the least energy: a constraint on a final variance."""
+"""A constraint on a final variance
+================================
+
+Learn the time constant to a given accuracy with the least energy.
+"""
 
 import covocp as co
 

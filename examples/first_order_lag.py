@@ -1,4 +1,8 @@
-"""The script of the README: move a lag with an unknown time constant so that the constant is learnt on the way."""
+"""Move a lag so that its time constant is learnt
+==============================================
+
+The script of the README: the control first pushes to learn the unknown constant, then steers to the target.
+"""
 
 import covocp as co
 

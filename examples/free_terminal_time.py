@@ -1,4 +1,8 @@
-"""When to stop identifying: time costs something too, so the terminal time is free."""
+"""When to stop identifying
+========================
+
+Time costs something too, so the terminal time is free.
+"""
 
 import covocp as co
 from covocp.models import free_time_integrator, unknown_lag

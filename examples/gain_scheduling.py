@@ -1,7 +1,13 @@
-"""Gain scheduling: linear regulators of several operating points, interpolated by where the system is asked to be.
+"""Gain scheduling
+===============
 
-A pendulum on a cart, held leaning at an angle by the acceleration of the cart: d2 angle/dt2 = sin angle + u cos angle,
-u = -tan angle at rest. The further it leans, the faster it falls and the less the cart can do about it.
+Linear regulators of several operating points, interpolated by where the system is asked to be.
+
+A pendulum on a cart, held leaning at an angle by the acceleration of the cart::
+
+    d2 angle/dt2 = sin angle + u cos angle,   u = -tan angle at rest
+
+The further it leans, the faster it falls and the less the cart can do about it.
 """
 
 import casadi as ca

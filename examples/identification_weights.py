@@ -1,4 +1,8 @@
-"""How hard to identify: the first-order lag with three weights on the final variance of its constant (thesis 5.3)."""
+"""How hard to identify
+====================
+
+The first-order lag with three weights on the final variance of its constant (thesis 5.3).
+"""
 
 import covocp as co
 from covocp.models import unknown_lag

@@ -1,4 +1,8 @@
-"""Noise that is not what filter and feedback were designed for (thesis 6.11): disturbed more, measured better."""
+"""Noise that is not what was designed for
+=======================================
+
+Filter and feedback meet more disturbance, and better measurements, than they were designed for (thesis 6.11).
+"""
 
 import numpy as np
 

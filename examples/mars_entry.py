@@ -1,4 +1,8 @@
-"""Mars entry (thesis, chapter 7): lift chosen so that filter and feedback miss little, against a constant ratio."""
+"""Mars entry
+==========
+
+Lift chosen so that filter and feedback miss little, against a constant ratio (thesis, chapter 7).
+"""
 
 import covocp as co
 from covocp.models import mars_entry

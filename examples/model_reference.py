@@ -1,10 +1,15 @@
-"""Model-reference adaptation: the gains follow the error to a model, and the unknown plant is never identified.
+"""Model-reference adaptation
+==========================
 
-dx/dt = a x + b u with a and the size of b unknown to the law, dxm/dt = -am xm + am r, u = kx x + kr r:
+The gains follow the error to a model, and the unknown plant is never identified::
+
+    dx/dt = a x + b u,   dxm/dt = -am xm + am r,   u = kx x + kr r
+
+with a and the size of b unknown to the law::
 
     dkx/dt = -g x e sgn b,   dkr/dt = -g r e sgn b,   e = x - xm
 
-With V = e^2 + |b| (dkx^2 + dkr^2) / g, dV/dt = -2 am e^2; two frequencies in x and r make the gains converge.
+With V = e^2 + abs(b) (dkx^2 + dkr^2) / g, dV/dt = -2 am e^2; two frequencies in x and r make the gains converge.
 """
 
 import casadi as ca

@@ -1,4 +1,8 @@
-"""Is the predicted spread the real one? Thousands of runs of the actual nonlinear systems, with noise and feedback."""
+"""Is the predicted spread the real one?
+=====================================
+
+Thousands of runs of the actual nonlinear systems, with noise and feedback.
+"""
 
 import numpy as np
 

@@ -1,4 +1,8 @@
-"""State-dependent noise (thesis 3.4): three costs, three trajectories, against their closed forms."""
+"""State-dependent noise
+=====================
+
+Three costs, three trajectories, against their closed forms (thesis 3.4).
+"""
 
 import numpy as np
 

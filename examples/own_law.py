@@ -1,4 +1,8 @@
-"""A law of one's own in the actual system, beside the designed one: what do filter and feedback of the design gain?"""
+"""A law of one's own in the actual system
+=======================================
+
+Beside the designed one: what do filter and feedback of the design gain?
+"""
 
 import numpy as np
 

@@ -1,4 +1,8 @@
-"""Without covariances covocp is an ordinary optimal-control tool: three problems that everybody tries first."""
+"""Without covariances
+===================
+
+Then covocp is an ordinary optimal-control tool: three problems that everybody tries first.
+"""
 
 import covocp as co
 from covocp.models import brachistochrone, bryson_denham, goddard_rocket

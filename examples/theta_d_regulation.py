@@ -1,4 +1,7 @@
-"""Agile aircraft back from 30 deg of angle of attack by θ-D and its filter (Xin and Balakrishnan 2009, figures 1 to 4).
+"""Agile aircraft: regulation by θ-D
+=================================
+
+Back from 30 deg of angle of attack by θ-D and its filter (Xin and Balakrishnan 2009, figures 1 to 4).
 
 Weights in both readings of the paper's units. First the cost of laws that know the state, over the true optimum by
 Ipopt; then the loop with a filter that starts 5 deg off, and the extended Kalman filter beside it.
@@ -10,8 +13,8 @@ import numpy as np
 
 import covocp as co
 from covocp.blocks import sdre, theta_d
-from covocp.law_simulation import extended_filter, gain_filter, simulate_law
 from covocp.models import agile_aircraft
+from covocp.simulation.laws import extended_filter, gain_filter, simulate_law
 
 x, u = ca.SX.sym("x", 5), ca.SX.sym("u")
 A0, bilinear, B, H = agile_aircraft.matrices()

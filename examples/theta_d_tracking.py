@@ -1,4 +1,7 @@
-"""Agile aircraft: path angle 0, 45, 0 deg by the θ-D servo and its filter (Xin and Balakrishnan 2009, figures 5 to 7).
+"""Agile aircraft: tracking by θ-D
+===============================
+
+Path angle 0, 45, 0 deg by the θ-D servo and its filter (Xin and Balakrishnan 2009, figures 5 to 7).
 
 Weights in both readings of the paper's units; only degrees track as published. Then the extended Kalman filter, the
 variant whose speed derivatives depend on the angle of attack too, where the θ-D filter diverges, and runs with noise.
@@ -10,8 +13,8 @@ import numpy as np
 
 from covocp import ProblemError
 from covocp.blocks import sdre, theta_d
-from covocp.law_simulation import extended_filter, gain_filter, simulate_law
 from covocp.models import agile_aircraft
+from covocp.simulation.laws import extended_filter, gain_filter, simulate_law
 
 PATH = [0.0, 0.0, 0.0, 1.0, 0.0]
 PAPER = {"k": agile_aircraft.FACTOR, "l": agile_aircraft.DECAY}

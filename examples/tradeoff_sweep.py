@@ -1,4 +1,8 @@
-"""The trade-off between energy and knowledge: one problem, built once, solved for 25 weights with warm starts."""
+"""The trade-off between energy and knowledge
+==========================================
+
+One problem, built once, solved for 25 weights with warm starts.
+"""
 
 import numpy as np
 from matplotlib.figure import Figure

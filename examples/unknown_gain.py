@@ -1,4 +1,8 @@
-"""An integrator whose gain is unknown (thesis 3.5): the optimum is a constant control, not the printed exponential."""
+"""An integrator whose gain is unknown
+===================================
+
+The optimum is a constant control, not the printed exponential (thesis 3.5).
+"""
 
 import numpy as np
 

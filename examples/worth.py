@@ -1,4 +1,8 @@
-"""Is a combined design worth its while? An estimate from the classical one, before the combined one is computed."""
+"""Is a combined design worth its while?
+=====================================
+
+An estimate from the classical one, before the combined one is computed.
+"""
 
 import casadi as ca
 
