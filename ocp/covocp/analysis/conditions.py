@@ -202,7 +202,7 @@ def terminal_weight(statement: Statement, parameters: Array) -> Array:
     return np.asarray(unpack_costate(np.asarray(slope.full()).ravel(), statement.matrices[0].size))
 
 
-def terminal_slopes(statement: Statement, parameters: Array, x: Array) -> tuple[Array, Array]:
+def end_slopes(statement: Statement, parameters: Array, x: Array) -> tuple[Array, Array]:
     """Gradient (nx,) and Hessian (nx, nx) of the terminal cost by the state, without the matrices."""
     symbol = ca.MX.sym("x", statement.nx)
     value = statement.terminal(symbol, ca.DM.zeros(statement.ne), statement.duration.guess, parameters)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from covocp.analysis.conditions import terminal_cost, terminal_slopes, terminal_weight
+from covocp.analysis.conditions import end_slopes, terminal_cost, terminal_weight
 from covocp.analysis.constraint_duals import duals, terminal_rows
 from covocp.analysis.reduction import Reduction
 from covocp.analysis.stages import Stages
@@ -81,7 +81,7 @@ class Bound:
         weight = terminal_weight(st, parameters)[nx:, nx:]
         uncertain = float(np.trace(weight @ covariance))
         running = 0.5 * float(np.einsum("ki,kij,kj->", zeta[:-1], stages.running, zeta[:-1]))
-        own, last = stages.running, terminal_slopes(st, parameters, x)
+        own, last = stages.running, end_slopes(st, parameters, x)
         curvature = own - stages.weighted(covariance @ weight @ covariance)
 
         def gradient(by_xi: Array, by_w: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from covocp.analysis.conditions import terminal_slopes, terminal_weight
+from covocp.analysis.conditions import end_slopes, terminal_weight
 from covocp.analysis.constraint_duals import acting, evaluated
 from covocp.analysis.reduction import Reduction, resolved
 from covocp.analysis.stages import Stages
@@ -40,7 +40,7 @@ def mesh_residual(extremal: Extremal, w: Array) -> tuple[float, float]:
     curvature = stages.running - stages.weighted(covariance @ weight @ covariance)
     local = np.einsum("kij,kj->ki", curvature, zeta[:-1])
     by_xi = np.vstack([local[:, : stages.size], np.zeros((1, stages.size))])
-    by_xi[-1, :nx] += terminal_slopes(st, parameters, zeta[-1, :nx])[0]
+    by_xi[-1, :nx] += end_slopes(st, parameters, zeta[-1, :nx])[0]
     nodal_x, nodal_u, slack, rows = _nodal(extremal, zeta[:, :nx])
     by_xi[:, :nx] += nodal_x
     constant = coarse.control == "constant"

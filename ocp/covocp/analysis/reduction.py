@@ -147,7 +147,7 @@ def resolved(statement: Statement, mesh: Mesh, parameters: Array) -> Mesh:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
+class Stage:
     """One step: everything affine in what it starts from has a last axis of columns.
 
     stages: (weight in the time integral, z, Hessian, gradient and value at z = 0 of the running cost). products:
@@ -186,7 +186,7 @@ class Reduction:
         initial = unpack(half, size)
         self.filtered, self.prior = initial[:nx, :nx], np.linalg.inv(initial[nx:, nx:])
 
-    def advance(self, k: int, x: Array, S: Array, filtered: Array, ends: tuple[Array, Array]) -> Iterator[Step]:
+    def advance(self, k: int, x: Array, S: Array, filtered: Array, ends: tuple[Array, Array]) -> Iterator[Stage]:
         """The steps of control interval k.
 
         Args:
@@ -208,7 +208,7 @@ class Reduction:
             ]
             S, filtered, products = self._filter(i, S, filtered, points, one)
             x = after
-            yield Step(stages=stages, products=products, x=x, S=S, filtered=filtered)
+            yield Stage(stages=stages, products=products, x=x, S=S, filtered=filtered)
 
     def _nominal(self, i: int, x: Array, controls: list[Array], one: Array) -> tuple[Array, Any, tuple[Array, Array]]:
         """Classical Runge-Kutta step: state at the end, stages of the running cost, h times the slopes at the ends."""

@@ -19,7 +19,7 @@ from covocp.blocks.algebraic import continuous
 from covocp.blocks.factorisation import as_rows, dependence
 
 Array = NDArray[np.float64]
-Law = Callable[[ArrayLike, float], Array]
+StateLaw = Callable[[ArrayLike, float], Array]
 
 
 def solution(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Callable[[ArrayLike], Array]:
@@ -42,7 +42,7 @@ def solution(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Callable[
     return _regulator(x, A0, A, B, Q, R)[0]
 
 
-def regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Law:
+def regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> StateLaw:
     """Feedback u = -R^-1 B' P(x) x.
 
     Args:
@@ -68,7 +68,7 @@ def regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> Law:
     return law
 
 
-def filter_gain(x: Expr, A0: Expr, A: Expr, H: Expr, W: Expr, V: Expr) -> Law:
+def filter_gain(x: Expr, A0: Expr, A: Expr, H: Expr, W: Expr, V: Expr) -> StateLaw:
     """Gain P(x) H' V^-1 of the filter, P(x) from the dual Riccati equation.
 
     Args:

@@ -24,7 +24,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, Step, full_interval, nominal_interval
+from covocp.transcription.steps import KEPT, StepKind, full_interval, nominal_interval
 
 
 def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
@@ -70,7 +70,7 @@ def _stack(extremal: Extremal) -> Any:
 
 
 @lru_cache(maxsize=KEPT)
-def adjoint_interval(statement: Statement, substeps: int, step: Step, *, nominal: bool = False) -> ca.Function:
+def adjoint_interval(statement: Statement, substeps: int, step: StepKind, *, nominal: bool = False) -> ca.Function:
     """Adjoint of one discrete control interval; with `nominal` of the nominal alone, without cost.
 
     Returns:

@@ -31,7 +31,7 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
     return rates, stacked(before, np.append(t[0], t[1:] - one_sided(0.0) * h))[1:]
 
 
-def filter_gain(extremal: Extremal) -> Array | None:
+def filter_gains(extremal: Extremal) -> Array | None:
     """Kalman gain K = E M' U^-1 at the nodes [Schmidt 2.5-3]."""
     st = extremal.statement
     block = next((b for b in st.matrices if b.estimation), None)

@@ -14,10 +14,10 @@ from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
 
-Entry = State | Unknown
+AugmentedEntry = State | Unknown
 
 
-def augmented_names(entries: Sequence[Entry]) -> tuple[str, ...]:
+def augmented_names(entries: Sequence[AugmentedEntry]) -> tuple[str, ...]:
     """Names of the rows of the estimation covariance: states, then unknowns."""
     return tuple(
         entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
@@ -57,7 +57,7 @@ class EstimationCovariance:
     order, by their Jacobians); `E.matrix` is the whole symmetric matrix.
     """
 
-    def __init__(self, entries: Sequence[Entry], declaration: Matrix) -> None:
+    def __init__(self, entries: Sequence[AugmentedEntry], declaration: Matrix) -> None:
         """Keep the entries of the augmented state and the declared matrix."""
         self._entries = tuple(entries)
         self._declaration = declaration

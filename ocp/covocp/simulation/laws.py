@@ -27,7 +27,7 @@ from covocp.simulation.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
 # A casadi.Function, or a Python function of arrays that returns an array.
-Law = Callable[..., Any]
+LawFunction = Callable[..., Any]
 
 # Error of a step without noise, relative and, for entries near zero, absolute.
 TOLERANCE = 1e-9
@@ -46,7 +46,7 @@ class Filter:
         H: measurement matrix, (p, n).
     """
 
-    rate: Law
+    rate: LawFunction
     initial: Array
     size: int
     H: Array
@@ -97,7 +97,7 @@ def _of_state_and_control(value: Given) -> str:
 )
 def simulate_law(
     plant: ca.Function,
-    law: Law,
+    law: LawFunction,
     *,
     initial: ArrayLike,
     duration: float,
@@ -156,7 +156,7 @@ def simulate_law(
 
 @checked(dynamics=_of_state_and_control, gain=a_function)
 def gain_filter(
-    dynamics: ca.Function, gain: Law, H: ArrayLike, initial: ArrayLike, *, integrate: ArrayLike | None = None
+    dynamics: ca.Function, gain: LawFunction, H: ArrayLike, initial: ArrayLike, *, integrate: ArrayLike | None = None
 ) -> Filter:
     """Filter d(e)/dt = dynamics(e, u) + gain(e, t) (y - H e) of the estimate e.
 
@@ -182,7 +182,7 @@ def gain_filter(
         correction = gained @ innovation if isinstance(gained, ca.SX) else gained.reshape(size, -1) @ innovation
         return _stack(_value(dynamics, estimate, u) + correction, _times(sums, estimate))
 
-    made: Law = rate
+    made: LawFunction = rate
     if isinstance(gain, ca.Function):
         made = _function(rate, [size + len(sums), 1, dynamics.size1_in(1), len(rows)])
     return Filter(rate=made, initial=np.append(start, np.zeros(len(sums))), size=size + len(sums), H=rows)
@@ -241,7 +241,7 @@ class _Loop:
     """The closed loop; its state is that of the plant, that of the filter and the cost."""
 
     plant: ca.Function
-    law: Law
+    law: LawFunction
     observer: Filter | None
     running: ca.Function | None
     size: int
@@ -270,7 +270,7 @@ class _Loop:
         parts.append(_stack(0.0) if self.running is None else _value(self.running, x, u))
         return _stack(*parts)
 
-    def functions(self) -> tuple[Law, Law]:
+    def functions(self) -> tuple[LawFunction, LawFunction]:
         """Rate and control; casadi.Functions where all the parts are."""
         parts = [self.law] if self.observer is None else [self.law, self.observer.rate]
         if not all(isinstance(part, ca.Function) for part in parts):
@@ -363,7 +363,7 @@ def _columns(function: Columns, state: Array, t: float, *shocks: Array) -> Array
     return np.array(function.outputs[0][:, :count])
 
 
-def _runge_kutta(rate: ca.Function, h: float) -> Law:
+def _runge_kutta(rate: ca.Function, h: float) -> LawFunction:
     """One classical step with the noise held."""
 
     def advance(state: Given, t: Given, process: Given, measurement: Given) -> Any:
@@ -372,13 +372,13 @@ def _runge_kutta(rate: ca.Function, h: float) -> Law:
     return advance
 
 
-def _function(expression: Law, sizes: Sequence[int]) -> ca.Function:
+def _function(expression: LawFunction, sizes: Sequence[int]) -> ca.Function:
     """A function of columns of the sizes, expanded to SX."""
     symbols: Any = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(sizes)]
     return ca.Function("part", symbols, [ca.densify(expression(*symbols))])
 
 
-def _value(function: Law, *arguments: Any) -> Any:
+def _value(function: LawFunction, *arguments: Any) -> Any:
     """The value of a function, as an array where the arguments are numbers; columns are flat."""
     try:
         value = function(*arguments)

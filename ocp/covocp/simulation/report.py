@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
-from covocp.simulation.verdict import Entry
+from covocp.simulation.verdict import Component
 
 if TYPE_CHECKING:
     from covocp.simulation.monte_carlo import MonteCarlo
@@ -58,7 +58,7 @@ def _head(sample: MonteCarlo) -> Section:
     return [*lines, *(Sentence(line, warning=True) for line in wrong)]
 
 
-def _entries(sample: MonteCarlo, title: str, entries: tuple[Entry, ...], design: Array) -> Section:
+def _entries(sample: MonteCarlo, title: str, entries: tuple[Component, ...], design: Array) -> Section:
     """One row for each component; the design's own expectation where the truth is another system."""
     if not entries:
         return []

@@ -9,7 +9,7 @@ from covocp.base.arguments import MOST, is_whole, positive
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
-from covocp.simulation.schedule import Filter
+from covocp.simulation.schedule import FilterKind
 from covocp.simulation.vectorised import padded
 
 FILTERS = ("perturbation", "extended")
@@ -25,7 +25,7 @@ class Request:
     paths: int
     batch: int
     level: float
-    filter: Filter
+    filter: FilterKind
     step: float | None
 
     __repr__ = short_repr

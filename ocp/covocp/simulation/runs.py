@@ -24,7 +24,7 @@ from covocp.simulation.prediction import Prediction, control_spread, predict
 from covocp.simulation.request import Request, wrong_argument
 from covocp.simulation.run_parts import Limits, Setting
 from covocp.simulation.sampling import THREE_SIGMA, moments_of
-from covocp.simulation.schedule import Filter, Grid, Nominal, base_grid, nominal_at, stored_times
+from covocp.simulation.schedule import FilterKind, Grid, Nominal, base_grid, nominal_at, stored_times
 from covocp.simulation.step_choice import StepChoice, choose_step, examined, given_step
 from covocp.simulation.verdict import LEFT
 from covocp.simulation.workers import Harvest, simulate_batches
@@ -50,7 +50,7 @@ def simulate(
     law: Given = None,
     period: float | None = None,
     executor: Any = None,
-    filter: Filter = "perturbation",
+    filter: FilterKind = "perturbation",
     step: float | None = None,
     limits: Given = None,
     store: int = 101,

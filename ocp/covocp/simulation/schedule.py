@@ -21,8 +21,8 @@ from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
 
-Filter = Literal["perturbation", "extended"]
-Estimator = Filter | Literal["law"]
+FilterKind = Literal["perturbation", "extended"]
+Estimator = FilterKind | Literal["law"]
 
 # A division is rounded up unless it is whole to this accuracy: 5 s into steps of 0.25 s are 20, not 21.
 WHOLE = 1e-9
@@ -190,7 +190,7 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
     if kind == "perturbation":
         _, F, G, _, h, M, Hu, U = design.linear(x, u, t, T, p)
         half = estimation_half(st, e)
-        parts |= {"K": filter_gain(half, n, M, U), "F": F, "G": G, "M": M, "Hu": Hu, "h": h}
+        parts |= {"K": kalman_gain(half, n, M, U), "F": F, "G": G, "M": M, "Hu": Hu, "h": h}
         parts["early"] = early_gain(unpack_symbolic(half, n), M, U, step)
     shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
     assert shapes["C"] == (m, n)
@@ -204,7 +204,7 @@ def estimation_half(statement: Given, e: Given) -> Any:
     return e[next(b for b in statement.matrices if b.estimation).span]
 
 
-def filter_gain(half: Given, size: int, M: Given, U: Given) -> Any:
+def kalman_gain(half: Given, size: int, M: Given, U: Given) -> Any:
     """Kalman gain K = E M' U^-1, (n, r), of the half-vector of E [Schmidt 2.5-3]; no columns without measurements."""
     E = unpack_symbolic(half, size)
     return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)

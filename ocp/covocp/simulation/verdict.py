@@ -25,7 +25,7 @@ AS_PROMISED = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class Component:
     """One component at the end: predicted standard deviation, that of the sample with its band, the bias."""
 
     name: str
@@ -64,8 +64,8 @@ class Verdict:
     gains between the nodes do something else than the solution promises.
     """
 
-    deviations: tuple[Entry, ...]
-    errors: tuple[Entry, ...]
+    deviations: tuple[Component, ...]
+    errors: tuple[Component, ...]
     left: float
     unstable: float
     asked: float
@@ -81,7 +81,7 @@ class Verdict:
     __repr__ = short_repr
 
     @property
-    def decisive(self) -> tuple[Entry, ...]:
+    def decisive(self) -> tuple[Component, ...]:
         """The components that decide."""
         return self.deviations if self.fed_back else self.errors
 
@@ -198,7 +198,9 @@ def judge(sample: MonteCarlo) -> Verdict:
     )
 
 
-def _entries(names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float) -> tuple[Entry, ...]:
+def _entries(
+    names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float
+) -> tuple[Component, ...]:
     """The components of some terminal values, (R, rows)."""
     inside = values[stayed]
     result = []
@@ -208,7 +210,7 @@ def _entries(names: tuple[str, ...], predicted: Array, values: Array, stayed: Ar
         fourth = float(np.mean(column**4)) if column.size else np.nan
         low, high = mean_square_band(square, degrees_of_freedom(column.size, square, fourth), level)
         result.append(
-            Entry(
+            Component(
                 name=name,
                 predicted=float(predicted[i]),
                 sample=float(np.sqrt(square)),

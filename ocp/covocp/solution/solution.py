@@ -29,7 +29,7 @@ from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
-from covocp.extremal.nodes import filter_gain, rates_along
+from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
 from covocp.solution.fingerprint import Fingerprint
@@ -126,7 +126,7 @@ class Solution:
             multipliers=extremal.multipliers,
             rates=rates,
             end_rates=end_rates,
-            filter_gain=filter_gain(extremal),
+            filter_gain=filter_gains(extremal),
             mesh_error=mesh_error(extremal, outcome.cost_terms["running"]),
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),

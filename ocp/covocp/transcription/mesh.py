@@ -14,7 +14,7 @@ from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import Step
+from covocp.transcription.steps import StepKind
 
 ELIMINATED_SEGMENTS = 10
 LARGEST_SUBSTEPS = 64
@@ -127,7 +127,7 @@ class Mesh:
     substeps: int
     segments: tuple[int, ...]
     eliminated: bool
-    step: Step
+    step: StepKind
     linear_solver: str = LINEAR_SOLVER
     points: int = 1
 
@@ -167,7 +167,7 @@ class Stiffness:
     matrices: float = 0.0
 
 
-def choose_mesh(statement: Statement, options: Options, step: Step, stiffness: Stiffness) -> Mesh:
+def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffness: Stiffness) -> Mesh:
     """Resolve every "auto".
 
     Args:
@@ -260,7 +260,7 @@ def explicit_substeps(stiffness: float) -> int:
     return int(np.clip(np.ceil(stiffness / STIFFNESS_PER_STEP), 1, LARGEST_SUBSTEPS))
 
 
-def choose_step(statement: Statement, options: Options, stiffness: Stiffness) -> Step:
+def choose_step(statement: Statement, options: Options, stiffness: Stiffness) -> StepKind:
     """The step of nominal and covariances.
 
     Args:
@@ -293,7 +293,7 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
     return "rodas" if possible and (options.step == "rodas" or stiff) else covariance
 
 
-def _choose_covariance_step(statement: Statement, options: Options) -> Step:
+def _choose_covariance_step(statement: Statement, options: Options) -> StepKind:
     """The covariance step: gauss where every rate has the Riccati form, else rk4.
 
     Where E and S of a closed loop are variables and small, rk4: written out in scalars, its exact derivatives cost a

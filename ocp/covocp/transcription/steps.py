@@ -36,7 +36,7 @@ from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.rosenbrock import between, implicit_interval
 
-Step = Literal["gauss", "strang", "rk4", "rodas"]
+StepKind = Literal["gauss", "strang", "rk4", "rodas"]
 
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
@@ -51,7 +51,7 @@ def _slopes(statement: Statement, count: int) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=KEPT)
-def nominal_interval(statement: Statement, substeps: int, step: Step) -> ca.Function:
+def nominal_interval(statement: Statement, substeps: int, step: StepKind) -> ca.Function:
     """The nominal over one control interval, by classical Runge-Kutta steps or, with "rodas", implicit ones.
 
     Returns:
@@ -114,7 +114,7 @@ def _classical_steps(
 
 
 @lru_cache(maxsize=KEPT)
-def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
+def step_matrix(statement: Statement, index: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """The step matrix of one matrix state over one substep, given the nominal at both ends of it.
 
     Returns:
@@ -131,7 +131,7 @@ def step_matrix(statement: Statement, index: int, step: Step, solver: str = LINE
 
 
 @lru_cache(maxsize=KEPT)
-def _gauss_points(statement: Statement, index: int, step: Step) -> ca.Function:
+def _gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Function:
     """h H at the two Gauss points, H = [-F' W; Q F], the nominal there by its own polynomial (`between`)."""
     form = _form(statement, index)
     inside = between(statement, GAUSS_NODES) if step == "rodas" else None
@@ -214,7 +214,7 @@ def _updated(covariance: Expr, information: Expr, solver: str) -> Any:
 
 @lru_cache(maxsize=KEPT)
 def propagate_step(
-    statement: Statement, positions: tuple[int, ...], step: Step = "gauss", solver: str = LINEAR_SOLVER
+    statement: Statement, positions: tuple[int, ...], step: StepKind = "gauss", solver: str = LINEAR_SOLVER
 ) -> ca.Function:
     """Half-vectors of some matrices over one substep, given their step matrices.
 
@@ -283,7 +283,7 @@ def early(interval: Interval) -> Expr:
 
 
 @lru_cache(maxsize=KEPT)
-def full_interval(statement: Statement, substeps: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
+def full_interval(statement: Statement, substeps: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 
     Returns:
@@ -318,7 +318,7 @@ def full_interval(statement: Statement, substeps: int, step: Step, solver: str =
 
 
 @lru_cache(maxsize=KEPT)
-def inside_interval(statement: Statement, count: int, step: Step, solver: str = LINEAR_SOLVER) -> ca.Function:
+def inside_interval(statement: Statement, count: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """The trajectory inside an interval whose ends are known: what runs forward from its start, S from its end.
 
     Returns:
@@ -359,7 +359,7 @@ def runge_kutta_step(statement: Statement, positions: tuple[int, ...]) -> ca.Fun
 
 @lru_cache(maxsize=KEPT)
 def matrices_step(
-    statement: Statement, positions: tuple[int, ...], step: Step, solver: str = LINEAR_SOLVER
+    statement: Statement, positions: tuple[int, ...], step: StepKind, solver: str = LINEAR_SOLVER
 ) -> ca.Function:
     """Some matrices over one step along a nominal that is known at both ends of it, in either direction.
 

@@ -24,7 +24,7 @@ DURATIONS = (1e-3, 1e3)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Entry:
+class Argument:
     """One argument of the solver: a parameter of the problem, or the duration.
 
     Attributes:
@@ -54,7 +54,7 @@ class Replannable:
 
     statement: Statement
     fixed: Problem
-    entries: tuple[Entry, ...]
+    entries: tuple[Argument, ...]
 
     __repr__ = short_repr
 
@@ -69,7 +69,7 @@ def replannable(problem: Problem) -> Replannable:
     statement, own = problem.statement(), problem.declarations
     start, _, matrices, _ = statement.boundary_values(statement.values)
     taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
-    entries: list[Entry] = []
+    entries: list[Argument] = []
     if own.expected is not None and not any(matrix.estimation for matrix in own.matrices):
         own = with_estimation(own)  # so that its start can be a parameter
     for position, state in enumerate(own.states):
@@ -85,14 +85,14 @@ def replannable(problem: Problem) -> Replannable:
         port = Port(
             name=identifier(block.name, taken), rows=block.size, unit=block.unit, about=f"{about} '{block.name}'"
         )
-        entries.append(Entry(port=port, parameter=block.name, value=value, deviation=0.02 * np.abs(value)))
+        entries.append(Argument(port=port, parameter=block.name, value=value, deviation=0.02 * np.abs(value)))
     moving = own
     if own.free_duration is None and statement.autonomous and not _timed(own):
         T = float(own.duration)
         free = Free(T, DURATIONS[0] * T, DURATIONS[1] * T)
         moving = replace(own, free_duration=free, duration=ca.MX.sym("duration"))
         port = Port(name="duration", unit="s", about="from now to the end")
-        entries.append(Entry(port=port, parameter="", value=np.array([T]), deviation=np.array([0.02 * T])))
+        entries.append(Argument(port=port, parameter="", value=np.array([T]), deviation=np.array([0.02 * T])))
     return Replannable(statement=statement_of(moving), fixed=Problem.of(own), entries=tuple(entries))
 
 
@@ -113,7 +113,7 @@ def _parameter(problem: Declarations, name: str, value: Array, unit: str, taken:
 
 
 def _with_start(
-    problem: Declarations, position: int, start: Array, taken: set[str], entries: list[Entry]
+    problem: Declarations, position: int, start: Array, taken: set[str], entries: list[Argument]
 ) -> Declarations:
     """The declarations with the known initial values of a state as a parameter."""
     state, known = problem.states[position], np.flatnonzero(~np.isnan(start))
@@ -129,7 +129,7 @@ def _with_start(
         deviation = 0.1 * np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(state.variance).full())), 0.0))[known]
     deviation = np.maximum(deviation, 0.005 * np.abs(start[known]))
     port = Port(name=name, rows=known.size, unit=state.unit, about=about)
-    entries.append(Entry(port=port, parameter=name, value=start[known], deviation=deviation))
+    entries.append(Argument(port=port, parameter=name, value=start[known], deviation=deviation))
     return _started(problem.adding(parameters=own), "states", position, ca.vertcat(*rows))
 
 
@@ -142,7 +142,7 @@ def _started(problem: Declarations, group: str, position: int, initial: Expr) ->
 
 
 def _with_matrix(
-    problem: Declarations, position: int, half: Array, taken: set[str], entries: list[Entry]
+    problem: Declarations, position: int, half: Array, taken: set[str], entries: list[Argument]
 ) -> Declarations:
     """The declarations with the initial value of a matrix as a parameter."""
     matrix = problem.matrices[position]
@@ -151,11 +151,11 @@ def _with_matrix(
     value = unpack(half, matrix.size)
     about = f"initial value of the matrix '{matrix.name}', rows {', '.join(labels)}"
     port = Port(name=name, rows=matrix.size, columns=matrix.size, unit=matrix.unit, about=about)
-    entries.append(Entry(port=port, parameter=name, value=value.ravel(), deviation=np.zeros(value.size)))
+    entries.append(Argument(port=port, parameter=name, value=value.ravel(), deviation=np.zeros(value.size)))
     return _started(problem.adding(parameters=own), "matrices", position, own.symbol)
 
 
-def stacked(entries: tuple[Entry, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
+def stacked(entries: tuple[Argument, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
     """The parameters of a statement from the arguments, in the order of their names; matrices as half-vectors."""
     by_parameter = {entry.parameter: entry for entry in entries}
     result = []
