@@ -340,7 +340,7 @@ class Space:
             extra[i] = max(abs(float(turned)), SMALLEST_EXTRA * extra[i]) if np.isfinite(turned) else extra[i]
         return replace(self, extra=extra)
 
-    def probe(self, iterate: Iterate, linear: Linear, metric: Expr, ell: Array) -> float:
+    def probe(self, iterate: Iterate, linear: Linear, metric: Expr) -> float:
         """Curvature of the Lagrangian along the step that the metric would take, in units of the metric."""
         lower, upper = self.room(iterate)
         still = np.zeros(self.conditions)

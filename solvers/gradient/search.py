@@ -161,7 +161,7 @@ class Search:
                 return Ending(current, measures, message, False)
             base = space.metric(current, linear, ell, settings.weight)
             metric = learnt(control.weight * base, control.pairs)
-            trial = self._try(current, linear, metric, ell, active)
+            trial = self._try(current, linear, metric, active)
             if isinstance(trial, str):
                 return Ending(current, measures, trial, False)
             following, step = trial
@@ -225,11 +225,11 @@ class Search:
         if not settings.adaptive:
             return
         metric = self.space.metric(current, linear, ell, settings.weight)
-        value = self.space.probe(current, linear, metric, ell)
+        value = self.space.probe(current, linear, metric)
         control.weight = float(np.clip(settings.weight_factor * value, SMALLEST_WEIGHT, LARGEST_WEIGHT))
 
     def _try(
-        self, current: Iterate, linear: Linear, metric: Metric, ell: Array, active: Array | None
+        self, current: Iterate, linear: Linear, metric: Metric, active: Array | None
     ) -> tuple[Iterate, Step] | str:
         """A step that changes cost and miss about as predicted; raises w and lowers d until there is one."""
         space, control, miss = self.space, self.control, current.run.miss

@@ -36,7 +36,6 @@ def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
         extremal.parameters,
         multipliers.end,
         multipliers.path[-1],
-        extremal.mesh,
     )
     return slopes[0] + multipliers.final, slopes[1] + multipliers.final_matrices
 

@@ -72,7 +72,7 @@ def freeze(problem: Declarations) -> Statement:
         nominal=nominal,
         rates=stacked.function("rates", [rates, matrix_rates, running]),
         terminal=stacked.function("terminal", [terminal], without=("control", "time")),
-        boundary=_boundary(problem, stacked),
+        boundary=_boundary(problem),
         matrix_end=_matrix_end(problem, stacked),
         loop=_loop(problem, stacked),
         riccati=riccati,
@@ -94,7 +94,7 @@ def freeze(problem: Declarations) -> Statement:
         noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
-        expression=_expression_builder(problem, stacked),
+        expression=_expression_builder(stacked),
     )
 
 
@@ -370,7 +370,7 @@ def _duration(problem: Declarations) -> Duration:
     return Duration(guess=free.guess, lower=free.lower, upper=free.upper)
 
 
-def _boundary(problem: Declarations, stacked: Stacked) -> ca.Function:
+def _boundary(problem: Declarations) -> ca.Function:
     """Initial and final values of states and matrices as functions of the parameters."""
     own = [entry.symbol for entry in _all(problem.parameters, problem.unknowns)]
     free = [ca.MX(ca.DM.nan(entry.symbol.shape)) for entry in problem.matrices]
@@ -464,7 +464,7 @@ def _diagonal_bounds(entry: Matrix) -> Any:
     return bounds[columns, rows]
 
 
-def _expression_builder(problem: Declarations, stacked: Stacked) -> Callable[[Any], ca.Function]:
+def _expression_builder(stacked: Stacked) -> Callable[[Any], ca.Function]:
     """What turns a user's expression into a function of the six stacked inputs."""
 
     def build(expression: Expr) -> ca.Function:

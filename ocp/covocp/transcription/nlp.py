@@ -169,7 +169,7 @@ class NLP:
         end = by_kind.get("end", zero.end)
         path = by_kind.get("path", zero.path.ravel()).reshape(zero.path.shape)
         costate = by_kind["gap_x"][-st.nx :]
-        slope_x, slope_e = terminal_slopes(st, trajectory, parameters, end, path[-1], mesh)
+        slope_x, slope_e = terminal_slopes(st, trajectory, parameters, end, path[-1])
         final_matrices = zero.final_matrices.copy()
         gaps = [by_kind[kind].reshape(len(mesh.segments), -1) for kind in ("gap_x", "gap_e") if kind in by_kind]
         if "e" in parts:
@@ -258,7 +258,7 @@ class NLP:
 
 
 def terminal_slopes(
-    statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array, mesh: Mesh
+    statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array
 ) -> tuple[Array, Array]:
     """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
     x, e = ca.MX.sym("x", statement.nx), ca.MX.sym("e", statement.ne)

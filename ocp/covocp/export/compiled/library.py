@@ -88,7 +88,7 @@ class Library:
         function.restype = ctypes.c_int
         function.argtypes = None
         given, received = (np.frombuffer(buffer, dtype=self._real) for buffer in (inputs, outputs))
-        first = [self._workspace(law)] if law.kind == "solver" else []
+        first = [self._workspace()] if law.kind == "solver" else []
         results = [self._pointer(outputs, span(law.results, port.name).start) for port in law.results]
         sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
         pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
@@ -143,7 +143,7 @@ class Library:
     def _pointer(self, buffer: Given, offset: int) -> Any:
         return ctypes.byref(buffer, offset * ctypes.sizeof(self._real))
 
-    def _workspace(self, law: Law) -> Any:
+    def _workspace(self) -> Any:
         size = ctypes.c_int.in_dll(self._library, f"{self._package}_workspace_bytes").value
         return (ctypes.c_double * (size // ctypes.sizeof(ctypes.c_double) + 1))()
 
