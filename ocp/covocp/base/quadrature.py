@@ -46,11 +46,11 @@ def simpson_weight(j: int, count: int) -> float:
     return (1 if j in (0, count) else 4 if j % 2 else 2) / (3 * count)
 
 
-def gauss_matrix(points: Expr, size: int, solver: str) -> Expr:
+def gauss_transition(points: Any, unit: Any, solve: Callable[[Any, Any], Any]) -> Any:
     """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
 
     With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a
-    solve, and inserting it leaves one system of size 2n instead of 4n:
+    solve, and inserting it leaves one system of the size of H instead of twice that:
 
         [(I - g h H2)(I - g h H1) - a h/2 (H1 + H2)] Y1 = I - g h H2.
 
@@ -58,14 +58,20 @@ def gauss_matrix(points: Expr, size: int, solver: str) -> Expr:
     the sparsity of F.
 
     Args:
-        points: h H at the two nodes.
-        size: n, half the rows of H.
-        solver: of the linear system.
+        points: h H at the two nodes; numbers, stacks of them, or expressions.
+        unit: the identity.
+        solve: (matrix, right side) -> solution.
     """
     first, second = points
     g = np.sqrt(3.0) / 6.0
     a = 0.5 - 2.0 * g
-    unit = ca.DM.eye(2 * size)
     left, right = unit - g * second, unit - g * first
-    stage = linear_solve(left @ right - a / 2 * (first + second), ca.densify(left), solver)
+    stage = solve(left @ right - a / 2 * (first + second), left)
     return unit + (right @ stage - unit) / a
+
+
+def gauss_matrix(points: Any, size: int, solver: str) -> Expr:
+    """The transition of 2 `size` rows as an expression, with a solver of CasADi's."""
+    return gauss_transition(
+        points, ca.DM.eye(2 * size), lambda matrix, right: linear_solve(matrix, ca.densify(right), solver)
+    )

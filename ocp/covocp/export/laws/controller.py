@@ -194,7 +194,7 @@ def _predict(
         at: their times [s].
         h: length of the step [s].
 
-    The elimination of the stages is that of `covocp.transcription.steps.gauss_matrix`.
+    The elimination of the stages is that of `covocp.base.quadrature.gauss_transition`, with an affine part.
     """
     st, (n, m, _) = design.statement, design.sizes
     unit, units = ca.DM.eye(n), ca.diag(ca.DM(design.units))

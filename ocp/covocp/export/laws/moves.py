@@ -10,7 +10,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
-from covocp.base.quadrature import GAUSS_NODES
+from covocp.base.quadrature import GAUSS_NODES, gauss_transition
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
@@ -184,13 +184,5 @@ def _moved(D: Array, P: Array) -> Array:
 
 
 def _transitions(H: list[Array]) -> Array:
-    """One step of the two-stage Gauss method for z' = H z for each step, H at both points times the step's length.
-
-    The elimination is that of `covocp.transcription.steps.gauss_matrix`.
-    """
-    g = np.sqrt(3.0) / 6.0
-    a = 0.5 - 2.0 * g
-    unit = np.eye(H[0].shape[1])
-    left, right = unit - g * H[1], unit - g * H[0]
-    stage = np.linalg.solve(left @ right - a / 2 * (H[0] + H[1]), left)
-    return np.asarray(unit + (right @ stage - unit) / a)
+    """Step matrices from h H at the two Gauss points."""
+    return np.asarray(gauss_transition(H, np.eye(H[0].shape[1]), np.linalg.solve))

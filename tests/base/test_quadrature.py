@@ -1,0 +1,70 @@
+"""Steps and rules of integration against closed forms."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, gauss_transition, hermite, simpson_weight
+
+H = np.array([[0.3, -1.2, 0.1, 0.0], [0.4, -0.2, 0.0, 0.7], [0.0, 0.5, -0.6, 0.2], [1.0, 0.0, 0.3, 0.1]])
+
+
+def test_classical_step_has_order_four():
+    """dx/dt = x cos t from 1: x = exp(sin t)."""
+
+    def error(h):
+        return abs(classical_step(lambda x, c: x * np.cos(c * h), 1.0, h) - np.exp(np.sin(h)))
+
+    ratios = [error(h) / error(h / 2) for h in (0.4, 0.2)]
+    assert 28 < min(ratios) <= max(ratios) < 36  # 2^5: the error of one step
+
+
+def test_a_known_first_slope_changes_nothing():
+    h = 0.3
+
+    def rate(x, c):
+        return x**2 + c
+
+    assert classical_step(rate, 0.7, h, rate(0.7, 0.0)) == classical_step(rate, 0.7, h)
+
+
+def test_hermite_is_exact_for_cubics():
+    cubic, slope = np.polynomial.Polynomial([0.3, -1.0, 2.0, 0.7]), np.polynomial.Polynomial([-1.0, 4.0, 2.1])
+    c = np.linspace(0.0, 1.0, 11)
+    np.testing.assert_allclose(hermite(cubic(0), cubic(1), slope(0), slope(1), c), cubic(c), rtol=1e-14)
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_simpson_is_exact_for_cubics(count):
+    cubic = np.polynomial.Polynomial([0.3, -1.0, 2.0, 0.7])
+    total = sum(simpson_weight(j, count) * cubic(j / count) for j in range(count + 1))
+    assert total == pytest.approx(cubic.integ()(1.0), rel=1e-14)
+
+
+def test_gauss_transition_is_the_pade_approximant_of_constant_rates():
+    unit = np.eye(4)
+    above, below = (unit + s * H / 2 + H @ H / 12 for s in (1.0, -1.0))
+    np.testing.assert_allclose(
+        gauss_transition([H, H], unit, np.linalg.solve), np.linalg.solve(below, above), rtol=1e-13
+    )
+
+
+def test_gauss_transition_has_order_four_where_rates_vary():
+    """z' = t H z: exp(t^2 H / 2)."""
+
+    def error(h):
+        points = [h * (c * h) * H for c in GAUSS_NODES]
+        return np.abs(gauss_transition(points, np.eye(4), np.linalg.solve) - expm(h**2 / 2 * H)).max()
+
+    assert error(0.5) / error(0.25) > 28
+
+
+def test_expressions_numbers_and_stacks_agree():
+    points = [H, H @ H / 3]
+    numbers = gauss_transition(points, np.eye(4), np.linalg.solve)
+    symbols = [ca.MX.sym(f"H{k}", 4, 4) for k in range(2)]
+    found = ca.Function("D", symbols, [gauss_matrix(symbols, 2, "lapacklu")])(*points)
+    np.testing.assert_allclose(found.full(), numbers, rtol=1e-12)
+    stacks = [np.stack([p, 0.5 * p]) for p in points]
+    np.testing.assert_allclose(gauss_transition(stacks, np.eye(4), np.linalg.solve)[0], numbers, rtol=1e-12)
