@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import covocp as co
 from covocp.models import unknown_lag
 from covocp.statement.interval import SIDE, Interval, one_sided
 
@@ -54,9 +53,6 @@ def test_substeps_are_the_parts_side_by_side():
 
 def test_the_arguments_of_the_model_have_its_order():
     statement = unknown_lag.problem().statement()
-    interval = Interval.symbols(statement)
-    sizes = [
-        argument.shape[0] for argument in interval.at(0.5, ca.SX.sym("x", statement.nx), ca.SX.sym("e", statement.ne))
-    ]
+    x, e = ca.SX.sym("x", statement.nx), ca.SX.sym("e", statement.ne)
+    sizes = [argument.shape[0] for argument in Interval.symbols(statement).at(0.5, x, e)]
     assert sizes == [statement.rates.size1_in(k) for k in range(6)]
-    assert isinstance(co.Problem.of(unknown_lag.problem().declarations), co.Problem)
