@@ -41,9 +41,10 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal, Guess, Outcome
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
-from covocp.solvers.gradient.iterate import Iterate, Measures, Space, make_space
+from covocp.solvers.gradient.iterate import Space, make_space
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
+from covocp.solvers.gradient.records import Iterate, Measures
 from covocp.solvers.gradient.search import Search, Settings, Variant
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess

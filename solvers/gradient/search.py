@@ -18,9 +18,10 @@ from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
 from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.descent import Step, solve_gram, solve_step, solve_tangent, unreachable
-from covocp.solvers.gradient.iterate import Iterate, Linear, Measures, Space
+from covocp.solvers.gradient.iterate import Space
 from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
 from covocp.solvers.gradient.penalty import next_weights
+from covocp.solvers.gradient.records import Iterate, Linear, Measures
 
 # On the slopes, unless the user gives another.
 TOLERANCE = 1e-6

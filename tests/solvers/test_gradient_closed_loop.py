@@ -22,7 +22,8 @@ import covocp as co
 from covocp.base.matrices import pack, pack_costate, unpack_costate
 from covocp.models import mars_entry, unknown_lag
 from covocp.solvers.gradient import one_iteration, prepare
-from covocp.solvers.gradient.iterate import Iterate, Linear, Space
+from covocp.solvers.gradient.iterate import Space
+from covocp.solvers.gradient.records import Iterate, Linear
 from covocp.solving.warm_start import make_guess
 from covocp.transcription.mesh import Options
 

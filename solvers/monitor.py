@@ -1,0 +1,81 @@
+"""What is seen of a run of the NLP solver while it goes on: its progress, and whether it has lost its way."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.transcription.nlp import NLP
+
+# A run that has not brought its largest violation below this share of the smallest one before, for so many iterations,
+# has lost its way, unless it violates (in the units of the NLP) less than this: then it may take its time.
+PATIENCE = 40
+PROGRESS = 0.9
+NEAR = 1e-3
+
+
+class Monitor(ca.Callback):
+    """Ipopt's iteration callback: reports progress, and stops when the user asks."""
+
+    def __init__(self, nlp: NLP) -> None:
+        ca.Callback.__init__(self)
+        self._sizes = {"x": nlp.w.shape[0], "g": nlp.g.shape[0], "p": nlp.p.shape[0], "f": 1}
+        self._progress: Progress | None = None
+        self._scale, self._iteration = 1.0, 0
+        self._bounds: dict[str, Array] = {}
+        self._impatient, self.wandered = False, False
+        self._least, self._since = np.inf, 0
+        self.construct("progress", {})
+
+    def attach(self, progress: Progress, scale: float, bounds: dict[str, Array], impatient: bool = False) -> None:
+        """Report to this progress from now on; an impatient one stops a run that has lost its way."""
+        self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
+        self._impatient, self.wandered = impatient, False
+        self._least, self._since = np.inf, 0
+
+    def get_n_in(self) -> int:
+        """One for each output of the solver."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """Whether to stop."""
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        """Names of the outputs of the solver."""
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        """The name that nlpsol asks for."""
+        return "ret"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Columns."""
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i).removeprefix("lam_")], 1)
+
+    def has_eval_buffer(self) -> bool:
+        """Numbers come as they lie in memory: matrices made of them would take longer than a small iteration."""
+        return True
+
+    def eval_buffer(self, arg: tuple[memoryview, ...], res: tuple[memoryview, ...]) -> int:
+        """One iteration."""
+        stop = False
+        if self._progress is not None:
+            cost, g = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in ("f", "g"))
+            violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
+            self._progress.update(self._iteration, float(cost[0]) * self._scale, float(violation))
+            self._iteration += 1
+            stop = self._progress.stop or self._wanders(float(violation))
+        np.frombuffer(res[0], dtype=float)[:] = stop
+        return 0
+
+    def _wanders(self, violation: float) -> bool:
+        """Whether a run that need not be finished has made no progress for long."""
+        if not self._impatient:
+            return False
+        if violation < PROGRESS * self._least:
+            self._least, self._since = violation, self._iteration
+        self.wandered = violation > NEAR and self._iteration - self._since >= PATIENCE
+        return self.wandered
