@@ -12,7 +12,7 @@ from covocp.blocks.least_squares import recursive_least_squares as recursive_lea
 from covocp.blocks.square_root import factor as factor
 from covocp.blocks.square_root import predict_factor as predict_factor
 from covocp.blocks.square_root import update_factor as update_factor
-from covocp.blocks.steady import SteadyFilter as SteadyFilter
+from covocp.blocks.steady import Filter as Filter
 from covocp.blocks.steady import steady_state as steady_state
 from covocp.blocks.updates import joseph as joseph
 from covocp.blocks.updates import predict as predict

@@ -17,7 +17,7 @@ from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.duality import Control, dual
-from covocp.blocks.steady import SteadyFilter, steady_state
+from covocp.blocks.steady import Filter, steady_state
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, weight
 
@@ -54,7 +54,7 @@ class GaussianRegulator:
     """
 
     regulator: Regulator
-    filter: SteadyFilter
+    filter: Filter
     average_cost: float
     eigenvalues: Modes
 

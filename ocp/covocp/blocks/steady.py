@@ -34,7 +34,7 @@ WORDS = Words(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SteadyFilter:
+class Filter:
     """A filter in steady state; arrays are read-only.
 
     Args:
@@ -53,7 +53,7 @@ class SteadyFilter:
 
 
 @checked(discrete=truth)
-def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: bool = True) -> SteadyFilter:
+def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: bool = True) -> Filter:
     """Steady state of the Kalman filter (item 4), discrete or continuous, by duality with the regulator.
 
     Args:
@@ -83,6 +83,4 @@ def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: b
     else:
         gain = np.linalg.solve(U, rows @ prior).T
         posterior, error = prior, phi - gain @ rows
-    return SteadyFilter(
-        prior=frozen(prior), posterior=frozen(posterior), gain=frozen(gain), eigenvalues=sorted_modes(error)
-    )
+    return Filter(prior=frozen(prior), posterior=frozen(posterior), gain=frozen(gain), eigenvalues=sorted_modes(error))
