@@ -166,3 +166,12 @@ def test_the_wheel_imports_from_its_own_files(distributions, tmp_path):
     found = run_python(code, tmp_path, PYTHONPATH=str(tmp_path))
     assert found.returncode == 0, found.stderr
     assert all(line.startswith(str(tmp_path)) for line in found.stdout.splitlines()[:3])
+
+
+def test_the_wheel_of_the_checkout_is_that_from_the_sdist(distributions, tmp_path):
+    project = copy_of_the_project(tmp_path / "project")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(project)]
+    built = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert names_in_wheel(wheel) == names_in_wheel(distributions[1])
