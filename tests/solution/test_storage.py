@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import covocp as co
-from covocp.base.archive import sealed_text
-from covocp.base.encoding import DamagedFileError, decode, encode
+from covocp.base.archive import DamagedFileError, decode, encode, sealed_text
 from covocp.models import bryson_denham, free_time_integrator, mass_chain, noisy_integrator, unknown_lag
 from covocp.solution.schema import from_tree, to_tree
 

@@ -12,7 +12,7 @@ from typing import Any, Literal, Union
 
 import numpy as np
 
-from covocp.base.encoding import DamagedFileError
+from covocp.base.archive import DamagedFileError
 from covocp.base.errors import CovocpError
 from covocp.extremal.mean_effect import MEAN_EFFECT, noted
 from covocp.extremal.optimality import Optimality

@@ -14,8 +14,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from covocp.base.archive import packed, unpacked
-from covocp.base.encoding import DamagedFileError
+from covocp.base.archive import DamagedFileError, packed, unpacked
 from covocp.base.errors import ExportError, ProblemError
 from covocp.base.files import check_target, written_whole
 from covocp.base.matrices import Array
