@@ -212,7 +212,7 @@ def densities(statement: Statement) -> ca.Function:
     """(state, control, time, duration, parameters) -> densities Q of the process and U of the measurement noise."""
     symbolic: Any = statement.symbolic
     arguments = [symbolic.sym(f"a{i}", k) for i, k in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
-    noise = _loop(statement).expansion(*arguments)[5]
+    noise = _loop(statement).slopes(*arguments).Q
     measured = statement.measurement
     density = symbolic(0, 0) if measured is None else measured(*arguments)[2]
     return ca.Function("densities", arguments, [noise, ca.densify(density)])
@@ -241,7 +241,7 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     points = []
     for c in GAUSS_NODES:
         z, u, t = hermite(za, zb, h * fa, h * fb, c), common.control(c), common.time(c)
-        F, G = loop.expansion(z[:nx], u, t, duration, p)[:2]
+        F, G = loop.slopes(z[:nx], u, t, duration, p)[:2]
         C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
         K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][block.span], size), (t, duration, p))
         noise, measured = density(z[:nx], u, t, duration, q)
@@ -359,7 +359,8 @@ def _running(statement: Statement) -> ca.Function:
     joint = symbolic.sym("joint", 2 * size, 2 * size)
     loop = _loop(statement)
     plain = (*six[:2], *six[3:])
-    _, _, A, B, N, Q = loop.expansion(*plain)
+    at = loop.slopes(*plain)
+    A, B, N, Q = at.A, at.B, at.N, at.Q
     C = loop.gain(*six)
     E, Z, Xhat = joint[:size, :size], joint[:size, size:], joint[size:, size:]
     X = E + Xhat - Z - Z.T

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,19 @@ from covocp.problem.expected_cost import statement_of
 from covocp.solution.solution import Solution
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Block, Statement
+
+
+class Linearised(NamedTuple):
+    """Rate of the augmented state, F, G, Q; measured values h, M, their slope Hu by the control, U."""
+
+    rate: Given
+    F: Given
+    G: Given
+    Q: Given
+    h: Given
+    M: Given
+    Hu: Given
+    U: Given
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +59,10 @@ class System:
     linear: ca.Function
 
     __repr__ = short_repr
+
+    def model(self, *point: Given) -> Linearised:
+        """What `linear` gives at (state, control, time, duration, parameters), by name."""
+        return Linearised(*self.linear(*point))
 
     @property
     def size(self) -> int:

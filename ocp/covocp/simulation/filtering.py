@@ -41,17 +41,17 @@ def corrected(run: Run, z: Given, c: dict[str, Any], noise: Given, h: Given, *, 
         return z
     _, fed = control_of(run, z, c)
     u = ca.vertcat(fed, part(c["u"], design.fed_back))
-    _, _, _, _, value, _, _, density = system_at(run, setting.actual, (z[run.spans["x"]], run.own), u, c)
-    reading = value + ca.sqrt(2 / h) * (factor(density) @ noise)
+    actual = system_at(run, setting.actual, (z[run.spans["x"]], run.own), u, c)
+    reading = actual.h + ca.sqrt(2 / h) * (factor(actual.U) @ noise)
     y = z[run.spans["estimate"]]
     if setting.filter == "perturbation":
         expected = c["h"] + c["M"] @ y + c["Hu"] @ (fed - part(c["u"], 0, design.fed_back))
         gain = h / 2 * c["K"] if late else c["early"]
         return replaced(z, run.spans["estimate"], y + gain @ (reading - expected))
-    _, _, _, _, expected, M, _, assumed = system_at(run, design, estimate_of(run, z), u, c)
+    own = system_at(run, design, estimate_of(run, z), u, c)
     covariance = unpack_symbolic(z[run.spans["E"]], design.size)
     law = updating("sequential", "raise")
-    estimate, spread = apply(law, y, covariance, reading - expected + M @ y, M, 2 / h * assumed)
+    estimate, spread = apply(law, y, covariance, reading - own.h + own.M @ y, own.M, 2 / h * own.U)
     return replaced(replaced(z, run.spans["estimate"], estimate), run.spans["E"], pack_symbolic(spread))
 
 
@@ -69,9 +69,9 @@ def moved_covariance(run: Run, z: Given, ahead: Given, sides: list[dict[str, Any
     slopes, noises = [], []
     for state, c in zip((z, ahead), sides, strict=True):
         u = ca.vertcat(control_of(run, state, c)[1], part(c["u"], design.fed_back))
-        _, F, _, Q, _, _, _, _ = system_at(run, design, estimate_of(run, state), u, c)
-        slopes.append(F)
-        noises.append(Q)
+        at = system_at(run, design, estimate_of(run, state), u, c)
+        slopes.append(at.F)
+        noises.append(at.Q)
     first, second = slopes
     tangent = run.symbolic.eye(design.size) + h / 2 * (first + second + h * (second @ first))
     before = unpack_symbolic(z[run.spans["E"]], design.size) + h / 2 * noises[0]

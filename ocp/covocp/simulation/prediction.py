@@ -128,9 +128,9 @@ def _joint(design: System, actual: System) -> ca.Function:
     x, u, e, t, T, p, q = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
     chosen = coefficients(design, "perturbation")
     c = chosen.split(chosen.function(x, u, e, t, T, p, 0))
-    f, F, G, Q, h, M, Hu, U = actual.linear(x[: other.nx], u[: other.nu], t, T, q)
+    f, F, G, Q, h, M, Hu, U = actual.model(x[: other.nx], u[: other.nu], t, T, q)
     C, K = c["C"], c["K"]
-    rate = design.linear(x, u, t, T, p)[0]
+    rate = design.model(x, u, t, T, p).rate
     own = c["F"] - K @ c["M"] - (c["G"] - K @ c["Hu"]) @ C
     drift = ca.blockcat([[F, -G @ C], [K @ M, own - K @ Hu @ C]])
     noise = ca.diagcat(Q, K @ U @ K.T)

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
 from covocp.base.short_repr import short_repr
-from covocp.simulation.actual import System
+from covocp.simulation.actual import Linearised, System
 from covocp.simulation.flown import Flown
 from covocp.simulation.schedule import Coefficients, Estimator
 from covocp.solution.solution import Solution
@@ -151,15 +151,15 @@ def factor(covariance: Given) -> Any:
 
 def system_at(
     run: Run, system: System, augmented: tuple[Any, Any], u: Given, c: dict[str, Any], t: Given = None
-) -> Any:
-    """What `System.linear` returns for a state and unknowns; rows that no run has are those of the nominal."""
+) -> Linearised:
+    """What `System.model` gives for a state and unknowns; rows that no run has are those of the nominal."""
     x, unknowns = augmented
     design, parameters = run.setting.design, system.parameters
     state = part(ca.vertcat(x, part(c["x"], design.states)), 0, system.statement.nx)
     known = ca.DM(parameters[: parameters.size - system.unknowns])
     time = c["t"] if t is None else t
     duration = run.setting.solution.duration
-    return system.linear(state, part(u, 0, system.statement.nu), time, duration, ca.vertcat(known, unknowns))
+    return system.model(state, part(u, 0, system.statement.nu), time, duration, ca.vertcat(known, unknowns))
 
 
 def part(column: Given, first: int, last: int | None = None) -> Any:

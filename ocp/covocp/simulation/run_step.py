@@ -127,15 +127,15 @@ def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
     setting, design, x = run.setting, run.setting.design, z[run.spans["x"]]
     _, fed = control_of(run, z, c)
     u = ca.vertcat(fed, part(c["u"], design.fed_back))
-    rate, _, _, _, h, _, _, _ = system_at(run, setting.actual, (x, run.own), u, c)
+    actual = system_at(run, setting.actual, (x, run.own), u, c)
     moved = fed - part(c["u"], 0, design.fed_back)
-    parts = [part(rate, 0, design.states)]
+    parts = [part(actual.rate, 0, design.states)]
     if setting.flown:
-        parts += [run.symbolic.zeros(design.size), h]
+        parts += [run.symbolic.zeros(design.size), actual.h]
     elif setting.filter == "perturbation":
         parts.append(c["F"] @ z[run.spans["estimate"]] + c["G"] @ moved)
     else:
-        expected = system_at(run, design, estimate_of(run, z), u, c)[0]
+        expected = system_at(run, design, estimate_of(run, z), u, c).rate
         parts += [expected, run.symbolic.zeros(half_length(design.size))]
     if design.statement.loop is not None:
         known = ca.DM(setting.solution.parameters[: setting.solution.parameters.size - design.unknowns])
@@ -149,12 +149,12 @@ def _noise(run: Run, z: Given, u: Given, sides: list[dict[str, Any]], h: Given) 
     """Factor of the noise of x, per root second; below it that of what a law measures, (rows, noises of the motion)."""
     setting, design = run.setting, run.setting.design
     t = sides[0]["t"] + h / 2
-    _, _, _, Q, _, _, _, U = system_at(run, setting.actual, (z[run.spans["x"]], run.own), u, sides[0], t)
+    actual = system_at(run, setting.actual, (z[run.spans["x"]], run.own), u, sides[0], t)
     process = run.symbolic(design.states, len(run.noisy))
     if run.noisy:
-        process[run.noisy, :] = factor(Q[run.noisy, run.noisy])
+        process[run.noisy, :] = factor(actual.Q[run.noisy, run.noisy])
     if setting.flown and design.measured:
-        return ca.diagcat(process, ca.vertcat(run.symbolic(design.size, design.measured), factor(U)))
+        return ca.diagcat(process, ca.vertcat(run.symbolic(design.size, design.measured), factor(actual.U)))
     return process
 
 

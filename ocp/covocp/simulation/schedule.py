@@ -188,10 +188,9 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
     }
     step = symbolic.sym("step")
     if kind == "perturbation":
-        _, F, G, _, h, M, Hu, U = design.linear(x, u, t, T, p)
-        half = estimation_half(st, e)
-        parts |= {"K": kalman_gain(half, n, M, U), "F": F, "G": G, "M": M, "Hu": Hu, "h": h}
-        parts["early"] = early_gain(unpack_symbolic(half, n), M, U, step)
+        at, half = design.model(x, u, t, T, p), estimation_half(st, e)
+        parts |= {"K": kalman_gain(half, n, at.M, at.U), "F": at.F, "G": at.G, "M": at.M, "Hu": at.Hu, "h": at.h}
+        parts["early"] = early_gain(unpack_symbolic(half, n), at.M, at.U, step)
     shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
     assert shapes["C"] == (m, n)
     return Coefficients(

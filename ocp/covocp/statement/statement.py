@@ -102,6 +102,17 @@ class Conditions:
         return self.function.map(count)(at.x, at.u, seen, at.time, *rest)
 
 
+class LoopSlopes(NamedTuple):
+    """F (n, n), G (n, m), A (n, n), B (m, m), N (n, m), Q (n, n), see `Loop.expansion`."""
+
+    F: Expr
+    G: Expr
+    A: Expr
+    B: Expr
+    N: Expr
+    Q: Expr
+
+
 @dataclass(frozen=True, kw_only=True)
 class Loop:
     """What the feedback of an expected cost sees of the actual system along the nominal [Schmidt 6.2, 6.3].
@@ -126,6 +137,10 @@ class Loop:
     by_parts: ca.Function | None
 
     __repr__ = short_repr
+
+    def slopes(self, *point: Expr) -> LoopSlopes:
+        """What `expansion` gives at (state, control, time, duration, parameters), by name."""
+        return LoopSlopes(*self.expansion(*point))
 
 
 @dataclass(frozen=True, kw_only=True)

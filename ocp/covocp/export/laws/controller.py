@@ -202,7 +202,7 @@ def _predict(
     kind = design.symbolic if n <= SCALAR_SIZE else ca.MX
     own, error, du, dt = kind.sym("y", n), kind.sym("E", n, n), kind.sym("held", m), kind.sym("h")
     symbols = [[kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("t")] for _ in at]
-    slopes = [design.linear(*three)[:2] for three in symbols]
+    slopes = [design.model(*three)[:2] for three in symbols]
     (H1, g1), (H2, g2) = (
         (dt * (inverse @ F @ units), dt * (inverse @ (G @ (du - three[1][:m]))))
         for (F, G), three in zip(slopes, symbols, strict=True)
@@ -239,7 +239,8 @@ def _corrected(
     kind = design.symbolic if r <= SCALAR_SIZE else ca.MX
     y, held, measured, h = kind.sym("y", n), kind.sym("held", m), kind.sym("measurement", r), kind.sym("h")
     x, u, e, t = kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("e", st.ne), kind.sym("t")
-    _, _, expected, M, slope, U = design.linear(x, u, t)
+    model = design.model(x, u, t)
+    expected, M, slope, U = model.h, model.M, model.H, model.U
     E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
@@ -266,7 +267,8 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
     now = tables.at(at)
     F = ca.Function("nominal", [at], [now.x, now.u, now.e])
     x, u, e = (np.asarray(v.full()) for v in F.map(count)(known[None, :]))
-    _, _, expected, M, _, U = design.linear.map(count)(x, u, known[None, :])
+    model = design.model(x, u, known[None, :])
+    expected, M, U = model.h, model.M, model.U
     C, E = (np.asarray(v.full()) for v in design.gain.map(count)(x, u, e, known[None, :]))
     rows = np.zeros((count, sum(port.size for port in ports)))
     for k in range(count):

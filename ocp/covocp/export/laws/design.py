@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ExportError
-from covocp.base.expressions import Given
+from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
 from covocp.statement.statement import Block, Statement
+
+
+class DesignAt(NamedTuple):
+    """F (n, n), G (n, m), h (r,), M (r, n), slope of h by the control (r, m), noise density U (r, r)."""
+
+    F: Any
+    G: Any
+    h: Any
+    M: Any
+    H: Any
+    U: Any
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +68,11 @@ class Design:
 
     __repr__ = short_repr
 
+    def model(self, x: Expr, u: Expr, t: Expr) -> DesignAt:
+        """What `linear` gives at one point, or at a column of each for several, by name."""
+        columns = x.shape[1] if len(x.shape) > 1 else 1
+        return DesignAt(*(self.linear if columns == 1 else self.linear.map(columns))(x, u, t))
+
     @property
     def symbolic(self) -> Any:
         """SX, or MX where the model has no SX form."""
@@ -94,7 +110,7 @@ def design_of(solution: Solution, limits: Given) -> Design:
     sizes = (statement.nx, statement.nu, statement.ne, 1)
     x, u, e, t = (symbolic.sym(k, size) for k, size in zip("xuet", sizes, strict=True))
     rest = (t, solution.duration, ca.DM(solution.parameters))
-    F, G, A, B, N, Q = statement.loop.expansion(x, u, *rest)
+    F, G, A, B, N, Q = statement.loop.slopes(x, u, *rest)
     h, M, U = statement.measurement(x, u, *rest)
     slope = ca.jacobian(h, u)[:, :m]
     block = next(b for b in statement.matrices if b.estimation)

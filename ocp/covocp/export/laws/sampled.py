@@ -235,7 +235,7 @@ def _correlations(spreads: Array) -> Array:
 def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
     """x, u, e, h, M, H, U, C at the samples."""
     x, u, e = nominal_values(tables, t)
-    _, _, h, M, H, U = (stacked(v, t.size) for v in design.linear.map(t.size)(x.T, u.T, t[None, :]))
+    h, M, H, U = (stacked(v, t.size) for v in design.model(x.T, u.T, t[None, :])[2:])
     C = stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
     return x, u, e, h, M, H, U, C
 
