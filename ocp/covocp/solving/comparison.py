@@ -135,9 +135,7 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the same table, and the figure."""
-        from covocp.plot.embedding import embedded
-
-        return as_html(self._sections(), embedded(self.plot) if self.solutions else "")
+        return as_html(self._sections(), later("plot.embedding").embedded(self.plot) if self.solutions else "")
 
     def _sections(self) -> list[Section]:
         """The name, the table, why runs failed, and what the columns mean."""
