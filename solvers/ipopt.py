@@ -32,6 +32,7 @@ from covocp.solvers.reached import (
     residuals,
     similar,
 )
+from covocp.solvers.statuses import Status, status_of
 from covocp.statement.statement import Statement
 from covocp.transcription.domain import needs_exact_bounds
 from covocp.transcription.first_guess import starts
@@ -68,25 +69,8 @@ INSIDE: dict[str, dict[str, Any]] = {
     "free gain": {"mu_init": 1e-2, "bound_push": 1e-4, "bound_frac": 1e-4},
 }
 
-LOST = ("Infeasible_Problem_Detected", "Restoration_Failed", "Invalid_Number_Detected")
-
-MESSAGES = {
-    "Solve_Succeeded": "solved",
-    "Solved_To_Acceptable_Level": "solved to the acceptable level only: the tolerance asked for was not reached",
-    "Infeasible_Problem_Detected": "converged to a point of local infeasibility: the constraints may contradict",
-    "Maximum_Iterations_Exceeded": "stopped at the largest number of iterations: start closer, or allow more "
-    "(max_iterations=)",
-    "Restoration_Failed": "the restoration of feasibility failed: the constraints may contradict, or start elsewhere",
-    "User_Requested_Stop": "interrupted by the user",
-    "Diverging_Iterates": "the iterates diverge: the cost may be unbounded below; add bounds",
-    "Search_Direction_Becomes_Too_Small": "no further progress is possible at this accuracy",
-    "Invalid_Number_Detected": "the model became NaN or inf: add bounds that keep it in its domain",
-}
 NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
 
-
-# Endings of Ipopt at points that may be stationary, whether it says so or not.
-JUDGED = ("Solved_To_Acceptable_Level", "Search_Direction_Becomes_Too_Small")
 STALE = "the tolerance was met in the scales of the start, but not in those of the point that was reached"
 REMEDY = "start closer (guess=), or give the magnitudes of states and controls (scale=)"
 
@@ -273,7 +257,8 @@ class ShootingSolver:
     def _judged(self, nlp: NLP, point: Point, parameters: Array, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
         where = point.where
-        if not (point.success or point.status in JUDGED):
+        status = status_of(point.status)
+        if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
         assert self._cold is not None
         first = FirstOrder(nlp, self._cold, self._plugin)
@@ -338,7 +323,8 @@ class ShootingSolver:
         """Whether the run lost its way, as a count."""
         if self._monitor is not None and self._monitor.wandered:
             return {"wandered": STOPPED}
-        return {"wandered": ENDED} if status in LOST else {}
+        known = status_of(status)
+        return {"wandered": ENDED} if known is not None and known.lost else {}
 
     def _outcome(self, last: Round, parameters: Array, stats: dict[str, Any]) -> Outcome:
         """The iterate as data."""
@@ -362,14 +348,14 @@ class ShootingSolver:
 
     def _message(self, last: Round) -> str:
         """How the run ended, a sentence."""
-        status = last.point.status
+        status, known = last.point.status, status_of(last.point.status)
         if last.converged:
-            return MESSAGES.get(status, "solved") if last.point.success else "solved"
+            return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
         if last.residuals is not None and last.point.success:
             return f"{STALE}: {last.residuals}; {REMEDY}"
         if status.startswith(NOT_EVALUABLE.format("")):
             return status
-        return MESSAGES.get(status, f"{self._plugin} ended with the status '{status}'")
+        return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
     def _build(self, parameters: Array, guess: Guess, watched: bool) -> tuple[NLP, ca.Function]:
         """The NLP and its solver, made at the first call; a second solver shares the functions for warm starts.
