@@ -78,9 +78,9 @@ class Scenario:
     W: Array
     V: Array
     duration: float
+    """[s]"""
 
     __repr__ = short_repr
-    """[s]"""
 
 
 class Matrices(NamedTuple):

@@ -45,9 +45,9 @@ class Exact:
     v: Array
     """[m/s]"""
     theta: Array
+    """From the vertical [rad]."""
 
     __repr__ = short_repr
-    """From the vertical [rad]."""
 
 
 def problem() -> co.Problem:

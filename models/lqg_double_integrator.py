@@ -78,9 +78,9 @@ class Exact:
     cost: float
     """Expected cost."""
     nominal_cost: float
+    """What it would be without noise and with an exact initial estimate."""
 
     __repr__ = short_repr
-    """What it would be without noise and with an exact initial estimate."""
 
 
 def sampled(step: float = STEP) -> Sampled:

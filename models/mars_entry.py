@@ -136,9 +136,9 @@ class Atmosphere:
     density: Array
     """[slug/ft^3]"""
     scale_height: Array
+    """H [ft]: d ln(rho)/dh = -1/H."""
 
     __repr__ = short_repr
-    """H [ft]: d ln(rho)/dh = -1/H."""
 
     def density_at(self, altitude: npt.ArrayLike) -> Array:
         """Density [slug/ft^3] at some altitudes [ft], its logarithm linear between the nodes and beyond them."""

@@ -50,9 +50,9 @@ class Exact:
     energy: float
     """Integral of u^2/2."""
     arc: float
+    """The time t1 at which x leaves zero."""
 
     __repr__ = short_repr
-    """The time t1 at which x leaves zero."""
 
 
 def problem(terminal_weight: float = 0.0, integral_weight: float = 0.0) -> co.Problem:

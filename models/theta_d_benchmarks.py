@@ -62,9 +62,9 @@ class Exact:
     cost: Array
     """V, (samples,)."""
     control: Array
+    """(samples, m)"""
 
     __repr__ = short_repr
-    """(samples, m)"""
 
 
 SYSTEMS = ("cubic", "arctangent", "rational", "rational_split", "van_der_pol", "two_inputs")

@@ -83,9 +83,9 @@ class Exact:
     hamiltonian: float
     cost: float
     energy: float
+    """Integral of u^2/2."""
 
     __repr__ = short_repr
-    """Integral of u^2/2."""
 
 
 def problem(
