@@ -58,6 +58,7 @@ __all__ = [
     "simulate",
     "MonteCarlo",
     "simulate_law",
+    "simulate_sampled",
     "LawSimulation",
     "export_c",
     "CPackage",
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
     from covocp.simulation import simulate as simulate
     from covocp.simulation.laws import LawSimulation as LawSimulation
     from covocp.simulation.laws import simulate_law as simulate_law
+    from covocp.simulation.sampled_loop import simulate_sampled as simulate_sampled
     from covocp.solving.comparison import Comparison as Comparison
     from covocp.solving.comparison import compare as compare
     from covocp.solving.loading import load as load
@@ -100,6 +102,7 @@ else:
         "export_c": "covocp.export",
         "LawSimulation": "covocp.simulation.laws",
         "simulate_law": "covocp.simulation.laws",
+        "simulate_sampled": "covocp.simulation.sampled_loop",
         "MonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
         "Worth": "covocp.analysis.combined_gain",

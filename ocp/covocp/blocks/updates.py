@@ -246,7 +246,7 @@ def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
         h, r = rows[i : i + 1, :], variances[i, 0]
         seen = P @ h.T
         spread = (h @ seen)[0, 0] + r
-        _check_divisor(spread)
+        check_divisor(spread)
         k = seen / spread
         step = step + k * (residual[i, 0] - (h @ step)[0, 0])
         left = P - k @ seen.T
@@ -254,7 +254,7 @@ def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     return step, P
 
 
-def _check_divisor(spread: Expr) -> None:
+def check_divisor(spread: Expr) -> None:
     """A row without noise of something that is known exactly has no update."""
     if not isinstance(spread, ca.SX) and not spread > 0.0:
         definite_solve(np.atleast_2d(spread), np.atleast_2d(spread), "covariance of the innovation, H P H' + R,")

@@ -1,0 +1,57 @@
+"""A casadi.Function that says by name which of its numeric arguments does not fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.blocks.values import array, is_symbolic, wrong_argument
+
+
+class CheckedFunction(ca.Function):
+    """A function of dense columns whose numbers are looked at before it is evaluated.
+
+    Columns must be finite and of the right length, given as numbers, flat arrays or columns; those named in `gaps` may
+    hold NaN, which stands for a missing reading. Expressions go through as to any casadi.Function. The result is a flat
+    array, or a tuple of them, where all arguments are numbers.
+    """
+
+    def __init__(self, function: ca.Function, gaps: tuple[str, ...] = ()) -> None:
+        """A copy of the function; `gaps`: names of the inputs that may be missing."""
+        super().__init__(function)
+        self.gaps = gaps
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """The value of the function.
+
+        Raises:
+            ProblemError: numbers of another size, NaN, or infinite ones, by the name of the argument.
+        """
+        given = dict(zip(self.name_in(), arguments, strict=False)) | named
+        if len(given) != self.n_in() or len(arguments) > self.n_in() or is_symbolic(*given.values()):
+            return super().__call__(*arguments, **named)
+        columns = [self._column(name, given[name]) for name in self.name_in() if name in given]
+        results = [value.full().ravel() for value in self.call(columns)]
+        return results[0] if len(results) == 1 else tuple(results)
+
+    def _column(self, name: str, value: Expr) -> Any:
+        """One argument, checked."""
+        numbers, size = array(name, value), self.size1_in(name)
+        if numbers.size != size or (numbers.ndim == 2 and size not in numbers.shape) or numbers.ndim > 2:
+            received = f"{numbers.size}" if numbers.ndim < 2 else " x ".join(str(count) for count in numbers.shape)
+            raise wrong_argument(name, f"{size} number{'s' if size > 1 else ''}", received)
+        if np.isinf(numbers).any() or (name not in self.gaps and np.isnan(numbers).any()):
+            expected = "finite numbers" + (", or NaN where the reading is missing" if name in self.gaps else "")
+            raise wrong_argument(name, expected, f"{numbers.ravel()}"[:100])
+        return ca.DM(numbers.ravel())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies keep what may be missing."""
+        return _restored, (self.serialize(), self.gaps)
+
+
+def _restored(text: str, gaps: tuple[str, ...]) -> CheckedFunction:
+    return CheckedFunction(ca.Function.deserialize(text), gaps)
