@@ -17,10 +17,10 @@ from covocp.blocks import kalman
 
 
 @FIXED
-@given(seed=SEEDS, size=st.integers(1, 4), count=st.integers(1, 4))
-def test_update_solves_the_least_squares_problem(seed, size, count):
+@given(seed=SEEDS, size=st.integers(1, 4), count=st.integers(1, 4), form=st.sampled_from(["array", "sequential"]))
+def test_update_solves_the_least_squares_problem(seed, size, count, form):
     x, P, y, rows, R = random_filter(seed, size, count)
-    estimate, lower = kalman.update_factor(x, kalman.factor(P), y, rows, kalman.factor(R))
+    estimate, lower = kalman.update_factor(x, kalman.factor(P), y, rows, kalman.factor(R), form=form)
     expected = least_squares(x, P, y, rows, R)
     np.testing.assert_allclose(estimate, expected[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(lower @ lower.T, expected[1], rtol=1e-9, atol=1e-9)

@@ -192,7 +192,7 @@ def spread(name: str, value: Expr, size: int) -> Any:
         return weight(name, ca.diag(value) if value.shape == (size, 1) and size > 1 else value, size)
     numbers = array(name, value)
     if numbers.ndim == 0:
-        numbers = numbers * np.eye(size)
+        numbers = np.diag(np.full(size, numbers))
     elif numbers.shape == (size,):
         numbers = np.diag(numbers)
     if numbers.shape != (size, size):
