@@ -21,7 +21,7 @@ The aileron of this condition is weak, C_l = 0.01 takes 42 deg: its column is fi
 and spoilers together, and C_l = 0.01 takes 8.4 deg. It is a choice of unit.
 
 Tracker, every 0.1 s: c = -K (x - x_c, z), where x_c is zero but for the commanded y_c and h_c, and z are the sums of
-0.1 s times y - y_c, h - h_c, u, phi. K by the discrete Riccati equation; 15 states, largest modulus in closed loop 0.9835.
+0.1 s times y - y_c, h - h_c, u, phi. K is by the discrete Riccati equation; of 15 modes the slowest has modulus 0.9835.
 
 Sources: B. Etkin, L. D. Reid, Dynamics of flight, 3rd ed., Wiley 1996, equations (4.9,18) and (4.9,19), chapters 6
 (derivatives) and 7 (controls); its data are those of R. K. Heffley, W. F. Jewell, NASA CR-2144, 1972. The form of the
@@ -191,28 +191,30 @@ def tracker(step: float = STEP, *, roll_effectors: float = ROLL_EFFECTORS) -> Tr
     )
 
 
-def trimmed(tracker: Tracker, rolling_moment: float, position: npt.ArrayLike = (0.0, 0.0)) -> Trim:
+def trimmed(tracker: Tracker, rolling_moment: float | Array, position: npt.ArrayLike = (0.0, 0.0)) -> Trim:
     """Steady flight under a rolling moment, wings level, in closed loop: states, sums and controls that stay.
 
     Args:
         tracker: whose sums hold the controls.
-        rolling_moment: C_l by the vortices at the position.
+        rolling_moment: C_l by the vortices at the position, one number.
         position: (y, h), which is commanded too, shape (2,) [m].
 
     Raises:
         ProblemError: a moment or a position that is not finite numbers.
     """
-    fits = np.shape(position) == (2,) and all(is_number(float(value)) for value in np.asarray(position).ravel())
-    check_argument("trimmed()", "position", lambda _: "" if fits else "two finite numbers, y and h", position)
-    check_argument(
-        "trimmed()", "rolling_moment", lambda v: "" if is_number(v) else "a finite number", float(rolling_moment)
+    moment = (
+        rolling_moment.item() if isinstance(rolling_moment, np.ndarray) and rolling_moment.size == 1 else rolling_moment
     )
+    check_argument("trimmed()", "rolling_moment", lambda v: "" if is_number(v) else "a finite number", moment)
+    at = np.asarray(position, dtype=object)
+    fits = at.shape == (2,) and all(is_number(value) for value in at)
+    check_argument("trimmed()", "position", lambda _: "" if fits else "two finite numbers, y and h", position)
     A, B, vortex = tracker.model
     system = np.block([[A - np.eye(11), B], [_selection(), np.zeros((4, 4))]])
-    steady = np.linalg.solve(system, np.concatenate([-vortex[:, 0] * float(rolling_moment), np.zeros(4)]))
+    steady = np.linalg.solve(system, np.concatenate([-vortex[:, 0] * moment, np.zeros(4)]))
     state, controls = steady[:11], steady[11:]
     sums = -np.linalg.solve(tracker.gain[:, 11:], controls + tracker.gain[:, :11] @ state)
-    state[-2:] += np.asarray(position, dtype=float)
+    state[-2:] += at.astype(float)
     return Trim(state=_frozen(state), sums=_frozen(sums), controls=_frozen(controls))
 
 
