@@ -202,9 +202,8 @@ def trimmed(tracker: Tracker, rolling_moment: float | Array, position: npt.Array
     Raises:
         ProblemError: a moment or a position that is not finite numbers.
     """
-    moment = (
-        rolling_moment.item() if isinstance(rolling_moment, np.ndarray) and rolling_moment.size == 1 else rolling_moment
-    )
+    single = isinstance(rolling_moment, np.ndarray) and rolling_moment.size == 1  # as a table gives it
+    moment = np.asarray(rolling_moment).item() if single else rolling_moment
     check_argument("trimmed()", "rolling_moment", lambda v: "" if is_number(v) else "a finite number", moment)
     at = np.asarray(position, dtype=object)
     fits = at.shape == (2,) and all(is_number(value) for value in at)
