@@ -17,8 +17,8 @@ over the chord):
 
 Far downstream, in the Trefftz plane, the trailing lines are doubly infinite and induce w_T, twice what the wing itself
 feels; w is felt in full (Munk). The wake of a leader far ahead is such lines too: by Munk's stagger theorem the sum of
-both drags does not depend on the distance. Its viscous core is that of Burnham and Hallock, w = -Gamma/(2 pi)
-dy/(dy^2 + dz^2 + r^2).
+both drags does not depend on the distance. The viscous core of a line is that of Burnham and Hallock; one that lifts
+the air on its right, as a right wing tip's does, has w = Gamma/(2 pi) dy/(dy^2 + dz^2 + r^2).
 
 Axes: x downstream, y to the right, z upward; angles in radians, the free stream is one, so that circulations are
 lengths. Incompressible, without camber, twist, thickness and friction; wakes stay flat unless `rolled_up`.
@@ -330,7 +330,7 @@ def upwash(wake: Wake, y: npt.ArrayLike, height: npt.ArrayLike) -> Array:
         height: above the wake [m]; of y's shape, or one that fits to it.
 
     Returns:
-        w = 1/(2 pi) sum_k Gamma_k dy_k/(dy_k^2 + height^2 + r^2), of the common shape; infinite on a line without core.
+        w = 1/(2 pi) sum_k Gamma_k dy_k/(dy_k^2 + height^2 + r^2), of the common shape; NaN on a line without core.
     """
     at, above = np.broadcast_arrays(np.asarray(y, dtype=float), np.asarray(height, dtype=float))
     w, fixed = np.zeros(at.shape), above**2 + wake.core**2
