@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import covocp as co
+from covocp.base.arguments import checked, is_number, one_of, positive, whole
 from covocp.base.short_repr import short_repr
 from covocp.blocks import kalman, peak_seeking
 
@@ -163,7 +164,7 @@ class LineRuns:
         times = self.arrival()
         reached = times[np.isfinite(times)]
         arrivals.hist(reached, bins=np.arange(0.0, self.t[-1] + PERIOD, PERIOD))
-        arrivals.set(xlabel="first time within 0.25 m of the minimum [s]", ylabel="runs")
+        arrivals.set(xlabel="first time within 0.25 m of the minimum [s]", ylabel="runs", xlim=(0.0, self.t[-1]))
         arrivals.set_title(f"{reached.size} of {times.size} runs", fontsize="medium", loc="right")
         for axes in panels[:4]:
             axes.set(xlim=(0.0, self.t[-1]), xlabel="t [s]")
@@ -195,6 +196,27 @@ class LineRuns:
                 axes.set_ylim(-2.0 * span, 2.0 * span)
 
 
+def _is_row(value: Any) -> str:
+    """A number or numbers in a row."""
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        return "finite numbers"
+    return "" if numbers.ndim == 1 and np.isfinite(numbers).all() else "finite numbers in a row"
+
+
+def _number(value: Any) -> str:
+    return "" if is_number(value) else "a finite number"
+
+
+@checked(
+    start=_number,
+    initial_steps=_is_row,
+    runs=whole(1, 10**6),
+    excitation=_number,
+    rate=positive,
+    settings=one_of("recommended", "printed"),
+)
 def simulate(
     start: float = 0.0,
     initial_steps: npt.ArrayLike = (15.0, 15.0, 15.0),
@@ -226,15 +248,8 @@ def simulate(
     Raises:
         ProblemError: an argument does not fit.
     """
-    known = {"recommended": RECOMMENDED, "printed": PRINTED}
-    if settings not in known:
-        raise co.ProblemError(
-            "The settings are unknown.",
-            expected="'recommended' or 'printed'",
-            received=repr(settings),
-            remedy="choose one of them, and change single arguments by name",
-        )
-    law = peak_seeking.seeker(1, **(known[settings] | changes))
+    known = {"recommended": RECOMMENDED, "printed": PRINTED}[settings]
+    law = peak_seeking.seeker(1, **(known | changes))
     steps = np.atleast_1d(np.asarray(initial_steps, dtype=float))
     begin = float(start) / GAIN
     found = co.simulate_sampled(
