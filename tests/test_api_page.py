@@ -38,7 +38,16 @@ MET = {
 }
 # By the user: their data are set on construction.
 MADE = ("Free", "Gain", "Problem", "Solver", "SolveError", "Interrupted")
-HELD = ("Solution", "MonteCarlo", "CPackage", "Comparison", "Certificate", "Worth", "LawSimulation")
+HELD = (
+    "Solution",
+    "MonteCarlo",
+    "CPackage",
+    "Comparison",
+    "Certificate",
+    "Worth",
+    "LawSimulation",
+    "SampledSimulation",
+)
 
 
 def listed(section: str) -> list[str]:

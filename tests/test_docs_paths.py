@@ -66,7 +66,9 @@ def test_the_reference_has_every_public_name_model_and_block():
     documented = set(re.findall(r"auto\w+:: ([\w.]+)", REFERENCE))
     wanted = {f"covocp.{name}" for name in co.__all__}
     wanted |= {f"covocp.models.{path.stem}" for path in (ROOT / "models").glob("*.py") if path.stem != "__init__"}
-    wanted |= {f"covocp.blocks.{name}" for name in ("kalman", "riccati", "theta_d", "theta_d_series", "sdre")}
+    wanted |= {
+        f"covocp.blocks.{name}" for name in ("kalman", "riccati", "theta_d", "theta_d_series", "sdre", "peak_seeking")
+    }
     assert wanted <= documented
 
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 import covocp as co
-from covocp.blocks import kalman, riccati, theta_d
+from covocp.blocks import kalman, peak_seeking, riccati, theta_d
 from covocp.simulation.laws import extended_filter, gain_filter
 from covocp.solving.solver import method_options
 from covocp.transcription.mesh import Options
@@ -267,6 +267,32 @@ def results() -> Iterator[tuple[str, str, Call]]:
         yield "load", argument, call
 
 
+def sampled_simulations() -> Iterator[tuple[str, str, Call]]:
+    """Of the loop at two rates, and of the law that flies in it."""
+    x, held, t, none = ca.SX.sym("x"), ca.SX.sym("held"), ca.SX.sym("t"), ca.SX.sym("none", 0)
+    seeker = peak_seeking.seeker(**SEEKER)
+    loop = {
+        "plant": ca.Function("plant", [x, held, t, none], [held - x]),
+        "sensor": ca.Function("sensor", [x, t, none], [ca.vertcat(x, x**2)]),
+        "law": seeker.law(),
+    }
+    times = {"initial": [1.0], "memory": seeker.initial(), "held": 0.0, "step": 0.5, "period": 1.0, "duration": 2.0}
+    for argument, call in called(co.simulate_sampled, **loop, **times, runs=2, seed=0, average=True, every=1):
+        yield "simulate_sampled", argument, call
+    for argument, call in called(peak_seeking.seeker, **SEEKER):
+        yield "seeker", argument, call
+    reading = {"memory": seeker.initial(), "position": 1.0, "value": 2.0}
+    for argument in reading:
+        yield "Seeker.update", argument, lambda v, n=argument: seeker.update(**{**reading, n: v})
+
+
+SEEKER: dict[str, Any] = {
+    "n": 1, "window": 3, "noise": 1.0, "drift": 0.1, "prior_covariance": 1.0, "prior": [0.0, 0.0], "start": 1,
+    "transport": True, "reuse": True, "newton": "plain", "smallest_curvature": 0.1, "largest_step": 1.0,
+    "descent_gain": 1.0, "switch": 1.0, "definite": True, "maximum": False, "position_noise": 0.0,
+}  # fmt: skip
+
+
 def simulations() -> Iterator[tuple[str, str, Call]]:
     """Of what simulates."""
     closed = made()["closed"]
@@ -292,6 +318,7 @@ def simulations() -> Iterator[tuple[str, str, Call]]:
     noisy = {**valid, "runs": 2, "step": 0.25}
     for argument in ("runs", "step", "process_noise", "measurement_noise", "seed", "observer", "law", "running"):
         yield "simulate_law with noise", argument, lambda v, n=argument: co.simulate_law(**{**noisy, n: v})
+    yield from sampled_simulations()
     eye = np.eye(1)
     for argument, call in called(gain_filter, dynamics=plant, gain=lambda x, t: eye, H=eye, initial=[0.0]):
         yield "gain_filter", argument, call

@@ -59,7 +59,15 @@ GALLERY = (
         "blocks",
         "Laws by themselves",
         "Filters and laws from `covocp.blocks`, in simulations of their own.",
-        ("theta_d_regulation", "theta_d_tracking", "gain_scheduling", "adaptive_regulator", "model_reference"),
+        (
+            "theta_d_regulation",
+            "theta_d_tracking",
+            "gain_scheduling",
+            "adaptive_regulator",
+            "model_reference",
+            "peak_seeking_line",
+            "formation_flight",
+        ),
     ),
     (
         "c",
@@ -71,6 +79,7 @@ GALLERY = (
             "export_replanning",
             "export_kalman_dropouts",
             "export_theta_d",
+            "export_peak_seeker",
         ),
     ),
 )

@@ -13,9 +13,9 @@
 To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback); expressions are
 CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several methods), `evaluate` (a given control),
 `methods`. To judge a solution: `certify` (is it the global minimum?), `worth` (does the combined design pay?),
-`simulate` (Monte Carlo of the actual system), `simulate_law`. To keep and to fly it: `Solution.save`, `load`,
-`export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`, `SolveError` and
-`ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
+`simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To keep and to fly it:
+`Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`,
+`SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
 
 `help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
 """
@@ -59,6 +59,7 @@ __all__ = [
     "MonteCarlo",
     "simulate_law",
     "simulate_sampled",
+    "SampledSimulation",
     "LawSimulation",
     "export_c",
     "CPackage",
@@ -85,6 +86,7 @@ if TYPE_CHECKING:
     from covocp.simulation import simulate as simulate
     from covocp.simulation.laws import LawSimulation as LawSimulation
     from covocp.simulation.laws import simulate_law as simulate_law
+    from covocp.simulation.sampled_loop import SampledSimulation as SampledSimulation
     from covocp.simulation.sampled_loop import simulate_sampled as simulate_sampled
     from covocp.solving.comparison import Comparison as Comparison
     from covocp.solving.comparison import compare as compare
@@ -103,6 +105,7 @@ else:
         "LawSimulation": "covocp.simulation.laws",
         "simulate_law": "covocp.simulation.laws",
         "simulate_sampled": "covocp.simulation.sampled_loop",
+        "SampledSimulation": "covocp.simulation.sampled_loop",
         "MonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
         "Worth": "covocp.analysis.combined_gain",

@@ -28,10 +28,16 @@ class CheckedFunction(ca.Function):
         """The value of the function.
 
         Raises:
-            ProblemError: numbers of another size, NaN, or infinite ones, by the name of the argument.
+            ProblemError: another size, NaN, or infinite numbers, by the name of the argument.
         """
         given = dict(zip(self.name_in(), arguments, strict=False)) | named
-        if len(given) != self.n_in() or len(arguments) > self.n_in() or is_symbolic(*given.values()):
+        if len(given) != self.n_in() or len(arguments) > self.n_in():
+            return super().__call__(*arguments, **named)
+        if is_symbolic(*given.values()):
+            for name, value in given.items():
+                if is_symbolic(value) and name in self.name_in() and value.numel() != self.size1_in(name):
+                    received = " x ".join(str(count) for count in value.shape)
+                    raise wrong_argument(name, f"{self.size1_in(name)} x 1", received)
             return super().__call__(*arguments, **named)
         columns = [self._column(name, given[name]) for name in self.name_in() if name in given]
         results = [value.full().ravel() for value in self.call(columns)]

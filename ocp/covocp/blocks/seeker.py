@@ -211,6 +211,9 @@ class _Settings:
     switch=optional(positive),
     definite=truth,
     maximum=truth,
+    position_noise=lambda value: (
+        "" if is_number(value) and 0 <= value <= LARGEST else f"a number from 0 to {LARGEST:g}"
+    ),
 )
 def seeker(
     n: int,
@@ -276,8 +279,6 @@ def seeker(
             f"give window={first} or more, or a prior and start=1",
         )  # fmt: skip
     _check_step(newton, smallest_curvature, largest_step, descent_gain, switch, definite)
-    if positive(position_noise) and position_noise != 0:
-        raise wrong_argument("position_noise", "a finite number >= 0", repr(position_noise))
     settings = _Settings(
         inputs=int(n),
         window=int(window),

@@ -29,6 +29,8 @@ SampledLaw = Callable[..., Any]
 
 # A run with an entry beyond this has diverged.
 LARGEST = 1e12
+# Periods in a run, and steps in a period, at most.
+MOST = 1e7
 # Relative deviation of a ratio of times from a whole number that is rounding.
 WHOLE = 1e-9
 
@@ -235,7 +237,7 @@ def _answer(law: SampledLaw, memory: Array, measured: Array, time: float, held: 
     try:
         new, answer = law(memory.copy(), measured.copy(), time)
         pair = np.ravel(values.array("memory", new)), np.ravel(values.array("held", answer))
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # whatever a function of the user raises
         raise _wrong_law(f"{type(error).__name__}: {error}"[:200], memory.size, held.shape[0]) from error
     if pair[0].size != memory.size or pair[1].size != held.shape[0]:
         raise _wrong_law(f"{pair[0].size} and {pair[1].size} numbers", memory.size, held.shape[0])
@@ -258,9 +260,9 @@ def _ratio(longer: str, long: float, shorter: str, short: float) -> int:
         ProblemError: not a whole number of times.
     """
     ratio = float(long) / float(short)
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE * ratio:
+    if not 0.5 < ratio < MOST or abs(ratio - round(ratio)) > WHOLE * ratio:
         received = f"{longer}={long}, {shorter}={short}: {ratio:.6g} times"
-        raise values.wrong_argument(longer, f"a whole number of {shorter}s", received)
+        raise values.wrong_argument(longer, f"a whole number of {shorter}s, less than {MOST:g}", received)
     return round(ratio)
 
 
