@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -24,20 +25,36 @@ STOPPED, ENDED = "stopped", "ended"
 
 @dataclass(frozen=True, kw_only=True)
 class Extremal:
-    """Trajectory, multipliers, and what is needed to evaluate anything along them."""
+    """Trajectory, multipliers, and what is needed to evaluate anything along them.
 
-    statement: Statement
+    stated: the problem; None where it was read from a file without its problem.
+    """
+
     mesh: Mesh
     trajectory: Trajectory
-    parameters: Array
+    parameters: Annotated[Array, "p"]
     multipliers: Multipliers
+    stated: Statement | None = None
 
     __repr__ = short_repr
 
     @property
+    def statement(self) -> Statement:
+        """The problem.
+
+        Raises:
+            CovocpError: it is not known.
+        """
+        if self.stated is None:
+            raise CovocpError(
+                "This solution was read from a file and knows no problem: use load(path, problem=...) for this."
+            )
+        return self.stated
+
+    @property
     def time(self) -> Array:
         """Times of the nodes [s]."""
-        return self.mesh.nodes * self.trajectory.duration
+        return np.asarray(self.mesh.nodes * self.trajectory.duration)
 
     @property
     def controls(self) -> Array:

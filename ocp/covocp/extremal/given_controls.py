@@ -56,7 +56,7 @@ def evaluate_controls(
     trajectory = Trajectory(x=at_nodes.T, u=u, e=halves.T, duration=duration)
     terminal = float(statement.terminal(trajectory.x[-1], trajectory.e[-1], duration, parameters))
     extremal = Extremal(
-        statement=statement,
+        stated=statement,
         mesh=mesh,
         trajectory=trajectory,
         parameters=parameters,

@@ -11,7 +11,7 @@ import numpy as np
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError, SolveError, warn_user
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, read_only
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
 from covocp.simulation.actual import System, actual_system, design_system
@@ -317,9 +317,7 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     values["numbers"] = np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches])
     for name in ("asking", "violating"):
         values[name] = np.sum([getattr(batch, name) for batch in batches], axis=0) / values["numbers"].size
-    for array in values.values():
-        array.setflags(write=False)
-    return {**values, "moments": moments_of(batches)}
+    return {**read_only(values), "moments": moments_of(batches)}
 
 
 def _predicted_costs(solution: Solution, truth: Given) -> tuple[float, float]:

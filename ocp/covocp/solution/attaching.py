@@ -41,8 +41,7 @@ def attached(solution: Solution, statement: Statement) -> Solution:
             f"Whether '{statement.name}' is the problem of the stored solution is known at the points kept in the file "
             "only: there all equations agree, but pieces or tables in them are written otherwise."
         )
-    whole = replace(solution, statement=statement)
-    return _with_violations(whole)
+    return _with_violations(replace(solution, extremal=replace(solution.extremal, stated=statement)))
 
 
 def _other_casadi(solution: Solution) -> bool:
@@ -93,8 +92,7 @@ def _contradictions(solution: Solution, statement: Statement) -> list[Difference
     for name, old, new in zip(statement.state_names, solution.targets, targets, strict=True):
         if not np.isclose(old, new, rtol=SAME_RATES, atol=0.0, equal_nan=True):
             return [Difference(what=f"the final value of '{name}'", stored=f"{old:g}", given=f"{new:g}")]
-    along = replace(solution, statement=statement).extremal
-    rates, _ = rates_along(along)
+    rates, _ = rates_along(replace(solution.extremal, stated=statement))
     scale = np.abs(solution.rates).max(axis=0, initial=0.0)
     error = np.abs(rates - solution.rates) > SAME_RATES * np.maximum(scale, np.finfo(float).tiny)
     if error.any():
