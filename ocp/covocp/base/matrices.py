@@ -152,3 +152,8 @@ def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERAN
         return False
     values = np.linalg.eigvalsh(full)
     return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
+
+
+def standard_deviations(covariances: ArrayLike) -> Array:
+    """Roots of the diagonals of covariances of shape (..., n, n), (..., n); what roundoff left below zero is zero."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1).clip(0.0)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
@@ -14,7 +14,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import Interval
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.trajectory import Multipliers, Trajectory
@@ -73,6 +73,15 @@ class Extremal:
             np.full((1, count), self.trajectory.duration),
             np.tile(self.parameters[:, None], (1, count)),
         )
+
+    def inequalities(self) -> Iterator[tuple[Conditions, str, Array]]:
+        """Those of the statement that are there, their place, and their values at the nodes of it, (nodes, rows)."""
+        st, columns = self.statement, [np.asarray(column) for column in self.columns()]
+        for place, nodes in (("path", slice(None)), ("start", slice(1)), ("end", slice(-1, None))):
+            conditions: Conditions = getattr(st, place)
+            if conditions.size:
+                chosen = [column[:, nodes] for column in columns]
+                yield conditions, place, np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
 
     @property
     def intervals(self) -> Interval:

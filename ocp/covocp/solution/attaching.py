@@ -32,20 +32,16 @@ def attached(solution: Solution, statement: Statement) -> Solution:
     Raises:
         ProblemError: it is the solution of another problem (says what differs).
     """
-    found = _differences(solution, statement)
-    written_elsewhere = solution.stored_problem is not None and only_switches(found)
-    if found and not (written_elsewhere and _other_casadi(solution)):
+    found, kept = _differences(solution, statement), solution.stored_problem
+    written_elsewhere = kept is not None and kept.casadi != ca.CasadiMeta.version()
+    if found and not (written_elsewhere and only_switches(found)):
         raise _of_another(solution, statement, found)
-    if found or (solution.stored_problem is not None and unlike_text(solution.stored_problem, statement)):
+    if found or (kept is not None and unlike_text(kept, statement)):
         warn_user(
             f"Whether '{statement.name}' is the problem of the stored solution is known at the points kept in the file "
             "only: there all equations agree, but pieces or tables in them are written otherwise."
         )
     return _with_violations(replace(solution, extremal=replace(solution.extremal, stated=statement)))
-
-
-def _other_casadi(solution: Solution) -> bool:
-    return solution.stored_problem is not None and solution.stored_problem.casadi != ca.CasadiMeta.version()
 
 
 def _of_another(solution: Solution, statement: Statement, found: list[Difference]) -> ProblemError:
