@@ -242,8 +242,7 @@ def _tell(harvest: Harvest, runs: int) -> None:
     if harvest.interrupted:
         if not done:
             raise KeyboardInterrupt
-        message = f"Interrupted: {done} of {runs} runs were simulated."
-        warn_user(message)
+        warn_user(f"Interrupted: {done} of {runs} runs were simulated.")
     if not harvest.failures:
         return
     listed = "".join(f"\n  {failure}" for failure in harvest.failures[:10])
@@ -286,7 +285,7 @@ def _result(
         predicted_error=true.error,
         predicted_mean=true.mean[:, : design.size],
         predicted_control=control_spread(solution, design, true, nominal),
-        intended=_intended(solution, design),
+        intended=np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy(),
         design=expected.deviation,
         design_error=expected.error,
         design_cost=costs[0],
@@ -302,11 +301,6 @@ def _result(
         augmented=design.statement.augmented,
         symbols=design.statement.symbols,
     )
-
-
-def _intended(solution: Solution, design: System) -> Array:
-    """Mean squares of the deviations at the end that the solution promises; NaN where nothing is fed back."""
-    return np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy()
 
 
 def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from covocp.base.matrices import Array, pack, standard_deviations
 from covocp.extremal.closed_loop import covariances_along, loop_substeps
-from covocp.extremal.extremal import Extremal
 from covocp.solution.solution import Solution
 
 # A deviation below this share of its largest predicted one counts as that share: what starts known is known.
@@ -72,8 +71,7 @@ def interpolated_flight(solution: Solution) -> Flight:
         solution: with a loop and its problem.
     """
     assert solution.loop is not None
-    extremal = solution.extremal
-    flown = covariances_along(extremal, _interpolated(solution, extremal))
+    flown = covariances_along(solution.extremal, _interpolated(solution))
     return compared(solution, flown, solution.loop.X, solution.t)
 
 
@@ -97,9 +95,9 @@ def compared(solution: Solution, flown: Array, predicted: Array, t: Array, small
     )
 
 
-def _interpolated(solution: Solution, extremal: Extremal) -> Array:
+def _interpolated(solution: Solution) -> Array:
     """x and half-vectors at equal parts of the intervals, (N, m + 1, size), as `Solution.at` has them."""
-    nodes, m = solution.t, loop_substeps(extremal)
+    nodes, m = solution.t, loop_substeps(solution.extremal)
     c = np.arange(m + 1) / m
     t = nodes[:-1, None] + np.diff(nodes)[:, None] * c
     t[:, -1] = nodes[1:]
