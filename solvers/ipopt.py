@@ -331,7 +331,7 @@ class ShootingSolver:
         nlp, point = last.nlp, last.point
         trajectory, values = last.where
         extremal = Extremal(
-            statement=self._statement,
+            stated=self._statement,
             mesh=self._mesh,
             trajectory=trajectory,
             parameters=parameters,

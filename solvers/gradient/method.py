@@ -237,7 +237,7 @@ class GradientSolver:
         run = last.run
         return Outcome(
             extremal=Extremal(
-                statement=self._statement,
+                stated=self._statement,
                 mesh=self._mesh,
                 trajectory=self._trajectory(last),
                 parameters=space.parameters,

@@ -313,7 +313,8 @@ def test_zero_control_is_certified_below_the_threshold_and_a_saddle_above_it() -
     certificate = co.certify(still)
     assert certificate.certified, str(certificate)
     assert certificate.smallest_eigenvalue == pytest.approx(1 - 50 * 0.04 * EIGENVALUE, abs=1e-5)
-    saddle = replace(still, parameters=np.array([10.0, 1.0]), cost_terms={"terminal": 50.0, "running": 0.0})
+    extremal = replace(still.extremal, parameters=np.array([10.0, 1.0]))
+    saddle = replace(still, extremal=extremal, cost_terms={"terminal": 50.0, "running": 0.0})
     certificate = co.certify(saddle)
     assert certificate.verdict == "not certified"
     assert certificate.smallest_eigenvalue == pytest.approx(1 - 500 * EIGENVALUE, rel=1e-6)

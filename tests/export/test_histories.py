@@ -88,7 +88,8 @@ def test_a_covariance_stays_semidefinite_where_its_cubic_would_not():
 def test_a_solution_that_is_not_finite_is_refused():
     x = open_lag().trajectory.x.copy()
     x[3] = np.nan
-    broken = replace(open_lag(), trajectory=replace(open_lag().trajectory, x=x))
+    extremal = replace(open_lag().extremal, trajectory=replace(open_lag().trajectory, x=x))
+    broken = replace(open_lag(), extremal=extremal)
     with pytest.raises(co.ExportError, match="NaN or infinite"):
         export_c(broken, FOLDER / "not_finite")
     assert not (FOLDER / "not_finite").exists()

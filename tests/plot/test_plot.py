@@ -182,7 +182,7 @@ def test_large_vectors_and_matrices_share_panels():
 
 def test_a_loaded_solution_is_drawn_without_its_problem(lag, tmp_path):
     stored = {"stored_optimality": lag.optimality, "stored_costates": lag.costates, "stored_dense": lag.dense}
-    known = replace(lag, **stored, statement=None)
+    known = replace(lag, **stored, extremal=replace(lag.extremal, stated=None))
     loaded = co.load(known.save(tmp_path / "solution.npz"))
     found, original = panels(loaded.plot("x", "E", costates=True)), panels(lag.plot("x", "E", costates=True))
     assert list(found) == list(original)
@@ -201,7 +201,8 @@ def test_solutions_of_different_problems_and_durations():
 
 def test_an_iterate_that_is_not_finite_is_drawn(lag):
     x = np.full_like(lag.trajectory.x, np.nan)
-    broken = replace(lag, trajectory=replace(lag.trajectory, x=x), converged=False, message="NaN")
+    extremal = replace(lag.extremal, trajectory=replace(lag.trajectory, x=x))
+    broken = replace(lag, extremal=extremal, converged=False, message="NaN")
     assert title_of(broken.plot()).endswith("NOT CONVERGED: NaN")
 
 

@@ -80,7 +80,8 @@ def test_a_saddle_and_an_indefinite_covariance_are_called_so(lag):
     assert "NOT A MINIMUM" not in summary(lag)
     e = lag.trajectory.e.copy()
     e[5] = [1.0, 2.0, 1.0]
-    indefinite = replace(lag, trajectory=replace(lag.trajectory, e=e), stored_optimality=lag.optimality)
+    extremal = replace(lag.extremal, trajectory=replace(lag.trajectory, e=e))
+    indefinite = replace(lag, extremal=extremal, stored_optimality=lag.optimality)
     assert "INDEFINITE" in summary(indefinite)
     assert "INDEFINITE" not in summary(lag)
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import covocp as co
 from covocp.base.archive import DamagedFileError, decode, encode, sealed_text
 from covocp.models import bryson_denham, free_time_integrator, mass_chain, noisy_integrator, unknown_lag
-from covocp.solution.schema import from_tree, to_tree
+from covocp.solution.storage import from_tree, to_tree
 
 FORMATS = (".npz", ".json")
 FIXED = settings(derandomize=True, deadline=None, database=None)
@@ -55,7 +55,7 @@ def assert_same(one, two, place="solution"):
         assert one.tobytes() == two.tobytes(), place
     elif is_dataclass(one):
         for f in fields(one):
-            if f.name not in ("statement", "stored_optimality", "stored_costates", "stored_dense", "stored_problem"):
+            if f.name not in ("stated", "stored_optimality", "stored_costates", "stored_dense", "stored_problem"):
                 assert_same(getattr(one, f.name), getattr(two, f.name), f"{place}.{f.name}")
         if isinstance(one, co.Solution):
             assert_same(one.costates, two.costates, f"{place}.costates")
@@ -140,7 +140,11 @@ def test_any_solution_comes_back(lag, tmp_path_factory, data, suffix):
         message=draw(st.text(max_size=5)),
         converged=draw(st.booleans()),
         cost_terms={"terminal": draw(st.floats()), "running": draw(st.floats())},
-        trajectory=replace(t, x=draw(floats(t.x.shape)), e=draw(floats(t.e.shape)), duration=draw(st.floats())),
+        extremal=replace(
+            lag.extremal,
+            trajectory=replace(t, x=draw(floats(t.x.shape)), e=draw(floats(t.e.shape)), duration=draw(st.floats())),
+            stated=None,
+        ),
         rates=draw(floats(lag.rates.shape)),
         filter_gain=draw(st.none() | floats(lag.filter_gain.shape)),
         violations=draw(st.dictionaries(st.text(max_size=5), st.floats(), max_size=3)),
@@ -148,7 +152,6 @@ def test_any_solution_comes_back(lag, tmp_path_factory, data, suffix):
         mesh_error=draw(st.floats()),
         stored_costates=lag.costates,
         stored_dense=replace(lag.dense, values=draw(floats(lag.dense.values.shape))),
-        statement=None,
     )
     path = changed.save(tmp_path_factory.mktemp("any") / f"solution{suffix}")
     assert_same(changed, co.load(path))
@@ -166,7 +169,8 @@ def test_a_failed_iterate_is_kept_and_is_a_guess(tmp_path):
 
 
 def test_optimality_that_cannot_be_evaluated_does_not_keep_from_saving(lag, tmp_path):
-    broken = replace(lag, trajectory=replace(lag.trajectory, duration=float("nan")), stored_optimality=None)
+    extremal = replace(lag.extremal, trajectory=replace(lag.trajectory, duration=float("nan")))
+    broken = replace(lag, extremal=extremal, stored_optimality=None)
     loaded = co.load(broken.save(tmp_path / "broken.npz"))
     assert np.isnan(loaded.duration)
 

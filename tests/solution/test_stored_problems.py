@@ -276,7 +276,8 @@ def test_changed_values_of_a_known_problem_are_compared_with_its_limits(tmp_path
     loaded = co.load(tmp_path / "right.npz")
     nominal = loaded.trajectory.x.copy()
     nominal[25] = 2.0
-    wrong = replace(loaded, trajectory=replace(loaded.trajectory, x=nominal), rates=loaded.rates * math.nan)
+    extremal = replace(loaded.extremal, trajectory=replace(loaded.trajectory, x=nominal))
+    wrong = replace(loaded, extremal=extremal, rates=loaded.rates * math.nan)
     file = wrong.save(tmp_path / "wrong.npz")
     with pytest.warns(co.CovocpWarning, match="violates lid by 0.5"):
         assert co.load(file, lag(lid=1.5)).violations == pytest.approx({"lid": 0.5})

@@ -220,31 +220,15 @@ def violations(solution: Solution) -> Mapping[str, float]:
     extremal = refined(solution.extremal)
     st, t = extremal.statement, extremal.trajectory
     x0, xf, _, _ = st.boundary_values(extremal.parameters)
-    columns = [np.asarray(column) for column in extremal.columns()]
-    nowhere = np.full(st.nx, np.inf)
     groups = [
         (st.control_names, t.u, *st.control_bounds, ""),
         (st.state_names, t.x, *st.state_bounds, ""),
-        (
-            st.state_names,
-            t.x[:1],
-            np.where(np.isnan(x0), -nowhere, x0),
-            np.where(np.isnan(x0), nowhere, x0),
-            "initial value of ",
-        ),
-        (
-            st.state_names,
-            t.x[-1:],
-            np.where(np.isnan(xf), -nowhere, xf),
-            np.where(np.isnan(xf), nowhere, xf),
-            "final value of ",
-        ),
     ]
-    for conditions, nodes in ((st.path, slice(None)), (st.start, slice(1)), (st.end, slice(-1, None))):
-        if conditions.size:
-            chosen = [column[..., nodes] for column in columns]
-            values = np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
-            groups.append((conditions.names, values, conditions.lower, conditions.upper, ""))
+    for given, values, words in ((x0, t.x[:1], "initial value of "), (xf, t.x[-1:], "final value of ")):
+        lower, upper = (np.where(np.isnan(given), free, given) for free in (-np.inf, np.inf))
+        groups.append((st.state_names, values, lower, upper, words))
+    for conditions, _, values in extremal.inequalities():
+        groups.append((conditions.names, values, conditions.lower, conditions.upper, ""))
     result = dict(solution.violations)
     for names, values, lower, upper, words in groups:
         limits = [np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (lower, upper)]

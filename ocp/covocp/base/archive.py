@@ -21,7 +21,7 @@ import json
 import math
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -58,15 +58,13 @@ def encode(value: Given, name: str, arrays: dict[str, Any] | None = None) -> Any
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"$float": _word(np.array([value]))}
-    if isinstance(value, list):
-        return [encode(v, f"{name}.{i}", arrays) for i, v in enumerate(value)]
-    if isinstance(value, tuple):
-        return {"$tuple": [encode(v, f"{name}.{i}", arrays) for i, v in enumerate(value)]}
+    if isinstance(value, (list, tuple)):
+        entries = [encode(v, f"{name}.{i}", arrays) for i, v in enumerate(value)]
+        return entries if isinstance(value, list) else {"$tuple": entries}
     if isinstance(value, Mapping):
         if all(isinstance(k, str) and not k.startswith("$") for k in value):
             return {k: encode(v, f"{name}.{k}", arrays) for k, v in value.items()}
-        pairs = [[encode(k, f"{name}.key"), encode(v, f"{name}.{k}", arrays)] for k, v in value.items()]
-        return {"$map": pairs}
+        return {"$map": [[encode(k, f"{name}.key"), encode(v, f"{name}.{k}", arrays)] for k, v in value.items()]}
     if isinstance(value, np.ndarray) and value.dtype.kind in KINDS and value.dtype.itemsize <= LARGEST_ITEM:
         return {"$array": _written_out(value) if arrays is None else _put_aside(value, name, arrays)}
     raise ExportError(
@@ -77,7 +75,7 @@ def encode(value: Given, name: str, arrays: dict[str, Any] | None = None) -> Any
     )
 
 
-def decode(tree: Any, arrays: Mapping[str, Any] | None = None) -> Any:
+def decode(tree: Any, arrays: Mapping[str, Any] | _Entries | None = None) -> Any:
     """The value that `encode` made the tree of; arrays are read-only.
 
     Args:
@@ -168,7 +166,7 @@ TEXT_UNPACKED, TEXT_ALWAYS = 4, 2**22
 CHUNK = 2**20
 DIGEST = 64  # letters of a SHA-256
 JSON_SEAL, JSON_END = b', "checksum": "sha256:', b'"}'
-NPZ_SEAL = re.compile(rb"covocp content ([0-9a-f]{64}) file ([0-9a-f]{64})")
+NPZ_SEAL = re.compile(rb"covocp content ([0-9a-f]{64}) file [0-9a-f]{64}")
 
 
 def packed(tree: Mapping[str, Any], suffix: str) -> bytes:
@@ -191,30 +189,41 @@ def packed(tree: Mapping[str, Any], suffix: str) -> bytes:
 
 def sealed_text(text: str) -> bytes:
     """A JSON object with its checksum as the last entry."""
-    body = text.rstrip()[:-1].encode() + JSON_SEAL
-    return body + hashlib.sha256(body).hexdigest().encode() + JSON_END
+    return _signed(text.rstrip()[:-1].encode() + JSON_SEAL) + JSON_END
 
 
 def sealed_arrays(entries: Mapping[str, Any]) -> bytes:
     """A .npz file of these entries with the checksums as its comment."""
     written = {name: _npy(array) for name, array in entries.items()}
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in written.items():
-            archive.writestr(_info(name), data)
-    raw = buffer.getvalue()
-    if sum(map(len, written.values())) > UNPACKED * len(raw) + ALWAYS:  # it would not be read again
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in written.items():
-                archive.writestr(_info(name, zipfile.ZIP_STORED), data)
-    content = _Content()
+    buffer = _zipped(written, zipfile.ZIP_DEFLATED)
+    if sum(map(len, written.values())) > UNPACKED * len(buffer.getvalue()) + ALWAYS:  # it would not be read again
+        buffer = _zipped(written, zipfile.ZIP_STORED)
+    content = hashlib.sha256()
     for name, data in written.items():
-        content.add(name, data)
+        content.update(_heading(name, data))
+        content.update(data)
     with zipfile.ZipFile(buffer, "a") as archive:
-        archive.comment = b"covocp content " + content.digest() + b" file " + b"0" * DIGEST
-    body = buffer.getvalue()[:-DIGEST]
+        archive.comment = f"covocp content {content.hexdigest()} file {'0' * DIGEST}".encode()
+    return _signed(buffer.getvalue()[:-DIGEST])
+
+
+def _signed(body: bytes) -> bytes:
+    """Bytes, and the checksum of them."""
     return body + hashlib.sha256(body).hexdigest().encode()
+
+
+def _heading(name: str, data: bytes) -> bytes:
+    """What the checksum of the content has of an entry before its bytes."""
+    return f"{len(name.encode())} {name} {len(data)} ".encode()
+
+
+def _zipped(written: Mapping[str, bytes], compression: int) -> io.BytesIO:
+    """An archive without the time of day: the same solution makes the same file."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, data in written.items():
+            archive.writestr(zipfile.ZipInfo(name + NPY), data, compression)
+    return buffer
 
 
 def unpacked(data: bytes) -> tuple[Any, bool]:
@@ -234,94 +243,51 @@ def unpacked(data: bytes) -> tuple[Any, bool]:
             tree.pop("checksum", None)
         return tree, _text_is_sealed(data)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if DOCUMENT + NPY not in archive.namelist():
+            raise DamagedFileError(f"it has no entry '{DOCUMENT}'")
         entries = _Entries(archive, len(data))
-        text = entries.text()
-        tree = decode(json.loads(text), entries)
+        tree = decode(json.loads(entries[DOCUMENT].tobytes().decode("utf-8")), entries)
         return tree, entries.sealed(data)
 
 
 def _text_is_sealed(data: bytes) -> bool:
-    body, digest, end = data[: -DIGEST - len(JSON_END)], data[-DIGEST - len(JSON_END) : -len(JSON_END)], data[-2:]
-    return body.endswith(JSON_SEAL) and end == JSON_END and hashlib.sha256(body).hexdigest().encode() == digest
+    body, seal, _ = data.rpartition(JSON_SEAL)
+    return data == _signed(body + seal) + JSON_END
 
 
-class _Content:
-    """The checksum over entries: their names, lengths and bytes, in the order of the tree."""
-
-    def __init__(self) -> None:
-        self._sum = hashlib.sha256()
-
-    def add(self, name: str, data: bytes) -> None:
-        self._sum.update(f"{len(name.encode())} {name} {len(data)} ".encode())
-        self._sum.update(data)
-
-    def digest(self) -> bytes:
-        return self._sum.hexdigest().encode()
-
-
-class _Entries(Mapping[str, Any]):
+class _Entries:
     """The arrays of an archive, unpacked when they are asked for, as often as the size of the file allows."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
         self._archive, self._size = archive, size
         self._left = UNPACKED * size + ALWAYS
-        self._names = {name.removesuffix(NPY): name for name in archive.namelist() if name.endswith(NPY)}
         self._read: set[str] = set()
-        self._content = _Content()
+        self._content = hashlib.sha256()
 
     def __getitem__(self, name: str) -> Any:
-        return self._array(name, self._left)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def text(self) -> str:
-        """The document."""
-        if DOCUMENT not in self._names:
-            raise DamagedFileError(f"it has no entry '{DOCUMENT}'")
-        array = self._array(DOCUMENT, TEXT_UNPACKED * self._size + TEXT_ALWAYS)
-        return bytes(array.tobytes()).decode("utf-8")
-
-    def sealed(self, data: bytes) -> bool:
-        """Whether the file is as it was written, or has nothing new but entries that do not belong to the tree."""
-        found = NPZ_SEAL.fullmatch(self._archive.comment)
-        if found is None or found.group(1) != self._content.digest():
-            return False
-        added = len(self._archive.infolist()) > len(self._read)
-        return added or (data.endswith(found.group(2)) and _digest(data[:-DIGEST]) == found.group(2))
-
-    def _array(self, name: str, most: int) -> Any:
-        info = self._archive.getinfo(self._names[name])
+        info = self._archive.getinfo(name + NPY)
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise DamagedFileError(f"the entry '{name[:60]}' is compressed in another way than save does it")
+        most = TEXT_UNPACKED * self._size + TEXT_ALWAYS if name == DOCUMENT else self._left
         if info.file_size > min(self._left, most):
             raise DamagedFileError(
                 f"the entry '{name[:60]}' unpacks to {info.file_size} bytes, more than a file of {self._size} bytes can"
                 " hold"
             )
         self._left -= info.file_size
-        chunks = []
         with self._archive.open(info) as stream:  # in pieces: one read would unpack more than the entry says it holds
-            while chunk := stream.read(CHUNK):
-                chunks.append(chunk)
-        data = b"".join(chunks)
+            data = b"".join(iter(lambda: stream.read(CHUNK), b""))
         self._read.add(name)
-        self._content.add(name, data)
+        self._content.update(_heading(name, data))
+        self._content.update(data)
         return _array(data)
 
-
-def _digest(data: bytes) -> bytes:
-    return hashlib.sha256(data).hexdigest().encode()
-
-
-def _info(name: str, compression: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
-    """Of an entry, without the time of day: the same solution makes the same file."""
-    info = zipfile.ZipInfo(name + NPY)
-    info.compress_type = compression
-    return info
+    def sealed(self, data: bytes) -> bool:
+        """Whether the file is as it was written, or has nothing new but entries that do not belong to the tree."""
+        found = NPZ_SEAL.fullmatch(self._archive.comment)
+        if found is None or found.group(1) != self._content.hexdigest().encode():
+            return False
+        return len(self._archive.infolist()) > len(self._read) or data == _signed(data[:-DIGEST])
 
 
 def _npy(array: Given) -> bytes:
@@ -335,12 +301,9 @@ def _array(data: bytes) -> Any:
     """The inverse of `_npy`; what its header promises is compared with what there is before anything is made."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, columns, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, columns, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
+    if version != (1, 0):  # larger headers are those of records
         raise DamagedFileError(f"an array in version {version} of its format")
+    shape, columns, dtype = np.lib.format.read_array_header_1_0(stream)
     rest = data[stream.tell() :]
     plain = dtype.kind in KINDS and dtype.itemsize <= LARGEST_ITEM and dtype.subdtype is None
     if not plain or any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(rest):

@@ -8,8 +8,9 @@ the entry stands for two entries of the matrix (Schmidt 1971, section 2.4).
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from covocp.base.expressions import Expr, Given
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 # A covariance counts as positive semidefinite while its smallest eigenvalue is above minus this times its largest:
 # roundoff of a propagation over some thousand steps.
@@ -51,6 +53,14 @@ def _no_number(value: Given) -> bool:
     if isinstance(value, (list, tuple)):
         return any(not isinstance(entry, (bool, np.bool_)) and _no_number(entry) for entry in value)
     return isinstance(value, (str, bytes, bool, np.bool_, ca.SX, ca.MX))
+
+
+def read_only(holder: T) -> T:
+    """A dataclass or a dictionary, whose own arrays cannot be written to any more."""
+    for value in (holder if isinstance(holder, Mapping) else vars(holder)).values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+    return holder
 
 
 def half_length(size: int) -> int:
@@ -142,3 +152,8 @@ def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERAN
         return False
     values = np.linalg.eigvalsh(full)
     return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
+
+
+def standard_deviations(covariances: ArrayLike) -> Array:
+    """Roots of the diagonals of covariances of shape (..., n, n), (..., n); what roundoff left below zero is zero."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1).clip(0.0)))

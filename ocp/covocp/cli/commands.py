@@ -113,22 +113,15 @@ def _parser() -> _Parser:
     listing.set_defaults(run=_list)
     solve = commands.add_parser("solve", help="solve a model and print what came out")
     _common(solve)
-    solve.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
     solve.add_argument("--plot", "--output", metavar="FILE", help="write a figure (" + ", ".join(FIGURES) + ")")
     solve.add_argument("--save", metavar="FILE", help="write the solution (" + ", ".join(FILES) + ")")
     solve.set_defaults(run=_solve)
     compare = commands.add_parser("compare", help="solve a model by several methods and print a table")
-    _common(compare)
-    compare.add_argument(
-        "--method",
-        action="append",
-        help="may be given several times; all methods by default: " + ", ".join(co.methods()),
-    )
+    _common(compare, several=True)
     compare.add_argument("--plot", "--output", metavar="FILE", help="write a figure of all solutions")
     compare.set_defaults(run=_compare)
     plot = commands.add_parser("plot", help="solve a model and draw its figures")
     _common(plot)
-    plot.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
     plot.add_argument("--plot", "--output", metavar="FILE", help="name of the figures; MODEL.png by default")
     plot.set_defaults(run=_plot)
     _export_options(commands.add_parser("export", help="solve a model and write C code, compiled and compared"))
@@ -139,7 +132,6 @@ def _export_options(export: argparse.ArgumentParser) -> None:
     """Options of `covocp export`."""
     _common(export)
     export.add_argument("directory", metavar="DIR", help="folder to make")
-    export.add_argument("--method", default="ipopt", help="one of " + ", ".join(co.methods()))
     export.add_argument("--name", help="of the package, an identifier in C; that of the folder by default")
     export.add_argument("--precision", choices=("double", "single"), default="double", help="of all numbers (double)")
     export.add_argument(
@@ -160,8 +152,8 @@ def _export_options(export: argparse.ArgumentParser) -> None:
     export.set_defaults(run=_export)
 
 
-def _common(parser: argparse.ArgumentParser) -> None:
-    """Options of every command that solves."""
+def _common(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """Options of every command that solves; several: by more than one method."""
     parser.add_argument("model", metavar="MODEL", help="a name from `covocp list`, or path/to/script.py:function")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the model; may be repeated"
@@ -171,6 +163,12 @@ def _common(parser: argparse.ArgumentParser) -> None:
         "--option", action="append", default=[], metavar="NAME=VALUE", help="an option of the solver; may be repeated"
     )
     parser.add_argument("--quiet", action="store_true", help="print errors only")
+    methods = ", ".join(co.methods())
+    if several:
+        words = "may be given several times; all methods by default: "
+        parser.add_argument("--method", action="append", help=words + methods)
+    else:
+        parser.add_argument("--method", default="ipopt", help="one of " + methods)
 
 
 def _whole(text: str) -> int:

@@ -91,16 +91,8 @@ def held_by(extremal: Extremal) -> Held:
         ("states", np.flatnonzero(state_sides), state_sides, state_strict),
         ("matrices", np.flatnonzero(matrix_sides), matrix_sides, matrix_strict),
     ]
-    for kind, conditions, multipliers, nodes in (
-        ("path", st.path, m.path, slice(None)),
-        ("start", st.start, m.start[None, :], slice(1)),
-        ("end", st.end, m.end[None, :], slice(-1, None)),
-    ):
-        if not conditions.size:
-            continue
-        columns = [np.asarray(column)[..., nodes] for column in extremal.columns()]
-        count = columns[0].shape[1]
-        values = np.asarray(conditions.function.map(count)(*columns).full()).T
+    for conditions, kind, values in extremal.inequalities():
+        multipliers = np.atleast_2d(getattr(m, kind))
         sides, strict = _sides(values, conditions.lower, conditions.upper, multipliers)
         equal = np.broadcast_to(conditions.lower == conditions.upper, sides.shape)
         groups.append((kind, np.flatnonzero((sides != 0) | equal), np.where(equal, 0.0, sides), strict | equal))

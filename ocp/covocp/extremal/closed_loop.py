@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -68,10 +68,10 @@ class ClosedLoop:
         statistics are not the design's.
     """
 
-    E: Array
-    Xhat: Array
-    Z: Array
-    gain: Array
+    E: Annotated[Array, "nodes augmented augmented"]
+    Xhat: Annotated[Array, "nodes augmented augmented"]
+    Z: Annotated[Array, "nodes augmented augmented"]
+    gain: Annotated[Array, "nodes any augmented"]
     cost: Mapping[str, float]
     other_cost: float | None
     conservation: float | None

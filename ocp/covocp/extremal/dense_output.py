@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -59,9 +59,9 @@ class Dense:
     """
 
     knots: Array
-    values: Array
-    first: Array
-    last: Array
+    values: Annotated[Array, "knots xe"]
+    first: Annotated[Array, "pieces xe"]
+    last: Annotated[Array, "pieces xe"]
 
     __repr__ = short_repr
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import Interval
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.trajectory import Multipliers, Trajectory
@@ -24,20 +25,36 @@ STOPPED, ENDED = "stopped", "ended"
 
 @dataclass(frozen=True, kw_only=True)
 class Extremal:
-    """Trajectory, multipliers, and what is needed to evaluate anything along them."""
+    """Trajectory, multipliers, and what is needed to evaluate anything along them.
 
-    statement: Statement
+    stated: the problem; None where it was read from a file without its problem.
+    """
+
     mesh: Mesh
     trajectory: Trajectory
-    parameters: Array
+    parameters: Annotated[Array, "p"]
     multipliers: Multipliers
+    stated: Statement | None = None
 
     __repr__ = short_repr
 
     @property
+    def statement(self) -> Statement:
+        """The problem.
+
+        Raises:
+            CovocpError: it is not known.
+        """
+        if self.stated is None:
+            raise CovocpError(
+                "This solution was read from a file and knows no problem: use load(path, problem=...) for this."
+            )
+        return self.stated
+
+    @property
     def time(self) -> Array:
         """Times of the nodes [s]."""
-        return self.mesh.nodes * self.trajectory.duration
+        return np.asarray(self.mesh.nodes * self.trajectory.duration)
 
     @property
     def controls(self) -> Array:
@@ -56,6 +73,15 @@ class Extremal:
             np.full((1, count), self.trajectory.duration),
             np.tile(self.parameters[:, None], (1, count)),
         )
+
+    def inequalities(self) -> Iterator[tuple[Conditions, str, Array]]:
+        """Those of the statement that are there, their place, and their values at the nodes of it, (nodes, rows)."""
+        st, columns = self.statement, [np.asarray(column) for column in self.columns()]
+        for place, nodes in (("path", slice(None)), ("start", slice(1)), ("end", slice(-1, None))):
+            conditions: Conditions = getattr(st, place)
+            if conditions.size:
+                chosen = [column[:, nodes] for column in columns]
+                yield conditions, place, np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
 
     @property
     def intervals(self) -> Interval:

@@ -56,7 +56,7 @@ def evaluate_controls(
     trajectory = Trajectory(x=at_nodes.T, u=u, e=halves.T, duration=duration)
     terminal = float(statement.terminal(trajectory.x[-1], trajectory.e[-1], duration, parameters))
     extremal = Extremal(
-        statement=statement,
+        stated=statement,
         mesh=mesh,
         trajectory=trajectory,
         parameters=parameters,
@@ -89,12 +89,7 @@ def missed(extremal: Extremal) -> dict[str, float]:
         excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=0.0)
         allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED
         result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
-    columns = [np.asarray(c) for c in extremal.columns()]
-    for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(-1, None))):
-        if not conditions.size:
-            continue
-        chosen = [c[:, at] for c in columns]
-        rows = np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
+    for conditions, _, rows in extremal.inequalities():
         excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)
         result |= {n: float(v) for n, v in zip(conditions.names, excess, strict=True) if v > MISS}
     return result

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -23,8 +23,8 @@ from covocp.statement.statement import Statement
 class Costates:
     """Costates at the nodes: p (N + 1, nx), those of the half-vectors (N + 1, ne)."""
 
-    state: Array
-    matrices: Array
+    state: Annotated[Array, "nodes x"]
+    matrices: Annotated[Array, "nodes e"]
 
     __repr__ = short_repr
 

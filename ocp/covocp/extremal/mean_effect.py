@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -42,8 +42,8 @@ class MeanEffect:
     cost: what it adds to the expected cost, to second order; not part of what was optimised.
     """
 
-    mean: Array
-    estimate: Array
+    mean: Annotated[Array, "nodes augmented"]
+    estimate: Annotated[Array, "nodes augmented"]
     cost: float
 
     __repr__ = short_repr

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
@@ -149,17 +149,13 @@ def complementarity(extremal: Extremal) -> float:
     """Sum of |multiplier| times distance from the bound, of controls, states, matrices and conditions, by the cost."""
     extremal = refined(extremal)  # limits act at all its nodes
     st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
-    columns = extremal.columns()
-    count = extremal.mesh.intervals + 1
     groups: list[tuple[Array, Array, Array, Array]] = [
         (m.controls, t.u, *st.control_bounds),
         (m.states, t.x, *st.state_bounds),
         (m.matrices, t.e, st.matrix_lower, np.full(st.ne, np.inf)),
     ]
-    for conditions, weights, at in ((st.path, m.path, slice(None)), (st.start, m.start, 0), (st.end, m.end, count - 1)):
-        if conditions.size:
-            rows = np.asarray(conditions.function.map(count)(*columns).full()).T
-            groups.append((weights, rows[at], conditions.lower, conditions.upper))
+    for conditions, place, values in extremal.inequalities():
+        groups.append((np.atleast_2d(getattr(m, place)), values, conditions.lower, conditions.upper))
     total = 0.0
     for weights, values, lower, upper in groups:
         kept, distance = complementary(weights, values, lower, upper)
@@ -196,7 +192,7 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
     if loop is None:
         return {}
     tiny = np.finfo(float).tiny
-    errors, estimates = (np.sqrt(np.diagonal(v, axis1=1, axis2=2).clip(0.0)) for v in (loop.E, loop.X))
+    errors, estimates = (standard_deviations(v) for v in (loop.E, loop.X))
     size = errors[:, :, None] * estimates[:, None, :]
     cross = np.abs(loop.Z) / np.where(size > tiny, size, np.inf)
     return {

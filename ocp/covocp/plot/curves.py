@@ -133,14 +133,12 @@ class Drawn:
         if self.covariance is None or (loop is None and block.kind == "control"):
             return None
         if loop is None:
-            variances = self.sample[self.covariance.name][:, rows, rows]
-        elif block.kind == "control":
+            return np.sqrt(np.maximum(self.sample[self.covariance.name][:, rows, rows], 0.0))
+        variances = (loop.E if block.kind == "unknown" else loop.X)[:, rows, rows]
+        if block.kind == "control":
             gain = loop.gain[:, block.span]
-            at_nodes = np.einsum("kui,kij,kuj->ku", gain, loop.Xhat, gain)
-            return self.between(np.sqrt(np.maximum(at_nodes, 0.0)))
-        else:
-            return self.between(np.sqrt(np.maximum((loop.E if block.kind == "unknown" else loop.X)[:, rows, rows], 0)))
-        return np.sqrt(np.maximum(variances, 0.0))
+            variances = np.einsum("kui,kij,kuj->ku", gain, loop.Xhat, gain)
+        return self.between(np.sqrt(np.maximum(variances, 0.0)))
 
     def between(self, values: Array) -> Array:
         """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""

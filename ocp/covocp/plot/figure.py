@@ -16,9 +16,8 @@ from covocp.base.arguments import checked, either, optional, positives, sequence
 from covocp.base.errors import ProblemError, no_option
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
-from covocp.base.pages import WARNING
 from covocp.plot.curves import Panel
-from covocp.plot.legends import fold_title, place_legend
+from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.plot.paths import outline
 from covocp.solution.origin import Origin
@@ -180,7 +179,7 @@ def _arrange(figure: Figure, axes: Any, count: int, abscissa: str) -> None:
         place.set_visible(False)
     for column in range(columns):
         last = max(row for row in range(rows) if row * columns + column < count)
-        axes[last, column].set_xlabel(_plain(abscissa))
+        axes[last, column].set_xlabel(plain_text(abscissa))
     figure.align_ylabels(list(axes.ravel()[:count]))
 
 
@@ -256,8 +255,7 @@ def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: 
         for s, label in zip(solutions, labels, strict=True)
         if not s.converged
     ]
-    if lines := [_plain(line) for line in (text, *failed) if line]:
-        figure.suptitle(fold_title(figure, lines), fontsize=10, color=WARNING if failed else "black")
+    place_title(figure, (text, *failed), warning=bool(failed))
 
 
 def _legend(
@@ -270,21 +268,16 @@ def _legend(
     handles: list[Any] = []
     if len(solutions) > 1:
         handles += [
-            Line2D([], [], label=_plain(label if s.converged else f"{label} (not converged)"), **_line(i))
+            Line2D([], [], label=plain_text(label if s.converged else f"{label} (not converged)"), **_line(i))
             for i, (s, label) in enumerate(zip(solutions, labels, strict=True))
         ]
     curves = [curve for panel in panels for curve in panel.curves]
+    widths = " and ".join(f"{width:g}" for width in sigmas) + " standard deviation"
+    widths += "s" if sigmas and sigmas[-1] != 1 else ""
     if sigmas and any(curve.deviation is not None for curve in curves):
-        widths = " and ".join(f"{width:g}" for width in sigmas)
-        plural = "s" if sigmas[-1] != 1 else ""
-        handles.append(
-            Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths} standard deviation{plural}")
-        )
+        handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths}"))
     if sigmas and any(panel.ellipses for panel in panels):
-        widths = " and ".join(f"{width:g}" for width in sigmas)
-        plural = "s" if sigmas[-1] != 1 else ""
-        label = f"ellipses of {widths} standard deviation{plural}"
-        handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=label))
+        handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=f"ellipses of {widths}"))
     if any(panel.path for panel in panels):
         handles.append(Line2D([], [], linestyle="none", label="start", **START))
     if any(curve.target is not None for curve in curves):
@@ -330,7 +323,7 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
     _targets(axes, panel)
     for bound in _near_bounds(panel):
         axes.axhline(bound, zorder=1, **BOUND)
-    axes.set_ylabel(_plain(_folded(panel.label)))
+    axes.set_ylabel(plain_text(_folded(panel.label)))
     axes.margins(x=PATH_MARGIN if panel.path else 0)
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
@@ -365,26 +358,14 @@ def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
     """Which entry is which, within the panel."""
     from matplotlib.lines import Line2D
 
-    styles = [
-        _line(k) if count == 1 else {"color": "#555555", "linestyle": _line(k)["linestyle"]} for k in _used(panel)
-    ]
-    handles = [
-        Line2D([], [], label=_plain(panel.entries[k]), **style) for k, style in zip(_used(panel), styles, strict=True)
-    ]
+    handles = []
+    for k in sorted({curve.entry for curve in panel.curves}):
+        style = _line(k) if count == 1 else {"color": "#555555", "linestyle": _line(k)["linestyle"]}
+        handles.append(Line2D([], [], label=plain_text(panel.entries[k]), **style))
     axes.legend(handles=handles, ncols=1 if len(handles) < 4 else 2, fontsize=7, handlelength=2.0, labelspacing=0.3)
-
-
-def _used(panel: Panel) -> list[int]:
-    """Numbers of the entries that are drawn."""
-    return sorted({curve.entry for curve in panel.curves})
 
 
 def _folded(label: str) -> str:
     """A label whose unit stands on a line of its own where the axis is too short for both."""
     name, bracket, unit = label.rpartition(" [")
     return label if len(label) <= LONGEST_LINE or not name else f"{name}\n{bracket.strip()}{unit}"
-
-
-def _plain(text: str) -> str:
-    """Text in which a dollar sign is a dollar sign."""
-    return text.replace("$", r"\$")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
+
+from covocp.base.pages import WARNING
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,10 +58,19 @@ def _size(figure: Figure, legend: Legend) -> tuple[float, float]:
     return box.width / figure.dpi, box.height / figure.dpi
 
 
-def fold_title(figure: Figure, lines: list[str]) -> str:
-    """Lines of a title, folded where they are longer than the figure is wide; it grows by the lines that are added."""
+def place_title(figure: Figure, lines: Iterable[str], *, warning: bool) -> None:
+    """A title of the lines that are not empty, folded where they are longer than the figure is wide.
+
+    The figure grows by the lines that are added.
+    """
     letters = max(LEAST_LETTERS, int(LETTERS * figure.get_figwidth()))
-    folded = [textwrap.fill(line, letters) for line in lines]
+    folded = [textwrap.fill(plain_text(line), letters) for line in lines if line]
     more = sum(text.count("\n") for text in folded)
     figure.set_figheight(figure.get_figheight() + more * LINE / 2)
-    return "\n".join(folded)
+    if folded:
+        figure.suptitle("\n".join(folded), fontsize=10, color=WARNING if warning else "black")
+
+
+def plain_text(text: str) -> str:
+    """Text in which a dollar sign is a dollar sign."""
+    return text.replace("$", r"\$")

@@ -398,23 +398,14 @@ def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) ->
 def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
     """Costates of a state or a matrix, at the nodes."""
     chosen = [d for d in drawn if d.knows(block.name)]
-    name = f"costate of {block.name}"
     if block.kind == "state":
         curves = [
             Curve(t=d.solution.t, y=values, order=d.order, entry=i)
             for d in chosen
             for i, values in enumerate(d.solution.costate(block.name).reshape(d.solution.t.size, -1).T)
         ]
-        if block.size > SEPARATE_ENTRIES:
-            return [Panel(label=name, entries=entry_names((block,)), curves=tuple(curves))]
-        return [
-            Panel(
-                label=f"costate of {entry}",
-                entries=(entry,),
-                curves=tuple(replace(curve, entry=0) for curve in curves if curve.entry == i),
-            )
-            for i, entry in enumerate(entry_names((block,)))
-        ]
+        panels = _separated(block, "", curves, _bounds(None, block))
+        return [replace(panel, label=f"costate of {panel.label}", key="") for panel in panels]
     pairs = [pair for group in _pairs(block) for pair in group]
     entries = tuple(f"{block.labels[i]}, {block.labels[j]}" for i, j in pairs)
     curves = [
@@ -422,4 +413,4 @@ def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
         for d in chosen
         for k, (i, j) in enumerate(pairs)
     ]
-    return [Panel(label=name, entries=entries, curves=tuple(curves))]
+    return [Panel(label=f"costate of {block.name}", entries=entries, curves=tuple(curves))]

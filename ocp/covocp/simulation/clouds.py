@@ -27,9 +27,8 @@ from covocp.plot.figure import (
     _figure,
     _folded,
     _grid,
-    _plain,
 )
-from covocp.plot.legends import fold_title, place_legend
+from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.paths import outline
 
 if TYPE_CHECKING:
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from covocp.simulation.monte_carlo import MonteCarlo
 
 PREDICTED, SAMPLE, ERROR = COLOURS[0], COLOURS[1], COLOURS[2]
+DASHED: Any = (0, (5, 1.6))
 DOTTED: Any = (0, (1.2, 1.4))
 GREY = "#777777"
 # Half the width of a cloud's axes, in the larger of the predicted and the robust deviation.
@@ -168,7 +168,7 @@ def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], 
     mean = sample.moments.mean[:, row]
     spread = np.sqrt(np.maximum(sample.moments.product[:, row, row] - mean**2, 0.0))
     for curve, width in ((mean, 1.4), (mean - spread, 1.0), (mean + spread, 1.0)):
-        axes.plot(t, curve, color=SAMPLE, linestyle=(0, (5, 1.6)), linewidth=width)
+        axes.plot(t, curve, color=SAMPLE, linestyle=DASHED, linewidth=width)
     if sample.estimated and row < n:
         _draw_error(axes, sample, row)
     axes.axhline(0.0, color="black", linewidth=0.6, zorder=1)
@@ -213,7 +213,7 @@ def _limits(sample: MonteCarlo, row: int) -> list[Array]:
 
 
 def _label(name: str, unit: str) -> str:
-    return _plain(f"deviation of {name}" + (f" [{unit}]" if unit else ""))
+    return plain_text(f"deviation of {name}" + (f" [{unit}]" if unit else ""))
 
 
 def _draw_cloud(
@@ -230,7 +230,7 @@ def _draw_cloud(
     own = values.T @ values / max(1, len(values))
     for k in sigmas:
         axes.plot(*outline(predicted, k), color=PREDICTED, linewidth=1.4, zorder=3)
-        axes.plot(*outline(own, k), color=SAMPLE, linewidth=1.2, linestyle=(0, (5, 1.6)), zorder=3)
+        axes.plot(*outline(own, k), color=SAMPLE, linewidth=1.2, linestyle=DASHED, zorder=3)
     axes.set_xlim(-view[0], view[0])
     axes.set_ylim(-view[1], view[1])
     beyond = int(np.count_nonzero((np.abs(values) > view).any(axis=1))) + int(np.count_nonzero(~sample.stayed))
@@ -249,11 +249,7 @@ def _title(figure: Figure, sample: MonteCarlo, title: str | None) -> None:
     flown = f", a law every {sample.period:.6g} s" if sample.filter == "law" else ""
     text = title if title is not None else sample.name + flown
     verdict = sample.verdict
-    lines = [line for line in (text, "" if verdict.holds else f"{verdict.headline}") if line]
-    if lines:
-        figure.suptitle(
-            fold_title(figure, list(map(_plain, lines))), fontsize=10, color="black" if verdict.holds else WARNING
-        )
+    place_title(figure, (text, "" if verdict.holds else verdict.headline), warning=not verdict.holds)
 
 
 def _legend(
@@ -262,11 +258,10 @@ def _legend(
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    dashes: Any = (0, (5, 1.6))
     handles: list[Any] = []
     if bands:
         handles.append(Patch(color=PREDICTED, alpha=2 * BAND, linewidth=0, label="predicted standard deviation"))
-        handles.append(Line2D([], [], color=SAMPLE, linestyle=dashes, label="mean and standard deviation of the runs"))
+        handles.append(Line2D([], [], color=SAMPLE, linestyle=DASHED, label="mean and standard deviation of the runs"))
     if errors:
         handles.append(Line2D([], [], color=ERROR, linewidth=1.0, label="predicted error of the estimate"))
         handles.append(Line2D([], [], color=ERROR, linestyle=DOTTED, label="error of the estimate in the runs"))
@@ -275,5 +270,5 @@ def _legend(
     if clouds:
         widths = ", ".join(f"{k:g}" for k in sigmas)
         handles.append(Line2D([], [], color=PREDICTED, label=f"predicted ellipses ({widths} deviations)"))
-        handles.append(Line2D([], [], color=SAMPLE, linestyle=dashes, label="ellipses of the runs"))
+        handles.append(Line2D([], [], color=SAMPLE, linestyle=DASHED, label="ellipses of the runs"))
     place_legend(figure, handles)

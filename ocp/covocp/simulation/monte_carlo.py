@@ -14,7 +14,7 @@ from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, standard_deviations
 from covocp.base.pages import as_html
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached, methods_one_at_a_time
@@ -185,8 +185,7 @@ class MonteCarlo:
     def deviation(self, key: Given, *, about: str = "nominal") -> Array:
         """Sample standard deviation, (K,) or (K, size), in the unit of the symbol; see `covariance`."""
         _, block = self.rows(key)
-        variance = np.diagonal(self.covariance(key, about=about), axis1=1, axis2=2)
-        return self._shaped(np.sqrt(np.maximum(variance, 0.0)), block)
+        return self._shaped(standard_deviations(self.covariance(key, about=about)), block)
 
     def deviation_band(self, key: Given) -> tuple[Array, Array]:
         """Confidence band of the standard deviation about the nominal, (low, high)."""
@@ -200,8 +199,7 @@ class MonteCarlo:
         """Standard deviation about the nominal that linear theory predicts, (K,) or (K, size)."""
         rows, block = self.rows(key)
         predicted = self.predicted_control if block.kind == "control" else self.predicted
-        squares = np.diagonal(predicted, axis1=1, axis2=2)[:, block_rows(rows, block, self.size)]
-        return self._shaped(np.sqrt(squares.clip(0.0)), block)
+        return self._shaped(standard_deviations(predicted)[:, block_rows(rows, block, self.size)], block)
 
     def error_covariance(self, a: Given, b: Given = None) -> Array:
         """Sample covariance of the errors of the estimates of two symbols, (K, size of a, size of b).

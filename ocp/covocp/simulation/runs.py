@@ -11,7 +11,7 @@ import numpy as np
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError, SolveError, warn_user
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, read_only
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
 from covocp.simulation.actual import System, actual_system, design_system
@@ -242,8 +242,7 @@ def _tell(harvest: Harvest, runs: int) -> None:
     if harvest.interrupted:
         if not done:
             raise KeyboardInterrupt
-        message = f"Interrupted: {done} of {runs} runs were simulated."
-        warn_user(message)
+        warn_user(f"Interrupted: {done} of {runs} runs were simulated.")
     if not harvest.failures:
         return
     listed = "".join(f"\n  {failure}" for failure in harvest.failures[:10])
@@ -286,7 +285,7 @@ def _result(
         predicted_error=true.error,
         predicted_mean=true.mean[:, : design.size],
         predicted_control=control_spread(solution, design, true, nominal),
-        intended=_intended(solution, design),
+        intended=np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy(),
         design=expected.deviation,
         design_error=expected.error,
         design_cost=costs[0],
@@ -304,11 +303,6 @@ def _result(
     )
 
 
-def _intended(solution: Solution, design: System) -> Array:
-    """Mean squares of the deviations at the end that the solution promises; NaN where nothing is fed back."""
-    return np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy()
-
-
 def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     """What the result has for each run, and the sums over them."""
     names = {"deviations": "deviation", "estimates": "estimate", "costs": "cost"}
@@ -317,9 +311,7 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     values["numbers"] = np.concatenate([np.arange(batch.first, batch.first + batch.runs) for batch in batches])
     for name in ("asking", "violating"):
         values[name] = np.sum([getattr(batch, name) for batch in batches], axis=0) / values["numbers"].size
-    for array in values.values():
-        array.setflags(write=False)
-    return {**values, "moments": moments_of(batches)}
+    return {**read_only(values), "moments": moments_of(batches)}
 
 
 def _predicted_costs(solution: Solution, truth: Given) -> tuple[float, float]:

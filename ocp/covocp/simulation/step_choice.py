@@ -88,12 +88,7 @@ def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
 
 def examined(choice: StepChoice, setting: Setting, *, runs: int, seed: int, stop: Callable[[], bool]) -> StepChoice:
     """A given step with the change that halving it makes, on a pilot batch; see `choose_step`."""
-    t = choice.grid.t[[0, -1]]
-    plans = [
-        make_plan(setting, grid, t, seed=seed, pilot=True, pairs=grid is choice.grid)
-        for grid in (choice.grid, choice.grid.divided(2))
-    ]
-    coarse, fine = (run_batch(plan, 0, min(runs, EXAMINED_RUNS), stop) for plan in plans)
+    coarse, fine = _pair(setting, choice.grid, choice.grid.divided(2), min(runs, EXAMINED_RUNS), seed, stop)
     change = _largest_change(coarse, fine, runs)
     return replace(choice, change=change, settled=change <= MATTERS)
 
@@ -121,18 +116,10 @@ def choose_step(
     most = max(1, MOST_STEPS // base.steps)
     unresolved = bool((parts > most).any())
     parts = np.minimum(parts, most)
-    count = min(runs, PILOT_RUNS)
     change = np.inf
     for _ in range(PAIRS):
-        coarse, fine = (
-            run_batch(
-                make_plan(setting, base.divided(p), base.t[[0, -1]], seed=seed, pilot=True, pairs=p is parts),
-                0,
-                count,
-                stop,
-            )
-            for p in (parts, 2 * parts)
-        )
+        grids = base.divided(parts), base.divided(2 * parts)
+        coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop)
         change = _largest_change(coarse, fine, runs)
         if unresolved and np.isfinite(fine.left).any():
             change = np.inf  # they may leave it because of the step, in both
@@ -143,6 +130,17 @@ def choose_step(
         needed = np.ceil(np.log(min(change, 1e9) / SHARE) / np.log(4.0))
         parts = parts * 2 ** int(np.clip(needed, 1, 3))
     return StepChoice(grid=base.divided(parts), change=change, settled=False)
+
+
+def _pair(
+    setting: Setting, coarse: Grid, fine: Grid, count: int, seed: int, stop: Callable[[], bool]
+) -> tuple[Batch, Batch]:
+    """Pilot runs on a grid, and on one with steps half as long along the same paths."""
+    one, two = (
+        make_plan(setting, grid, coarse.t[[0, -1]], seed=seed, pilot=True, pairs=grid is coarse)
+        for grid in (coarse, fine)
+    )
+    return run_batch(one, 0, count, stop), run_batch(two, 0, count, stop)
 
 
 def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation
 
@@ -169,7 +169,7 @@ def judge(sample: MonteCarlo) -> Verdict:
     stayed, states = sample.stayed, sum(b.size for b in sample.blocks if b.kind == "state")
     names, n = sample.augmented, sample.size
     states = min(states, n - sum(b.size for b in sample.blocks if b.kind == "unknown"))
-    predicted, errors = (np.sqrt(np.diagonal(v[-1]).clip(0.0)) for v in (sample.predicted, sample.predicted_error))
+    predicted, errors = (standard_deviations(v[-1]) for v in (sample.predicted, sample.predicted_error))
     flown, intended = (np.sqrt(v.clip(0.0))[:states] for v in (np.diagonal(sample.design[-1]), sample.intended))
     broken = ~(np.abs(flown - intended) <= AS_PROMISED * intended) & (intended > 0)
     # Deviations are measured by what is promised; a prediction that is no number, or far too large, excuses none.

@@ -32,21 +32,16 @@ def attached(solution: Solution, statement: Statement) -> Solution:
     Raises:
         ProblemError: it is the solution of another problem (says what differs).
     """
-    found = _differences(solution, statement)
-    written_elsewhere = solution.stored_problem is not None and only_switches(found)
-    if found and not (written_elsewhere and _other_casadi(solution)):
+    found, kept = _differences(solution, statement), solution.stored_problem
+    written_elsewhere = kept is not None and kept.casadi != ca.CasadiMeta.version()
+    if found and not (written_elsewhere and only_switches(found)):
         raise _of_another(solution, statement, found)
-    if found or (solution.stored_problem is not None and unlike_text(solution.stored_problem, statement)):
+    if found or (kept is not None and unlike_text(kept, statement)):
         warn_user(
             f"Whether '{statement.name}' is the problem of the stored solution is known at the points kept in the file "
             "only: there all equations agree, but pieces or tables in them are written otherwise."
         )
-    whole = replace(solution, statement=statement)
-    return _with_violations(whole)
-
-
-def _other_casadi(solution: Solution) -> bool:
-    return solution.stored_problem is not None and solution.stored_problem.casadi != ca.CasadiMeta.version()
+    return _with_violations(replace(solution, extremal=replace(solution.extremal, stated=statement)))
 
 
 def _of_another(solution: Solution, statement: Statement, found: list[Difference]) -> ProblemError:
@@ -93,8 +88,7 @@ def _contradictions(solution: Solution, statement: Statement) -> list[Difference
     for name, old, new in zip(statement.state_names, solution.targets, targets, strict=True):
         if not np.isclose(old, new, rtol=SAME_RATES, atol=0.0, equal_nan=True):
             return [Difference(what=f"the final value of '{name}'", stored=f"{old:g}", given=f"{new:g}")]
-    along = replace(solution, statement=statement).extremal
-    rates, _ = rates_along(along)
+    rates, _ = rates_along(replace(solution.extremal, stated=statement))
     scale = np.abs(solution.rates).max(axis=0, initial=0.0)
     error = np.abs(rates - solution.rates) > SAME_RATES * np.maximum(scale, np.finfo(float).tiny)
     if error.any():

@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -61,10 +61,10 @@ class Fingerprint:
 
     casadi: str
     symbols: tuple[str, ...]
-    numbers: Mapping[str, Array]
-    points: Array
-    values: Mapping[str, Array]
-    switches: Array
+    numbers: Mapping[str, Annotated[Array, "some"]]
+    points: Annotated[Array, "points any"]
+    values: Mapping[str, Annotated[Array, "points any"]]
+    switches: Annotated[Array, "points any"]
     tables: tuple[str, ...]
 
     __repr__ = short_repr

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from covocp.base.matrices import Array, pack
+from covocp.base.matrices import Array, pack, standard_deviations
 from covocp.extremal.closed_loop import covariances_along, loop_substeps
-from covocp.extremal.extremal import Extremal
 from covocp.solution.solution import Solution
 
 # A deviation below this share of its largest predicted one counts as that share: what starts known is known.
@@ -54,10 +53,8 @@ def gains_are_steep(solution: Solution) -> bool:
     """Whether the feedback or the filter of a loop changes much within an interval: cheap, where a flight is not."""
     loop = solution.loop
     assert loop is not None
-    deviations = np.sqrt(np.maximum(np.diagonal(loop.X, axis1=1, axis2=2), 0.0))
-    errors = np.sqrt(np.maximum(np.diagonal(loop.E, axis1=1, axis2=2), 0.0))
-    feedback = np.linalg.norm(loop.gain * deviations.max(axis=0), axis=2)
-    return any(_largest_change(values) > STEEP for values in (feedback, errors))
+    feedback = np.linalg.norm(loop.gain * standard_deviations(loop.X).max(axis=0), axis=2)
+    return any(_largest_change(values) > STEEP for values in (feedback, standard_deviations(loop.E)))
 
 
 def _largest_change(values: Array) -> float:
@@ -74,8 +71,7 @@ def interpolated_flight(solution: Solution) -> Flight:
         solution: with a loop and its problem.
     """
     assert solution.loop is not None
-    extremal = solution.extremal
-    flown = covariances_along(extremal, _interpolated(solution, extremal))
+    flown = covariances_along(solution.extremal, _interpolated(solution))
     return compared(solution, flown, solution.loop.X, solution.t)
 
 
@@ -84,7 +80,7 @@ def compared(solution: Solution, flown: Array, predicted: Array, t: Array, small
 
     A deviation below the share `small` of its largest predicted one counts as that.
     """
-    actual, expected = (np.sqrt(np.maximum(np.diagonal(v, axis1=1, axis2=2), 0.0)) for v in (flown, predicted))
+    actual, expected = (standard_deviations(v) for v in (flown, predicted))
     floor = small * expected.max(axis=0)
     actual = np.where(np.isfinite(np.diagonal(flown, axis1=1, axis2=2)), np.maximum(actual, floor), np.inf)
     expected = np.maximum(expected, floor)
@@ -99,9 +95,9 @@ def compared(solution: Solution, flown: Array, predicted: Array, t: Array, small
     )
 
 
-def _interpolated(solution: Solution, extremal: Extremal) -> Array:
+def _interpolated(solution: Solution) -> Array:
     """x and half-vectors at equal parts of the intervals, (N, m + 1, size), as `Solution.at` has them."""
-    nodes, m = solution.t, loop_substeps(extremal)
+    nodes, m = solution.t, loop_substeps(solution.extremal)
     c = np.arange(m + 1) / m
     t = nodes[:-1, None] + np.diff(nodes)[:, None] * c
     t[:, -1] = nodes[1:]

@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, half_indices
+from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.origin import Classical
@@ -154,7 +154,7 @@ def _left_out(solution: Solution) -> Section:
         return []
     share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
     names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in entry_names((b,))]
-    spread = _roots(np.asarray(solution.loop.X))[-1] if solution.loop is not None else np.zeros(0)
+    spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
     worst = int(np.argmax(moved))
@@ -215,7 +215,7 @@ def _unknowns(solution: Solution) -> Section:
         means = np.atleast_1d(solution.values[b.name][0])
         deviations = np.full((2, b.size), np.nan)
         if solution.loop is not None:
-            deviations = _roots(solution.loop.E)[:, _rows(solution, b.name)]
+            deviations = standard_deviations(solution.loop.E)[:, _rows(solution, b.name)]
         elif _estimated(solution):
             deviations = solution.deviation(b.name).reshape(-1, b.size)
         entries = zip(entry_names((b,)), means, deviations[0], deviations[-1], strict=True)
@@ -228,17 +228,12 @@ def _rows(solution: Solution, name: str) -> list[int]:
     return [i for i, label in enumerate(solution.augmented) if label.split("[")[0] == name]
 
 
-def _roots(covariance: Array) -> Array:
-    """Standard deviations over time, (K, n)."""
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)))
-
-
 def _deviations(solution: Solution) -> Section:
     """What the actual states of a closed loop do at the end, and how much of it the filter does not know."""
     loop = solution.loop
     if loop is None:
         return []
-    total, error = _roots(loop.X), _roots(loop.E)
+    total, error = standard_deviations(loop.X), standard_deviations(loop.E)
     states = [i for b in solution.blocks if b.kind == "state" for i in _rows(solution, b.name)]
     rows = [
         [

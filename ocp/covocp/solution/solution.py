@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from itertools import accumulate
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import as_number, is_whole
-from covocp.base.errors import CovocpError, ProblemError
+from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import (
-    Array,
-    is_semidefinite,
-    smallest_eigenvalue,
-    unpack,
-    unpack_costate,
-)
+from covocp.base.matrices import Array, is_semidefinite, read_only, smallest_eigenvalue, unpack, unpack_costate
 from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
@@ -41,8 +37,6 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import matplotlib.figure
 
 
@@ -60,10 +54,7 @@ class Solution:
         converged: whether the method's own test was met.
         message: how the method ended.
         cost_terms: terminal and running cost.
-        mesh: nodes, controls, covariance step.
-        trajectory: x, u, e at the nodes, terminal time [s].
-        parameters: stacked values of known parameters and means of unknowns.
-        multipliers: of the constraints.
+        extremal: mesh, trajectory, parameters and multipliers, with the problem where that is known.
         rates: of x and e stacked, at the nodes, (K, nx + ne).
         end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
         filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
@@ -75,7 +66,6 @@ class Solution:
         augmented: names of the rows of the estimation covariance.
         targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
-        statement: the problem solved; None for a solution read from a file.
         stored_problem: of a solution read from a file, what its problem was, to tell it from others.
     """
 
@@ -84,22 +74,18 @@ class Solution:
     converged: bool
     message: str
     cost_terms: Mapping[str, float]
-    mesh: Mesh
-    trajectory: Trajectory
-    parameters: Array
-    multipliers: Multipliers
-    rates: Array
-    end_rates: Array
-    filter_gain: Array | None
+    extremal: Extremal
+    rates: Annotated[Array, "nodes xe"]
+    end_rates: Annotated[Array, "intervals xe"]
+    filter_gain: Annotated[Array, "nodes augmented any"] | None
     mesh_error: float
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
     blocks: tuple[Block, ...]
     augmented: tuple[str, ...]
-    targets: Array
+    targets: Annotated[Array, "x"]
     constraints: Mapping[str, tuple[str, ...]]
     loop: ClosedLoop | None = None
-    statement: Statement | None = None
     stored_costates: Costates | None = None
     stored_dense: Dense | None = None
     stored_optimality: Optimality | None = None
@@ -108,22 +94,17 @@ class Solution:
     @staticmethod
     def of(outcome: Outcome, method: str) -> Solution:
         """The solution of an outcome, with the estimate of its mesh error."""
-        extremal = outcome.extremal
-        st, trajectory = extremal.statement, extremal.trajectory
+        extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
         loop = close_loop(extremal) if st.loop is not None and np.isfinite(rates).all() else None
-        for array in (trajectory.x, trajectory.u, trajectory.e, rates, end_rates):
-            array.setflags(write=False)
-        return Solution(
+        read_only(extremal.trajectory)
+        solution = Solution(
             name=st.name,
             method=method,
             converged=outcome.converged,
             message=outcome.message,
             cost_terms=_split_cost(outcome.cost_terms, loop),
-            mesh=extremal.mesh,
-            trajectory=trajectory,
-            parameters=extremal.parameters,
-            multipliers=extremal.multipliers,
+            extremal=extremal,
             rates=rates,
             end_rates=end_rates,
             filter_gain=filter_gains(extremal),
@@ -135,8 +116,33 @@ class Solution:
             targets=st.boundary_values(extremal.parameters)[1],
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             loop=loop,
-            statement=st,
         )
+        return read_only(solution)
+
+    @property
+    def mesh(self) -> Mesh:
+        """Nodes, controls, covariance step."""
+        return self.extremal.mesh
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """x, u, e at the nodes, terminal time [s]."""
+        return self.extremal.trajectory
+
+    @property
+    def parameters(self) -> Array:
+        """Stacked values of known parameters and means of unknowns."""
+        return self.extremal.parameters
+
+    @property
+    def multipliers(self) -> Multipliers:
+        """Of the constraints."""
+        return self.extremal.multipliers
+
+    @property
+    def statement(self) -> Statement | None:
+        """The problem solved; None for a solution read from a file."""
+        return self.extremal.stated
 
     @property
     def cost(self) -> float:
@@ -166,7 +172,7 @@ class Solution:
     @property
     def t(self) -> Array:
         """Times of the nodes [s], shape (K,)."""
-        return np.asarray(self.mesh.nodes * self.duration)
+        return self.extremal.time
 
     @property
     def gains(self) -> Mapping[str, Array]:
@@ -179,34 +185,10 @@ class Solution:
         """The user's symbols by name; empty for a solution read from a file."""
         return self.statement.symbols if self.statement is not None else {}
 
-    @property
-    def extremal(self) -> Extremal:
-        """Trajectory and multipliers with the statement, for the functions of `hamiltonian`.
-
-        Raises:
-            CovocpError: where the solution was read from a file without its problem.
-        """
-        if self.statement is None:
-            raise CovocpError(
-                "This solution was read from a file and knows no problem: use load(path, problem=...) for this."
-            )
-        return Extremal(
-            statement=self.statement,
-            mesh=self.mesh,
-            trajectory=self.trajectory,
-            parameters=self.parameters,
-            multipliers=self.multipliers,
-        )
-
     @cached
     def costates(self) -> Costates:
         """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
-        if self.stored_costates is not None:
-            return self.stored_costates
-        costates, _, _ = discrete_costates(self.extremal)
-        for array in (costates.state, costates.matrices):
-            array.setflags(write=False)
-        return costates
+        return self.stored_costates or read_only(discrete_costates(self.extremal)[0])
 
     @cached
     def optimality(self) -> Optimality:
@@ -248,13 +230,7 @@ class Solution:
 
     def _all_covariances(self) -> list[Array]:
         loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]
-        return [self._matrix(b) for b in self._covariances()] + loop
-
-    def _covariances(self) -> list[Block]:
-        return [b for b in self.blocks if b.kind == "matrix" and b.covariance]
-
-    def _matrix(self, block: Block) -> Array:
-        return unpack(self.trajectory.e[:, block.span], block.size)
+        return [self.values[b.name] for b in self.blocks if b.kind == "matrix" and b.covariance] + loop
 
     def block(self, name: str) -> Block:
         """Where a name, or that of an entry of a vector, lies."""
@@ -272,16 +248,12 @@ class Solution:
     @cached
     def values(self) -> Mapping[str, Array]:
         """Values of all symbols at the nodes by name; read-only."""
-        values = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
-        for array in values.values():
-            array.setflags(write=False)
-        return values
+        return read_only(self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e))
 
     @property
     def controls(self) -> Array:
         """Controls at all K nodes; a constant control holds its last value at the last node."""
-        u = self.trajectory.u
-        return u if u.shape[0] == self.mesh.nodes.size else np.vstack([u, u[-1:]])
+        return self.extremal.controls
 
     def _assemble(self, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
         """Values by name at some times; x (K, nx), u (K, nu), e (K, ne)."""
@@ -304,13 +276,13 @@ class Solution:
         found = self._name(key, missing_ok=isinstance(key, ca.MX))
         if found:
             return entry_values(self.values, found)
-        extremal = self.extremal
+        statement = self.extremal.statement
         try:
-            function = extremal.statement.expression(key)
+            function = statement.expression(key)
         except RuntimeError as error:
             raise unknown_name(key, tuple(self.values)) from error
         count = self.mesh.nodes.size
-        value = np.asarray(function.map(count)(*extremal.columns()).full())
+        value = np.asarray(function.map(count)(*self.extremal.columns()).full())
         rows, columns = key.shape
         shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
         return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
@@ -358,12 +330,7 @@ class Solution:
     @cached
     def dense(self) -> Dense:
         """States and half-vectors between the nodes, read-only; computed when first asked for."""
-        if self.stored_dense is not None:
-            return self.stored_dense
-        dense = dense_output(self.extremal)
-        for array in (dense.knots, dense.values, dense.first, dense.last):
-            array.setflags(write=False)
-        return dense
+        return self.stored_dense or read_only(dense_output(self.extremal))
 
     @cached
     def _dense_states(self) -> Dense:
@@ -440,7 +407,7 @@ class Solution:
                 received=self.name,
                 remedy="index the matrices of the problem by their names",
             )
-        full = self._matrix(block) if self.loop is None else self.loop.X
+        full = self.values[block.name].copy() if self.loop is None else self.loop.X
         rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
         return np.asarray(full[:, rows, columns])
 
@@ -451,13 +418,10 @@ class Solution:
         return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
 
     def _augmented_span(self, key: Given) -> slice:
-        offset = 0
         both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
         candidates = tuple(q for q in both if entry_names((q,))[0] in self.augmented)  # constants of a gain have no row
-        rows = []
-        for q in candidates:
-            rows.append(replace(q, kind="state", offset=offset))
-            offset += q.size
+        offsets = accumulate((q.size for q in candidates), initial=0)
+        rows = [replace(q, kind="state", offset=offset) for q, offset in zip(candidates, offsets, strict=False)]
         found = block_of(self._name(key, candidates), rows)
         assert found is not None
         return found.span
@@ -490,11 +454,10 @@ class Solution:
 
     def passed_limits(self, points: int = 10) -> tuple[Passed, ...]:
         """What `check_path` finds, with the share of the limit and the time, the worst first."""
-        extremal = self.extremal
-        if not limited(extremal):
+        if not limited(self.extremal):
             return ()
-        whole = extremal.statement.path.uses_matrices or "dense" in self.__dict__ or self.stored_dense is not None
-        return passed_limits(extremal, self.dense if whole else self._dense_states, points)
+        whole = self.stored_dense or "dense" in self.__dict__ or self.extremal.statement.path.uses_matrices
+        return passed_limits(self.extremal, self.dense if whole else self._dense_states, points)
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.figure.plot_solutions`."""
@@ -507,8 +470,8 @@ class Solution:
         return later("solution.storage").save(self, path)  # type: ignore[no-any-return]
 
     def to_xarray(self) -> Any:
-        """The solution as an xarray.Dataset; see `covocp.solution.storage.to_xarray`."""
-        return later("solution.storage").to_xarray(self)
+        """The solution as an xarray.Dataset; see `covocp.solution.dataset.to_xarray`."""
+        return later("solution.dataset").to_xarray(self)
 
     def __repr__(self) -> str:
         """One line: what a console shows of a solution that nobody prints is no page of numbers."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.base.errors import warn_user
-from covocp.base.matrices import Array, half_indices
+from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.solution.solution import Solution
 from covocp.statement.statement import Conditions
 
@@ -29,8 +29,8 @@ def mention_spread(solution: Solution) -> None:
         rows = sorted({int(k) for i, j, there in pairs if there for k in (i, j) if k < moving})
         if not rows:  # what is constant scatters as it did; a condition on it is one on what is learnt
             continue
-        error = np.sqrt(np.diagonal(loop.E[at], axis1=1, axis2=2)[:, rows].clip(0.0))
-        actual = np.sqrt(np.diagonal(loop.X[at], axis1=1, axis2=2)[:, rows].clip(0.0))
+        error = standard_deviations(loop.E[at])[:, rows]
+        actual = standard_deviations(loop.X[at])[:, rows]
         excess: Array = np.where(actual > (1.0 + SAME_SPREAD) * error, actual - error, 0.0)
         if not np.any(excess):
             continue

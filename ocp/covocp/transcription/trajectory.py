@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -16,9 +17,9 @@ from covocp.transcription.mesh import Mesh
 class Trajectory:
     """Nominal and matrices at the nodes: x (N+1, nx), u (N+1 or N, nu), e (N+1, ne), terminal time [s]."""
 
-    x: Array
-    u: Array
-    e: Array
+    x: Annotated[Array, "nodes x"]
+    u: Annotated[Array, "controls u"]
+    e: Annotated[Array, "nodes e"]
     duration: float
 
     __repr__ = short_repr
@@ -44,17 +45,17 @@ class Multipliers:
     approximate the densities of the continuous problem.
     """
 
-    final: Array
-    final_matrices: Array
-    end: Array = field(default_factory=lambda: np.zeros(0))
-    start: Array = field(default_factory=lambda: np.zeros(0))
-    path: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    states: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    matrices: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    controls: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    final: Annotated[Array, "x"]
+    final_matrices: Annotated[Array, "e"]
+    end: Annotated[Array, "end"] = field(default_factory=lambda: np.zeros(0))
+    start: Annotated[Array, "start"] = field(default_factory=lambda: np.zeros(0))
+    path: Annotated[Array, "nodes path or none"] = field(default_factory=lambda: np.zeros((0, 0)))
+    states: Annotated[Array, "nodes x or none"] = field(default_factory=lambda: np.zeros((0, 0)))
+    matrices: Annotated[Array, "nodes e or none"] = field(default_factory=lambda: np.zeros((0, 0)))
+    controls: Annotated[Array, "controls u or none"] = field(default_factory=lambda: np.zeros((0, 0)))
     gaps: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    inside_path: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    inside_states: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    inside_path: Annotated[Array, "intervals inside path"] = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    inside_states: Annotated[Array, "intervals inside x"] = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     __repr__ = short_repr
 

@@ -21,8 +21,8 @@ import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from covocp.base.disk import abandoned, exchange, flush, held
 from covocp.base.errors import ExportError
+from covocp.base.files import abandoned, exchange, flush, held
 from covocp.export.compiled.building import FOLDER
 
 # What tells that a folder was written here, and may be replaced.
