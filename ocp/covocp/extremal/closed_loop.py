@@ -21,10 +21,10 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, unpack, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, simpson_weight
-from covocp.base.riccati_rates import inverse
+from covocp.base.quadrature import GAUSS_NODES, covariance_after, gauss_matrix, hermite, simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
@@ -157,17 +157,11 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
     step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
-    joint = np.zeros((2 * size, 2 * size))
-    joint[:size, :size] = statistics.initial
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
-    values[0] = joint
+    values[0, :size, :size] = statistics.initial
     matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
-    half = 2 * size
     for k, D in enumerate(matrices):
-        moved = D[half:, :half] + D[half:, half:] @ joint
-        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
-        joint = 0.5 * (joint + joint.T)
-        values[k + 1] = joint
+        values[k + 1] = covariance_after(D, values[k])
     return values
 
 
@@ -188,7 +182,7 @@ def loop_substeps(extremal: Extremal) -> int:
     if st.measurement is not None:
         _, M, U = (each(v) for v in st.measurement.map(count)(x, u, t, duration, p))
         E = unpack(extremal.trajectory.e[:, block.span], size)
-        loops.append(F - E @ M.transpose(0, 2, 1) @ np.linalg.solve(U, M))
+        loops.append(F - kalman_gain(E, M, U) @ M)
     rates = [np.abs(np.linalg.eigvals(matrix)).max(axis=1, initial=0.0) for matrix in loops]
     h = np.diff(extremal.time)
     stiff = max(float((np.maximum(rate[1:], rate[:-1]) * h).max(initial=0.0)) for rate in rates)
@@ -260,7 +254,7 @@ def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ..
     if statement.measurement is None:
         return E[:, :0], E[:0, :]
     _, M, U = statement.measurement(x, u, *rest)
-    return E @ M.T @ inverse(U), ca.densify(M)
+    return kalman_gain(E, M, U), ca.densify(M)
 
 
 def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Statistics) -> float | None:

@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, unpack_symbolic
-from covocp.base.riccati_rates import inverse
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
@@ -138,7 +138,7 @@ def _curved(st: Statement) -> ca.Function:
     if st.measurement is not None:
         measured, M, U = st.measurement(*at)
     E = unpack_symbolic(e[next(b for b in st.matrices if b.estimation).span], n)
-    K = E @ M.T @ inverse(U) if measured.shape[0] else symbolic.zeros(n, 0)
+    K = kalman_gain(E, M, U)
     C = loop.gain(*six)
     seen = ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -C]])
     both = ca.vertcat(rate, measured)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, unpack
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import one_sided
@@ -45,6 +46,6 @@ def filter_gains(extremal: Extremal) -> Array | None:
     U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
     E = unpack(extremal.trajectory.e[:, block.span], size)
     try:
-        return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
+        return np.asarray(kalman_gain(E, M, U))
     except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
         return None

@@ -19,6 +19,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, unpack
+from covocp.base.quadrature import covariance_after
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
@@ -195,9 +196,7 @@ def _passage(first: Array, forms: tuple[Array, Array, Array], times: Array) -> A
     try:
         for k in range(count - 1):
             D = np.linalg.solve(unit - h[k] / 2 + square[k], unit + h[k] / 2 + square[k])
-            moved = D[:, :size] + D[:, size:] @ values[k]
-            after = np.linalg.solve(moved[:size].T, moved[size:].T)
-            values[k + 1] = 0.5 * (after + after.T)
+            values[k + 1] = covariance_after(D, values[k])
     except np.linalg.LinAlgError:  # what comes after the point that cannot be stepped from counts as settled
         pass
     values[~np.isfinite(values).all(axis=(1, 2))] = 0.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
-from covocp.base.quadrature import GAUSS_NODES, gauss_transition
+from covocp.base.quadrature import GAUSS_NODES, covariance_after, gauss_transition
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
@@ -99,7 +99,7 @@ class Moves:
         n, m, _ = self.sizes
         z = np.eye(n + m + 1)
         for i in self.steps(k):
-            z, P = self.state[i] @ z, _moved(self.noise[i], P)
+            z, P = self.state[i] @ z, covariance_after(self.noise[i], P)
         return Period(transition=z[:n, :n], held=z[:n, n : n + m], offset=z[:n, n + m :], covariance=P)
 
     def measuring(self, k: int) -> tuple[Array, Array, Array]:
@@ -112,7 +112,7 @@ class Moves:
         n, m, r = self.sizes
         z, P = np.eye(n + r + m), np.zeros((n + r, n + r))
         for i in self.steps(k):
-            z, P = self.measured[i] @ z, _moved(self.measured_noise[i], P)
+            z, P = self.measured[i] @ z, covariance_after(self.measured_noise[i], P)
         return z[: n + r, :n], z[: n + r, n + r :], P
 
     def weighed(self, k: int, S: Array) -> Array:
@@ -124,7 +124,7 @@ class Moves:
         P = np.zeros((n + m, n + m))
         P[:n, :n] = S
         for i in reversed(self.steps(k)):
-            P = _moved(self.weight[i], P)
+            P = covariance_after(self.weight[i], P)
         return P
 
 
@@ -174,13 +174,6 @@ def _lyapunov(drifts: list[Array], noises: list[Array]) -> Array:
     zero = np.zeros_like(drifts[0])
     pairs = zip(drifts, noises, strict=True)
     return _transitions([_blocks([[-F.transpose(0, 2, 1), zero], [Q, F]], 2 * n) for F, Q in pairs])
-
-
-def _moved(D: Array, P: Array) -> Array:
-    """P after a step of a Lyapunov equation: its D12 vanishes."""
-    n = P.shape[0]
-    moved = np.linalg.solve(D[:n, :n].T, (D[n:, :n] + D[n:, n:] @ P).T)
-    return np.asarray(0.5 * (moved + moved.T))
 
 
 def _transitions(H: list[Array]) -> Array:

@@ -27,8 +27,10 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
+from covocp.base.gains import innovation_gain
 from covocp.base.matrices import Array, pack, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
     STATUSES,
@@ -207,12 +209,10 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
     for k in range(1, count + 1):
         Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
-        spreads.append(M[k] @ P @ M[k].T + U[k] / period)
-        gain = np.linalg.solve(spreads[k], M[k] @ P).T
-        rest = np.eye(n) - gain @ M[k]
-        P = rest @ P @ rest.T + gain @ (U[k] / period) @ gain.T
-        P = 0.5 * (P + P.T)
+        gain, spread = innovation_gain(P, M[k], U[k] / period, np.linalg.solve)
+        P = joseph_form(P, gain, M[k], U[k] / period)
         gains.append(gain)
+        spreads.append(spread)
     L = np.array(gains)
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
     parts |= {"g": g, "L": L}
