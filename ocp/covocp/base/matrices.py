@@ -123,6 +123,12 @@ def unpack_symbolic(half: Expr, size: int) -> Any:
     return ca.reshape(half[order], size, size)
 
 
+def stacked(value: Expr, count: int) -> Array:
+    """Matrices side by side, as a mapped function returns them, one after the other: (count, rows, columns)."""
+    numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value)
+    return numbers.reshape(numbers.shape[0], count, numbers.shape[1] // count).transpose(1, 0, 2)
+
+
 def smallest_eigenvalue(matrices: ArrayLike) -> float:
     """Smallest eigenvalue over all the symmetric matrices of shape (..., n, n); inf where there is none."""
     full = np.asarray(matrices, dtype=float)

@@ -45,6 +45,11 @@ def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr)
     )
 
 
+def interpolated(values: Array, old: Array, new: Array) -> Array:
+    """Columns, (K, n), interpolated linearly from their places to others."""
+    return np.array([np.interp(new, old, column) for column in values.T]).reshape(values.shape[1], new.size).T
+
+
 def simpson_weight(j: int, count: int) -> float:
     """Weight of point j of `count` equal steps, an even number, in the integral over [0, 1] by Simpson's rule."""
     return (1 if j in (0, count) else 4 if j % 2 else 2) / (3 * count)

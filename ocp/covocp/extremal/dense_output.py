@@ -22,7 +22,7 @@ from covocp.base.quadrature import hermite
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
-from covocp.statement.interval import one_sided
+from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.steps import KEPT, joint_interval, matrices_step, nominal_interval
 
@@ -189,15 +189,11 @@ class _Steps:
 
     def control(self, k: Expr, c: Array) -> Array:
         """Controls there, (m, nu)."""
-        u = self.extremal.controls
-        share = (1.0 - c if self.backward else c)[:, None]
-        held = self.extremal.mesh.control == "constant"
-        return np.asarray(u[k] if held else u[k] + share * (u[k + 1] - u[k]))
+        return self.extremal.control(k, 1.0 - c if self.backward else c)
 
     def fixed(self, count: int) -> tuple[Array, Array]:
         """Terminal time and parameters, a column each."""
-        duration, parameters = self.extremal.trajectory.duration, self.extremal.parameters
-        return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
+        return repeated(self.extremal.trajectory.duration, self.extremal.parameters, count)
 
     def advance(self, k: Expr, c: Array, d: Array, z: Array) -> Array:
         """The entries at the share d from those at c."""

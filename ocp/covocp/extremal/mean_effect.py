@@ -22,10 +22,11 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
-from covocp.base.matrices import Array, unpack_symbolic
+from covocp.base.matrices import Array, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
 
@@ -112,8 +113,8 @@ def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, A
         [np.dstack([loop.X, with_estimate]), np.dstack([with_estimate.transpose(0, 2, 1), loop.Xhat])], 1
     )
     values = _curved(st).map(count)(*columns, spread[part].transpose(1, 0, 2).reshape(2 * n, -1))
-    drift, forcing, slope = (np.asarray(v.full()) for v in values)
-    return drift.reshape(2 * n, count, 2 * n).transpose(1, 0, 2), forcing.T, slope.T
+    drift, forcing, slope = (stacked(v, count) for v in values)
+    return drift, forcing[:, :, 0], slope[:, :, 0]
 
 
 @lru_cache(maxsize=KEPT)
@@ -124,7 +125,7 @@ def _curved(st: Statement) -> ca.Function:
     assert loop is not None
     assert st.nominal is not None
     m = int(loop.gain.size1_out(0))
-    x, u, e, t, duration, p = six = [symbolic.sym(f"a{i}", k) for i, k in enumerate((st.nx, st.nu, st.ne, 1, 1, st.np))]
+    x, u, e, t, duration, p = six = model_symbols(st)
     spread = symbolic.sym("spread", 2 * n, 2 * n)
     unknowns = sum(b.size for b in st.of_kind("unknown"))
     z = symbolic.sym("z", n + m)  # augmented state and the controls that are fed back
@@ -137,7 +138,7 @@ def _curved(st: Statement) -> ca.Function:
     measured, M, U = symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0)
     if st.measurement is not None:
         measured, M, U = st.measurement(*at)
-    E = unpack_symbolic(e[next(b for b in st.matrices if b.estimation).span], n)
+    E = unpack_symbolic(e[st.estimation.span], n)
     K = kalman_gain(E, M, U)
     C = loop.gain(*six)
     seen = ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -C]])

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 
 # Share of an interval by which its ends are moved inside where the model is told the time, see `one_sided`.
@@ -88,6 +90,11 @@ class Interval(NamedTuple):
         n = self.s.shape[1]
         entries = zip(*(self.part(j / count, (j + 1) / count) for j in range(count)), strict=True)
         return Interval(*(ca.reshape(ca.vertcat(*each), each[0].shape[0], n * count) for each in entries))
+
+
+def repeated(duration: float, parameters: Array, count: int) -> tuple[Array, Array]:
+    """Terminal time and parameters, a column for each of several points."""
+    return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
 
 
 def model_symbols(statement: Statement, kind: Any = None) -> list[Expr]:

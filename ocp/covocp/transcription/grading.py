@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, unpack
-from covocp.base.quadrature import covariance_after
+from covocp.base.matrices import Array, stacked, unpack
+from covocp.base.quadrature import covariance_after, interpolated
 from covocp.base.short_repr import short_repr
+from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
@@ -173,14 +174,10 @@ def _forms(
     s = 1.0 - s if backward else s
     own = np.linspace(0.0, 1.0, guess.x.shape[0])
     at = own if guess.u.shape[0] == own.size else 0.5 * (own[1:] + own[:-1])
-    x, u = (
-        np.array([np.interp(s, nodes, column) for column in values.T]).reshape(values.shape[1], s.size)
-        for nodes, values in ((own, guess.x), (at, guess.u))
-    )
-    columns = (np.full((1, s.size), duration), np.tile(parameters[:, None], (1, s.size)))
-    values = form.map(s.size)(x, u, (duration * s)[None, :], *columns)
+    x, u = (interpolated(values, nodes, s).T for nodes, values in ((own, guess.x), (at, guess.u)))
+    values = form.map(s.size)(x, u, (duration * s)[None, :], *repeated(duration, parameters, s.size))
     sign = -1.0 if backward else 1.0
-    result = [sign * np.asarray(v.full()).reshape(size, s.size, size).transpose(1, 0, 2) for v in values]
+    result = [sign * stacked(v, s.size) for v in values]
     return tuple(np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0) for v in result)  # type: ignore[return-value]
 
 

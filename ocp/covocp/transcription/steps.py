@@ -281,6 +281,11 @@ def early(interval: Interval) -> Expr:
 
 
 @lru_cache(maxsize=KEPT)
+def moving_interval(statement: Statement, substeps: int, step: StepKind) -> ca.Function:
+    """The interval of what cannot be told apart: x and e stacked where rates of x contain e, else x."""
+    return (full_interval if statement.coupled else nominal_interval)(statement, substeps, step)
+
+
 def full_interval(statement: Statement, substeps: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 

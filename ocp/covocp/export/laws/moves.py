@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import GAUSS_NODES, covariance_after, gauss_transition
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
@@ -26,12 +25,6 @@ def nominal_values(tables: History, t: Array) -> tuple[Array, Array, Array]:
     values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
     x, u, e = (np.asarray(v.full()).T for v in values)
     return x, u, e
-
-
-def stacked(value: Expr, count: int) -> Array:
-    """Matrices beside each other as (count, rows, columns)."""
-    array = np.asarray(value.full())
-    return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
 
 
 class Period(NamedTuple):

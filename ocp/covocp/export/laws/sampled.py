@@ -28,7 +28,7 @@ import numpy as np
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.gains import innovation_gain
-from covocp.base.matrices import Array, pack, unpack_symbolic
+from covocp.base.matrices import Array, pack, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
@@ -45,7 +45,7 @@ from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.export.laws.moves import WHOLE, Moves, nominal_values, stacked
+from covocp.export.laws.moves import WHOLE, Moves, nominal_values
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
