@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import casadi as ca
+
 from covocp.base.checks import caller, check_symmetric, density_matrix, is_scalar
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -40,3 +44,12 @@ def with_rate(own: Declarations, symbol: Given, rate: Given, noise: Given) -> De
     one = density is not None and is_scalar(noise)
     entry = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
     return own.adding(rates={name: entry})
+
+
+def process_noise(own: Declarations) -> Any:
+    """Density of the process noise of the augmented state, in the user's symbols; of the unknowns it is zero."""
+    blocks: list[Any] = []
+    for entry in own.augmented:
+        given = own.rates.get(entry.name)
+        blocks.append(ca.MX(entry.size, entry.size) if given is None or given.noise is None else given.noise)
+    return ca.diagcat(*blocks)
