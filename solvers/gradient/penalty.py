@@ -83,6 +83,17 @@ class Weights:
     __repr__ = short_repr
 
 
+def limits(statement: Statement) -> tuple[Array, Array]:
+    """Lower and upper bounds of z = (x, e)."""
+    upper = np.concatenate([statement.state_bounds[1], np.full(statement.ne, np.inf)])
+    return np.concatenate([statement.state_bounds[0], statement.matrix_lower]), upper
+
+
+def limited(statement: Statement) -> Indices:
+    """Entries of z with a bound."""
+    return np.flatnonzero(np.isfinite(limits(statement)).any(axis=0))
+
+
 def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:
     """The groups of a statement that have rows.
 
@@ -95,9 +106,7 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
     steps = np.diff(mesh.nodes) * statement.duration.guess
     shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
     every, once = np.arange(n + 1), np.ones(1)
-    lower = np.concatenate([statement.state_bounds[0], statement.matrix_lower])
-    upper = np.concatenate([statement.state_bounds[1], np.full(statement.ne, np.inf)])
-    bounded = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    (lower, upper), bounded = limits(statement), limited(statement)
     names = (*statement.state_names, *statement.matrix_names)
     left = [i for i in range(statement.end.size) if i not in exact]
     path, end, start = statement.path, statement.end, statement.start

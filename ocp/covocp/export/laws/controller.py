@@ -166,14 +166,12 @@ def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
 def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Array:
     """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits."""
     m = design.sizes[1]
-    time = ca.MX.sym("time")
-    now = tables.at(time)
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
-    x, u, e = (np.asarray(v.full()) for v in ca.Function("nominal", [time], [now.x, now.u, now.e])(0.0))
+    x, u, e = (values[0] for values in tables.rows(np.zeros(1)))
     zeros |= {
-        "control": np.clip(u[:m].ravel(), *design.limits),
-        "nominal_control": u[:m].ravel(),
-        "nominal_state": x.ravel(),
+        "control": np.clip(u[:m], *design.limits),
+        "nominal_control": u[:m],
+        "nominal_state": x,
     }
     zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
     return np.concatenate(list(zeros.values()))
@@ -256,10 +254,7 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
     known = np.clip(np.nan_to_num(time, posinf=tables.duration, neginf=0.0), 0.0, tables.duration)
     steps = tables.duration * 10.0 ** random.uniform(-4.0, -1.5, count)
     last = np.clip(known - np.where(random.uniform(size=count) < 0.1, -steps, steps), 0.0, tables.duration)
-    at = ca.MX.sym("time")
-    now = tables.at(at)
-    F = ca.Function("nominal", [at], [now.x, now.u, now.e])
-    x, u, e = (np.asarray(v.full()) for v in F.map(count)(known[None, :]))
+    x, u, e = (values.T for values in tables.rows(known))
     model = design.model(x, u, known[None, :])
     expected, M, U = model.h, model.M, model.U
     C, E = (np.asarray(v.full()) for v in design.gain.map(count)(x, u, e, known[None, :]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, stacked
@@ -16,15 +15,6 @@ from covocp.export.laws.history import History
 
 # Times that differ by less than this share of a period are the same.
 WHOLE = 1e-9
-
-
-def nominal_values(tables: History, t: Array) -> tuple[Array, Array, Array]:
-    """x, u, e at some times, rows."""
-    time = ca.MX.sym("time")
-    now = tables.at(time)
-    values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
-    x, u, e = (np.asarray(v.full()).T for v in values)
-    return x, u, e
 
 
 class Period(NamedTuple):
@@ -141,7 +131,7 @@ class _Point:
     @staticmethod
     def at(design: Design, tables: History, t: Array, h: Array) -> _Point:
         """At some times, for steps of some lengths."""
-        x, u, _ = nominal_values(tables, t)
+        x, u, _ = tables.rows(t)
         columns = x.T, u.T, t[None, :]
         F, G, _, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
         Q = h * stacked(design.noise.map(t.size)(*columns), t.size)

@@ -45,7 +45,7 @@ from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.export.laws.moves import WHOLE, Moves, nominal_values
+from covocp.export.laws.moves import WHOLE, Moves
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
@@ -234,7 +234,7 @@ def _correlations(spreads: Array) -> Array:
 
 def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
     """x, u, e, h, M, H, U, C at the samples."""
-    x, u, e = nominal_values(tables, t)
+    x, u, e = tables.rows(t)
     h, M, H, U = (stacked(v, t.size) for v in design.model(x.T, u.T, t[None, :])[2:])
     C = stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
     return x, u, e, h, M, H, U, C
