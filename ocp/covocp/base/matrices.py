@@ -139,7 +139,7 @@ def smallest_eigenvalue(matrices: ArrayLike) -> float:
     return float(np.linalg.eigvalsh(full).min())
 
 
-def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERANCE) -> bool:
+def is_semidefinite(matrices: ArrayLike) -> bool:
     """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff."""
     full = np.asarray(matrices, dtype=float)
     if full.size == 0:
@@ -147,4 +147,4 @@ def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERAN
     if not np.all(np.isfinite(full)):
         return False
     values = np.linalg.eigvalsh(full)
-    return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
+    return bool(np.all(values[..., 0] >= -SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[..., -1]), 1e-300)))

@@ -84,18 +84,11 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
             return None
         cost += h[k] / 2 * float(c @ state + e @ after)
         states[k + 1] = state = after
-    at_end = st.loop.terminal.jacobian()(
-        extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters, *_terminal(extremal)
-    )
+    end = (extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters)
+    at_end = st.loop.terminal.jacobian()(*end, *st.loop.terminal(*end))
     unknowns = [i for b in st.of_kind("unknown") for i in range(b.span.start, b.span.stop)]
     slope = np.hstack([np.asarray(at_end[0].full())[0, : n - len(unknowns)], np.asarray(at_end[2].full())[0, unknowns]])
     return MeanEffect(mean=states[:, :n], estimate=states[:, n:], cost=cost + float(slope @ states[-1, :n]))
-
-
-def _terminal(extremal: Extremal) -> Any:
-    """Values of the terminal function, which its Jacobian wants as arguments."""
-    loop: Any = extremal.statement.loop
-    return loop.terminal(extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters)
 
 
 def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, Array, Array]:

@@ -97,8 +97,8 @@ def repeated(duration: float, parameters: Array, count: int) -> tuple[Array, Arr
     return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
 
 
-def model_symbols(statement: Statement, kind: Any = None) -> list[Expr]:
+def model_symbols(statement: Statement) -> list[Expr]:
     """Symbols of the arguments of the model: state, control, half-vectors, time, duration, parameters."""
-    kind = statement.symbolic if kind is None else kind
+    kind: Any = statement.symbolic
     sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
     return [kind.sym(f"a{i}", size) for i, size in enumerate(sizes)]

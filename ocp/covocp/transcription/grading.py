@@ -147,7 +147,7 @@ def _steepness(
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
         if form is not None and block.backward == backward and (block.estimation or block.backward):
             first = _first_value(statement, guess, parameters, block)
-            forms = _forms(form, block.size, guess, parameters, times, backward)
+            forms = _forms(form, guess, parameters, times, backward)
             values = _passage(first, forms, times)
             rates = np.maximum(rates, _changes(values, forms))
             drift = forms[0] - values @ forms[2]
@@ -166,7 +166,7 @@ def _first_value(statement: Statement, guess: Trajectory, parameters: Array, blo
 
 
 def _forms(
-    form: Expr, size: int, guess: Trajectory, parameters: Array, times: Array, backward: bool
+    form: Expr, guess: Trajectory, parameters: Array, times: Array, backward: bool
 ) -> tuple[Array, Array, Array]:
     """F, Q, W in the direction of travel at some distances from the end, along the guess; (points, n, n) each."""
     duration = guess.duration
