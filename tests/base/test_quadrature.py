@@ -14,6 +14,7 @@ from covocp.base.quadrature import (
     gauss_transition,
     hermite,
     interpolated,
+    lyapunov_after,
     simpson_weight,
 )
 
@@ -95,8 +96,21 @@ def test_covariance_of_an_integrated_white_noise_is_exact():
     """P = [t^3/3 t^2/2; t^2/2 t] from zero: the method of order 4 is exact for cubics."""
     F, Q, t = np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, 1.0]), 0.7
     generator = t * np.block([[-F.T, np.zeros((2, 2))], [Q, F]])
-    after = covariance_after(gauss_transition([generator] * 2, np.eye(4), np.linalg.solve), np.zeros((2, 2)))
-    np.testing.assert_allclose(after, [[t**3 / 3, t**2 / 2], [t**2 / 2, t]], rtol=1e-13)
+    D = gauss_transition([generator] * 2, np.eye(4), np.linalg.solve)
+    for step in (covariance_after, lyapunov_after):
+        np.testing.assert_allclose(step(D, np.zeros((2, 2))), [[t**3 / 3, t**2 / 2], [t**2 / 2, t]], rtol=1e-13)
+
+
+def test_a_lyapunov_step_does_not_see_what_rounding_leaves():
+    F, P, t = np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([1e16, 1.0]), 0.7
+    D = gauss_transition(
+        [t * np.block([[-F.T, np.zeros((2, 2))], [np.zeros((2, 2)), F]])] * 2, np.eye(4), np.linalg.solve
+    )
+    move = np.array([[1.0, t], [0.0, 1.0]])
+    expected = lyapunov_after(D, P)
+    np.testing.assert_allclose(expected, move @ P @ move.T, rtol=1e-13)
+    D[:2, 2:] = 1e-17
+    np.testing.assert_array_equal(lyapunov_after(D, P), expected)
 
 
 def test_interpolation_is_exact_for_lines_and_knows_what_has_no_columns():

@@ -24,7 +24,7 @@ from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array, stacked, unpack, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, covariance_after, gauss_matrix, hermite, simpson_weight
+from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after, simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
@@ -160,7 +160,7 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
     values[0, :size, :size] = statistics.initial
     for k, D in enumerate(stacked(step, n * m)):
-        values[k + 1] = covariance_after(D, values[k])
+        values[k + 1] = lyapunov_after(D, values[k])
     return values
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from covocp.base.matrices import Array, stacked
-from covocp.base.quadrature import GAUSS_NODES, covariance_after, gauss_transition
+from covocp.base.quadrature import GAUSS_NODES, gauss_transition, lyapunov_after
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
@@ -82,7 +82,7 @@ class Moves:
         n, m, _ = self.sizes
         z = np.eye(n + m + 1)
         for i in self.steps(k):
-            z, P = self.state[i] @ z, covariance_after(self.noise[i], P)
+            z, P = self.state[i] @ z, lyapunov_after(self.noise[i], P)
         return Period(transition=z[:n, :n], held=z[:n, n : n + m], offset=z[:n, n + m :], covariance=P)
 
     def measuring(self, k: int) -> tuple[Array, Array, Array]:
@@ -95,7 +95,7 @@ class Moves:
         n, m, r = self.sizes
         z, P = np.eye(n + r + m), np.zeros((n + r, n + r))
         for i in self.steps(k):
-            z, P = self.measured[i] @ z, covariance_after(self.measured_noise[i], P)
+            z, P = self.measured[i] @ z, lyapunov_after(self.measured_noise[i], P)
         return z[: n + r, :n], z[: n + r, n + r :], P
 
     def weighed(self, k: int, S: Array) -> Array:
@@ -107,7 +107,7 @@ class Moves:
         P = np.zeros((n + m, n + m))
         P[:n, :n] = S
         for i in reversed(self.steps(k)):
-            P = covariance_after(self.weight[i], P)
+            P = lyapunov_after(self.weight[i], P)
         return P
 
 
