@@ -37,9 +37,8 @@ from covocp.statement.statement import Statement
 from covocp.transcription.domain import needs_exact_bounds
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
-from covocp.transcription.nlp import NLP, Scales, check_finite
-from covocp.transcription.scales import choose_scales
-from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.nlp import NLP, QUIET, Scales, check_finite
+from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 
@@ -52,9 +51,6 @@ LARGEST_ROUNDS = 6
 # A run that ends after so few iterations had met its tolerance where it began: the next one has this share of it.
 AT_ONCE, STRICTER = 1, 0.03
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
-# Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
-# curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
-STRETCH = 10.0
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
@@ -119,8 +115,7 @@ def prepare(
     mesh = resolve_mesh(statement, options, statement.values)
     limited = hessian == "limited-memory" or (hessian == "auto" and mesh.eliminated and bool(statement.matrices))
     limited = limited and plugin == "ipopt"
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
-    settings["calc_lam_p"] = False
+    settings: dict[str, Any] = dict(QUIET)
     if plugin == "ipopt":
         settings["ipopt"] = {
             "print_level": 0,
@@ -161,16 +156,12 @@ def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plug
     }
     for name, value in given.items():
         if plugin != "ipopt" and value is not None:
-            raise _option_error(name, f"nothing: it is Ipopt's, and '{plugin}' takes plugin_options", value)
-
-
-def _option_error(name: str, expected: str, received: Given) -> ProblemError:
-    return ProblemError(
-        f"The option '{name}' has a value that does not apply.",
-        expected=expected,
-        received=repr(received),
-        remedy=f"correct {name}=",
-    )
+            raise ProblemError(
+                f"The option '{name}' has a value that does not apply.",
+                expected=f"nothing: it is Ipopt's, and '{plugin}' takes plugin_options",
+                received=repr(value),
+                remedy=f"correct {name}=",
+            )
 
 
 class ShootingSolver:
@@ -304,11 +295,12 @@ class ShootingSolver:
             stats = solver.stats()
         w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
         success, status = bool(stats["success"]), str(stats.get("return_status", ""))
+        evaluable = True
         try:
             where = nlp.unpack(w, parameters)
         except RuntimeError:  # a solve inside the model that gives up: the last iterate is lost, the start is not
             w, lam_x, lam_g, where = w0, 0.0 * lam_x, 0.0 * lam_g, nlp.unpack(w0, parameters)
-            success, status = False, NOT_EVALUABLE.format(status)
+            success, status, evaluable = False, NOT_EVALUABLE.format(status), False
         return Point(
             w=w,
             lam_x=scale * lam_x,
@@ -317,6 +309,7 @@ class ShootingSolver:
             success=success,
             status=status,
             iterations=int(stats.get("iter_count", -1)),
+            evaluable=evaluable,
         )
 
     def _lost_way(self, status: str) -> dict[str, Any]:
@@ -353,7 +346,7 @@ class ShootingSolver:
             return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
         if last.residuals is not None and last.point.success:
             return f"{STALE}: {last.residuals}; {REMEDY}"
-        if status.startswith(NOT_EVALUABLE.format("")):
+        if not last.point.evaluable:
             return status
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
@@ -375,10 +368,7 @@ class ShootingSolver:
     def _transcribe(self, scales: Scales) -> None:
         """The NLP in these scales, and its solver."""
         if self._limited:
-            # in these units equal changes of two control values cost the same, however long their intervals are
-            weights = quadrature_weights(self._mesh)
-            units = np.sqrt(weights.mean() / weights)[:, None]
-            scales = replace(scales, x=STRETCH * scales.x, u=scales.u * units)
+            scales = evened(scales, self._mesh)
         self._nlp = transcribe(self._statement, self._mesh, scales)
         if self._plugin == "ipopt":
             self._monitor = Monitor(self._nlp)

@@ -29,7 +29,10 @@ Evaluated = tuple[Trajectory, dict[str, Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """Where a run of the NLP solver ended: variables, multipliers for a cost scale of 1, and how it ended."""
+    """Where a run of the NLP solver ended: variables, multipliers for a cost scale of 1, and how it ended.
+
+    evaluable: whether the model has values there; else this is where the run began.
+    """
 
     w: Array
     lam_x: Array
@@ -38,6 +41,7 @@ class Point:
     success: bool
     status: str
     iterations: int
+    evaluable: bool
 
     __repr__ = short_repr
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from covocp.solvers.endings import Ending
 
 
-class Status(Enum):
+class Status(Ending):
     """Ipopt's own name of the ending, what it means, what to do."""
 
     SOLVED = ("Solve_Succeeded", "solved", "")
@@ -41,10 +41,6 @@ class Status(Enum):
     def __init__(self, name_of_ipopt: str, words: str, advice: str) -> None:
         """Keep the parts of the value by name."""
         self.name_of_ipopt, self.words, self.advice = name_of_ipopt, words, advice
-
-    def __str__(self) -> str:
-        """In words, with what to do."""
-        return f"{self.words}: {self.advice}" if self.advice else self.words
 
     @property
     def lost(self) -> bool:

@@ -34,17 +34,18 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import backward_interval, forward_costates
 from covocp.extremal.hamiltonian import hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
-from covocp.statement.interval import Interval
+from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import full_interval, inside_interval, nominal_interval
+from covocp.transcription.trajectory import at_nodes
 
 # Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.
 LARGEST_FLAT = 10_000
@@ -338,7 +339,7 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
         jumps: of the costates at the nodes (N + 1, size), from the penalties; the last is added to the terminal value.
     """
     mesh, pairs = sweeps.mesh, sweeps.pairs
-    n, size, width = mesh.intervals, run.z.shape[1], 1 + len(sweeps.terminal.names)
+    n, size = mesh.intervals, run.z.shape[1]
     common = interval_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
     points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
     z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
@@ -350,12 +351,11 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     last[:, 0] += jumps[-1]
     last[behind, 0] = given_end
     order = list(range(n - 1, -1, -1))
-    stacked = [ca.DM(v[::-1].transpose(2, 0, 1).reshape(v.shape[2], n * v.shape[1])) for v in (z, given)]
+    along = [ca.DM(v[::-1].transpose(2, 0, 1).reshape(v.shape[2], n * v.shape[1])) for v in (z, given)]
     columns = [column[:, order] for column in common]
-    starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), *stacked, *columns)
-    at_nodes = np.asarray(starts.full()).reshape(size, n, width)[:, ::-1].transpose(1, 0, 2)
-    at_pairs = np.asarray(passed.full()).reshape(size, n, pairs * width)[:, ::-1].transpose(1, 0, 2)
-    middles = (z, np.concatenate([at_nodes, last[None]]), at_pairs, by_duration.ravel())
+    starts, passed = sweeps.backward(last, ca.DM(jumps[:-1][::-1].T), *along, *columns)
+    nodes = np.concatenate([stacked(starts, n)[::-1], last[None]])
+    middles = (z, nodes, stacked(passed, n)[::-1], by_duration.ravel())
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
@@ -374,8 +374,8 @@ def reweigh(sweeps: Sweeps, slopes: Slopes, u: Array, duration: float, parameter
 
 
 def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middles: tuple[Array, ...]) -> Slopes:
-    z, at_nodes, at_pairs, by_duration = middles
-    n, size, width = sweeps.mesh.intervals, z.shape[2], at_nodes.shape[2]
+    z, columns, at_pairs, by_duration = middles
+    n, size, width = sweeps.mesh.intervals, z.shape[2], columns.shape[2]
     nu = sweeps.statement.nu
 
     def side_by_side(values: Array) -> Any:
@@ -383,7 +383,7 @@ def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middle
 
     common = interval_columns(sweeps.mesh, ca.DM(u.T), duration, ca.DM(parameters))
     outputs = sweeps.quadrature(
-        side_by_side(at_nodes[1:]), side_by_side(at_pairs), side_by_side(z.transpose(0, 2, 1)), *common
+        side_by_side(columns[1:]), side_by_side(at_pairs), side_by_side(z.transpose(0, 2, 1)), *common
     )
     first, second, by_time, cost_first, cost_second = (np.asarray(v.full()) for v in outputs)
 
@@ -399,18 +399,17 @@ def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middle
         control=gather(first, second, width),
         cost=gather(cost_first, cost_second, 1)[0],
         duration=by_duration + by_time.reshape(n, width).sum(axis=0),
-        start=at_nodes[0].T,
-        columns=at_nodes,
+        start=columns[0].T,
+        columns=columns,
         middles=middles,
     )
 
 
 def control_curvature(sweeps: Sweeps, run: Run, u: Array, columns: Array, ell: Array, parameters: Array) -> Array:
     """H_uu at the nodes, (N + 1, nu, nu), with the costates p + R l, P + R_E l."""
-    st, n = sweeps.statement, sweeps.mesh.intervals
     costates = columns[:, :, 0] + columns[:, :, 1:] @ ell
     values = sweeps.curvature(*_at_nodes(sweeps, run, u, costates, parameters))
-    return np.asarray(values.full()).reshape(st.nu, n + 1, st.nu).transpose(1, 0, 2)
+    return stacked(values, sweeps.mesh.intervals + 1)
 
 
 def control_sizes(sweeps: Sweeps, run: Run, columns: Array, ell: Array, parameters: Array) -> Array:
@@ -418,7 +417,7 @@ def control_sizes(sweeps: Sweeps, run: Run, columns: Array, ell: Array, paramete
     costates = np.abs(columns[:, :, 0]) + np.abs(columns[:, :, 1:]) @ np.abs(ell)
     terms = np.asarray(sweeps.terms(*_at_nodes(sweeps, run, run.u, costates, parameters)).full()).T
     curvature = control_curvature(sweeps, run, run.u, columns, ell, parameters)
-    return slope_sizes(terms, curvature, controls_at_nodes(run.u, sweeps.mesh.intervals))
+    return slope_sizes(terms, curvature, at_nodes(run.u, sweeps.mesh.nodes.size))
 
 
 def _at_nodes(sweeps: Sweeps, run: Run, u: Array, costates: Array, parameters: Array) -> tuple[Array, ...]:
@@ -426,16 +425,10 @@ def _at_nodes(sweeps: Sweeps, run: Run, u: Array, costates: Array, parameters: A
     nx, n = sweeps.statement.nx, sweeps.mesh.intervals
     return (
         run.z[:, :nx].T,
-        controls_at_nodes(u, n).T,
+        at_nodes(u, n + 1).T,
         run.z[:, nx:].T,
         (sweeps.mesh.nodes * run.duration)[None, :],
-        np.full((1, n + 1), run.duration),
-        np.tile(parameters[:, None], (1, n + 1)),
+        *repeated(run.duration, parameters, n + 1),
         costates[:, :nx].T,
         costates[:, nx:].T,
     )
-
-
-def controls_at_nodes(u: Array, intervals: int) -> Array:
-    """Controls at all N + 1 nodes."""
-    return u if u.shape[0] == intervals + 1 else np.vstack([u, u[-1:]])

@@ -28,7 +28,17 @@ from covocp.solvers.gradient.influence import (
     sweep_forward,
 )
 from covocp.solvers.gradient.memory import learnt
-from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights, evaluate_penalty, first_weights, violation
+from covocp.solvers.gradient.penalty import (
+    Group,
+    Indices,
+    Penalty,
+    Weights,
+    evaluate_penalty,
+    first_weights,
+    limited,
+    limits,
+    violation,
+)
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
 from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import choose_scales
@@ -244,7 +254,7 @@ class Space:
             blocks = np.broadcast_to(given, (mesh.intervals + 1, st.nu, st.nu))
         metric = control_metric(mesh, run.duration, blocks)
         if penalty.any():
-            metric = metric + _block_diagonal(self._fold(penalty))
+            metric = metric + sparse.block_diag(list(self._fold(penalty)), format="csc")
         return with_extra(metric, self.extra)
 
     def room(self, iterate: Iterate) -> tuple[Array, Array]:
@@ -330,7 +340,7 @@ class Space:
             elif group.kind == "end":
                 end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
             else:
-                bounds[1:, self._bounded()] = values
+                bounds[1:, limited(st)] = values
         final += bounds[-1]
         bounds[-1] = 0.0
         controls = -np.where(measures.active, measures.residual, 0.0)[: self.controls].reshape(zero.controls.shape)
@@ -344,12 +354,6 @@ class Space:
             matrices=bounds[:, st.nx :],
             controls=controls,
         )
-
-    def _bounded(self) -> Indices:
-        st = self.sweeps.statement
-        lower = np.concatenate([st.state_bounds[0], st.matrix_lower])
-        upper = np.concatenate([st.state_bounds[1], np.full(st.ne, np.inf)])
-        return np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
 
     def violations(self, iterate: Iterate, tolerance: float) -> dict[str, float]:
         """Largest violation of each violated constraint, in its own unit, by name."""
@@ -367,11 +371,6 @@ class Space:
                 if value > tolerance * scale
             }
         return dict(sorted(result.items(), key=lambda entry: -entry[1]))
-
-
-def _block_diagonal(blocks: Array) -> Any:
-    """Sparse block-diagonal matrix."""
-    return sparse.block_diag(list(blocks), format="csc")
 
 
 def _point(space: Space, trajectory: Trajectory) -> Array:
@@ -406,8 +405,7 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
     z_scale = np.concatenate([scales.x, scales.e])
     timed = int(st.duration.free)
     unit = np.concatenate([np.tile(scales.u, mesh.control_nodes), [scales.duration] * timed, z_scale[free]])
-    z_lower = np.concatenate([st.state_bounds[0], st.matrix_lower])
-    z_upper = np.concatenate([st.state_bounds[1], np.full(st.ne, np.inf)])
+    z_lower, z_upper = limits(st)
     bounds = []
     for control, time, z in (
         (st.control_bounds[0], st.duration.lower, z_lower),

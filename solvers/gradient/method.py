@@ -44,8 +44,9 @@ from covocp.solvers.gradient.influence import build_sweeps
 from covocp.solvers.gradient.iterate import Space, make_space
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
-from covocp.solvers.gradient.records import Iterate, Measures
-from covocp.solvers.gradient.search import Search, Settings, Variant
+from covocp.solvers.gradient.records import Iterate
+from covocp.solvers.gradient.search import End, Search, Settings, Variant
+from covocp.solvers.gradient.statuses import Status
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh, Options
@@ -198,18 +199,15 @@ class GradientSolver:
                 remedy="give another guess of the controls, more intervals, or use method='ipopt'",
             )
         search = Search(space, self._settings, progress)
-        current, measures, message, converged = search.run(current)
+        end = search.run(current)
         return self._outcome(
             space,
-            current,
-            measures,
-            message,
-            converged,
+            end,
             {
                 "iterations": search.control.iterations,
                 "build_seconds": built - begin,
                 "solve_seconds": time.perf_counter() - built,
-                "return_status": message,
+                "return_status": str(end.status),
                 "variant": self._settings.variant,
                 "weight": search.control.weight,
                 "passes": search.passes,
@@ -230,23 +228,21 @@ class GradientSolver:
         run, nx = iterate.run, self._statement.nx
         return Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
 
-    def _outcome(
-        self, space: Space, last: Iterate, measures: Measures, message: str, converged: bool, stats: dict[str, Any]
-    ) -> Outcome:
+    def _outcome(self, space: Space, end: End, stats: dict[str, Any]) -> Outcome:
         """The last iterate as data."""
-        run = last.run
+        run = end.iterate.run
         return Outcome(
             extremal=Extremal(
                 stated=self._statement,
                 mesh=self._mesh,
-                trajectory=self._trajectory(last),
+                trajectory=self._trajectory(end.iterate),
                 parameters=space.parameters,
-                multipliers=space.multipliers(last, measures),
+                multipliers=space.multipliers(end.iterate, end.measures),
             ),
             cost_terms={"terminal": run.terminal, "running": run.running},
-            converged=converged,
-            message=message,
-            violations=space.violations(last, self._settings.violation_tolerance),
+            converged=end.status is Status.SOLVED,
+            message=str(end.status),
+            violations=space.violations(end.iterate, self._settings.violation_tolerance),
             stats=stats,
         )
 

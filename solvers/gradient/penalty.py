@@ -20,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
-from covocp.solvers.gradient.influence import Run, controls_at_nodes
+from covocp.solvers.gradient.influence import Run
+from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
+from covocp.transcription.trajectory import at_nodes
 
 Indices = NDArray[np.intp]
 
@@ -81,6 +83,17 @@ class Weights:
     __repr__ = short_repr
 
 
+def limits(statement: Statement) -> tuple[Array, Array]:
+    """Lower and upper bounds of z = (x, e)."""
+    upper = np.concatenate([statement.state_bounds[1], np.full(statement.ne, np.inf)])
+    return np.concatenate([statement.state_bounds[0], statement.matrix_lower]), upper
+
+
+def limited(statement: Statement) -> Indices:
+    """Entries of z with a bound."""
+    return np.flatnonzero(np.isfinite(limits(statement)).any(axis=0))
+
+
 def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:
     """The groups of a statement that have rows.
 
@@ -93,9 +106,7 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
     steps = np.diff(mesh.nodes) * statement.duration.guess
     shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
     every, once = np.arange(n + 1), np.ones(1)
-    lower = np.concatenate([statement.state_bounds[0], statement.matrix_lower])
-    upper = np.concatenate([statement.state_bounds[1], np.full(statement.ne, np.inf)])
-    bounded = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    (lower, upper), bounded = limits(statement), limited(statement)
     names = (*statement.state_names, *statement.matrix_names)
     left = [i for i in range(statement.end.size) if i not in exact]
     path, end, start = statement.path, statement.end, statement.start
@@ -202,13 +213,12 @@ def first_weights(
 
 def _evaluate(group: Group, mesh: Mesh, run: Run, parameters: Array, weights: Array, shifts: Array) -> list[Array]:
     count = group.nodes.size
-    controls = controls_at_nodes(run.u, mesh.intervals)[group.nodes]
+    controls = at_nodes(run.u, mesh.nodes.size)[group.nodes]
     outputs = group.function(
         run.z[group.nodes].T,
         controls.T,
         mesh.nodes[group.nodes][None, :],
-        np.full((1, count), run.duration),
-        np.tile(parameters[:, None], (1, count)),
+        *repeated(run.duration, parameters, count),
         weights.T,
         shifts.T,
     )
@@ -230,7 +240,7 @@ def evaluate_penalty(groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters
         multipliers.append(outputs[4].T)
         excess.append(outputs[5].T)
         room.append(outputs[7].T)
-        curvature[group.nodes] += outputs[6].reshape(nu, group.nodes.size, nu).transpose(1, 0, 2)
+        curvature[group.nodes] += stacked(outputs[6], group.nodes.size)
     return Penalty(
         value=value,
         jumps=jumps,

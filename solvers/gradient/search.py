@@ -22,6 +22,7 @@ from covocp.solvers.gradient.iterate import Space
 from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
 from covocp.solvers.gradient.penalty import next_weights
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
+from covocp.solvers.gradient.statuses import Status
 
 # On the slopes, unless the user gives another.
 TOLERANCE = 1e-6
@@ -46,11 +47,9 @@ TERMINAL_SHARE = 1e-2
 LARGEST_PASSES = 30
 # Iterations in which the miss must fall by a tenth while it is above its tolerance.
 PATIENCE = 100
-RAISE_WEIGHT = "raise the weight, or weight_factor"
 # A fixed W that is too small lets the cost grow; above this multiple of the first cost there is no way back.
 DIVERGED = 1e8
 FIRST_PASS_TOLERANCE = 1e-2
-INFINITE_SLOPES = "the slopes are NaN or inf where the cost is not: bound what the model cannot be differentiated at"
 PASS_FACTOR = 0.1
 
 
@@ -91,16 +90,12 @@ class _Control:
     __repr__ = short_repr
 
 
-CONTRADICTING = "the penalties do not remove the violations: they may contradict"
-
-
-class Ending(NamedTuple):
-    """The last iterate, its measures, how the run ended, whether it converged."""
+class End(NamedTuple):
+    """The last iterate, its measures, how the run ended."""
 
     iterate: Iterate
     measures: Measures
-    message: str
-    converged: bool
+    status: Status
 
 
 class Search:
@@ -112,23 +107,24 @@ class Search:
         self.passes = 0
         self.reached: Residuals | None = None
 
-    def run(self, current: Iterate) -> Ending:
-        """All passes; returns the last iterate, its measures, how it ended, whether it converged."""
+    def run(self, current: Iterate) -> End:
+        """All passes."""
         space, settings = self.space, self.settings
         tolerance = settings.tolerance if not space.groups else max(settings.tolerance, FIRST_PASS_TOLERANCE)
         before = np.full(len(space.groups), np.inf)
         limit = LIMIT * max(1.0, settings.tolerance / TOLERANCE)
         while True:
-            current, measures, message, done = self._pass(current, tolerance)
+            end = self._pass(current, tolerance)
+            current = end.iterate
             self.passes += 1
             worst = space.violation(current)
-            if not done or not space.groups:
-                return Ending(current, measures, message, done)
+            if end.status is not Status.SOLVED or not space.groups:
+                return end
             tight = tolerance <= settings.tolerance and worst.max(initial=0.0) <= settings.violation_tolerance
             if tight and self.reached is not None and self.reached.hold(limit):
-                return Ending(current, measures, message, True)
+                return end
             if self.passes >= LARGEST_PASSES:
-                return Ending(current, measures, CONTRADICTING, False)
+                return end._replace(status=Status.VIOLATED)
             factor = PASS_FACTOR if worst.any() else 0.0
             tolerance = max(settings.tolerance, factor * tolerance)
             space = self.space = space.with_weights(next_weights(current.penalty, space.weights, before, worst))
@@ -137,12 +133,12 @@ class Search:
             self.control.past.clear()
             self.control.pairs.clear()
 
-    def _pass(self, current: Iterate, tolerance: float) -> Ending:
+    def _pass(self, current: Iterate, tolerance: float) -> End:
         """Gradient steps for the present penalties."""
         space, settings, control = self.space, self.settings, self.control
         linear = space.linearise(current)
         if not linear.finite:
-            return Ending(current, Measures.unknown(linear), INFINITE_SLOPES, False)
+            return End(current, Measures.unknown(linear), Status.NO_NUMBER)
         measures = space.measure(current, linear)
         ell = measures.ell
         self._check_reachable(current, linear)
@@ -154,21 +150,21 @@ class Search:
         while True:
             self._record(current, measures)
             if self._arrived(current, linear, measures, tolerance):
-                return Ending(current, measures, "solved", True)
+                return End(current, measures, Status.SOLVED)
             if self.progress.stop:
-                return Ending(current, measures, "interrupted by the user", False)
-            message = self._hopeless(measures)
-            if message:
-                return Ending(current, measures, message, False)
+                return End(current, measures, Status.STOPPED)
+            hopeless = self._hopeless(measures)
+            if hopeless:
+                return End(current, measures, hopeless)
             base = space.metric(current, linear, ell, settings.weight)
             metric = learnt(control.weight * base, control.pairs)
             trial = self._try(current, linear, metric, active)
-            if isinstance(trial, str):
-                return Ending(current, measures, trial, False)
+            if isinstance(trial, Status):
+                return End(current, measures, trial)
             following, step = trial
             after = space.linearise(following)
             if not after.finite:
-                return Ending(current, measures, INFINITE_SLOPES, False)
+                return End(current, measures, Status.NO_NUMBER)
             self._learn(following.point - current.point, linear, after, step, metric, base)
             current, linear, ell, active = following, after, step.ell, step.active
             measures = space.measure(current, linear)
@@ -185,17 +181,16 @@ class Search:
         left = replace(self.reached, complementarity=0.0, infeasibility=0.0) if self.space.groups else self.reached
         return left.hold(LIMIT * max(1.0, tolerance / TOLERANCE))
 
-    def _hopeless(self, measures: Measures) -> str:
+    def _hopeless(self, measures: Measures) -> Status | None:
         """Why to give up, if so."""
         control, settings = self.control, self.settings
         if control.iterations >= settings.max_iterations:
-            return "stopped at the largest number of iterations: start closer, or allow more"
+            return Status.ITERATIONS
         if measures.miss <= TERMINAL_SHARE * settings.violation_tolerance or measures.miss < 0.9 * control.nearest[0]:
             control.nearest = (measures.miss, control.iterations)
         if control.iterations - control.nearest[1] > PATIENCE:
-            remedy = "the bounds may forbid them, or start elsewhere" if settings.adaptive else RAISE_WEIGHT
-            return f"the terminal conditions do not come closer: {remedy}"
-        return ""
+            return Status.UNMET if settings.adaptive else Status.UNMET_BY_FIXED_WEIGHT
+        return None
 
     def _check_reachable(self, current: Iterate, linear: Linear) -> None:
         """Terminal conditions that nothing changes (D is singular) and that are not met.
@@ -231,7 +226,7 @@ class Search:
 
     def _try(
         self, current: Iterate, linear: Linear, metric: Metric, active: Array | None
-    ) -> tuple[Iterate, Step] | str:
+    ) -> tuple[Iterate, Step] | Status:
         """A step that changes cost and miss about as predicted; raises w and lowers d until there is one."""
         space, control, miss = self.space, self.control, current.run.miss
         adaptive = self.settings.adaptive
@@ -243,7 +238,7 @@ class Search:
                 kept = following.run.finite and abs(following.cost) <= DIVERGED * (
                     1.0 + abs(self.control.history[0]["cost"])
                 )
-                return (following, step) if kept else f"the steps diverge: {RAISE_WEIGHT}"
+                return (following, step) if kept else Status.DIVERGING
             if following.run.finite:
                 control.merit = np.maximum(control.merit, MERIT_FACTOR * np.abs(step.ell))
                 expected = miss + linear.rows @ step.change
@@ -262,7 +257,7 @@ class Search:
             else:
                 control.fraction /= 2
             control.raised = min(RAISE * control.raised, LARGEST_WEIGHT)
-        return "no step lowers the cost as predicted: the slopes may be wrong at this mesh; use more intervals"
+        return Status.NO_DECREASE
 
     def _reaching_step(self, current: Iterate, linear: Linear, metric: Metric, active: Array | None) -> Step:
         """A step that the bounds leave most of what it owes the terminal conditions, with w raised as needed.

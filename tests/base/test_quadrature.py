@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, gauss_transition, hermite, simpson_weight
+from covocp.base.quadrature import (
+    GAUSS_NODES,
+    classical_step,
+    covariance_after,
+    gauss_matrix,
+    gauss_step,
+    gauss_transition,
+    hermite,
+    interpolated,
+    lyapunov_after,
+    simpson_weight,
+)
 
 H = np.array([[0.3, -1.2, 0.1, 0.0], [0.4, -0.2, 0.0, 0.7], [0.0, 0.5, -0.6, 0.2], [1.0, 0.0, 0.3, 0.1]])
 
@@ -68,3 +79,42 @@ def test_expressions_numbers_and_stacks_agree():
     np.testing.assert_allclose(found.full(), numbers, rtol=1e-12)
     stacks = [np.stack([p, 0.5 * p]) for p in points]
     np.testing.assert_allclose(gauss_transition(stacks, np.eye(4), np.linalg.solve)[0], numbers, rtol=1e-12)
+
+
+def test_a_step_with_a_forcing_is_that_of_the_larger_system_without():
+    """y' = H y + f is (y, 1)' = [H f; 0 0] (y, 1)."""
+    forcing, start = [np.array([[0.1], [0.4], [-0.3], [0.2]]), np.array([[0.3], [0.0], [0.5], [-0.1]])], np.ones((4, 1))
+    points = [0.3 * H, 0.2 * H.T]
+    blocks = [np.block([[A, f], [np.zeros((1, 5))]]) for A, f in zip(points, forcing, strict=True)]
+    larger = gauss_transition(blocks, np.eye(5), np.linalg.solve)
+    change, transition = gauss_step([ca.DM(A) for A in points], forcing, ca.DM(start), ca.DM.eye(4), ca.solve)
+    np.testing.assert_allclose(start + change, larger[:4, :4] @ start + larger[:4, 4:], rtol=1e-13)
+    np.testing.assert_allclose(transition, larger[:4, :4], rtol=1e-13)
+
+
+def test_covariance_of_an_integrated_white_noise_is_exact():
+    """P = [t^3/3 t^2/2; t^2/2 t] from zero: the method of order 4 is exact for cubics."""
+    F, Q, t = np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, 1.0]), 0.7
+    generator = t * np.block([[-F.T, np.zeros((2, 2))], [Q, F]])
+    D = gauss_transition([generator] * 2, np.eye(4), np.linalg.solve)
+    for step in (covariance_after, lyapunov_after):
+        np.testing.assert_allclose(step(D, np.zeros((2, 2))), [[t**3 / 3, t**2 / 2], [t**2 / 2, t]], rtol=1e-13)
+
+
+def test_a_lyapunov_step_does_not_see_what_rounding_leaves():
+    F, P, t = np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([1e16, 1.0]), 0.7
+    D = gauss_transition(
+        [t * np.block([[-F.T, np.zeros((2, 2))], [np.zeros((2, 2)), F]])] * 2, np.eye(4), np.linalg.solve
+    )
+    move = np.array([[1.0, t], [0.0, 1.0]])
+    expected = lyapunov_after(D, P)
+    np.testing.assert_allclose(expected, move @ P @ move.T, rtol=1e-13)
+    D[:2, 2:] = 1e-17
+    np.testing.assert_array_equal(lyapunov_after(D, P), expected)
+
+
+def test_interpolation_is_exact_for_lines_and_knows_what_has_no_columns():
+    old, new = np.array([0.0, 0.3, 1.0]), np.linspace(0.0, 1.0, 7)
+    lines = [[1.0, -2.0]]
+    np.testing.assert_allclose(interpolated(old[:, None] * lines, old, new), new[:, None] * lines, atol=1e-15)
+    assert interpolated(np.zeros((3, 0)), old, new).shape == (7, 0)

@@ -24,8 +24,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Given
+from covocp.base.gains import weighted
 from covocp.base.matrices import Array, unpack
-from covocp.base.quadrature import GAUSS_NODES, hermite
+from covocp.base.quadrature import GAUSS_NODES, covariance_after, hermite
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -230,17 +231,17 @@ class Reduction:
     def _filter(self, i: int, S: Array, filtered: Array, points: list[Array], one: Array) -> tuple[Array, Array, Any]:
         """Gauss step of Ebar, S and Lambda, with z at the two Gauss points."""
         h, nx, shape = self.steps[i], S.shape[0], (2 * S.shape[0], *S.shape[1:])
-        systems, inputs, drifts, biases, weighted, states = [], [], [], [], [], []
+        systems, inputs, drifts, biases, inputs_of_bias, states = [], [], [], [], [], []
         for g, z in enumerate(points, start=GAUSS):
             A, M = self.samples.rate[0][i, g][:, :nx], self.samples.state[i, g]
             F, Mb = (
                 slope[i, g] @ z + constant[i, g][:, :, None] * one
                 for slope, constant in (self.samples.drift, self.samples.bias)
             )
-            information = np.linalg.solve(self.samples.density[i, g], M).T  # M_x' U^-1
+            information = weighted(M, self.samples.density[i, g])
             systems.append(np.block([[-A.T, information @ M], [self.samples.noise[i, g], A]]))
             inputs.append(np.concatenate([np.tensordot(information, Mb, 1), F]))
-            weighted.append(np.tensordot(np.linalg.inv(self.samples.density[i, g]), Mb, 1))
+            inputs_of_bias.append(np.tensordot(np.linalg.inv(self.samples.density[i, g]), Mb, 1))
             drifts.append(F)
             biases.append(Mb)
             states.append(M)
@@ -254,15 +255,13 @@ class Reduction:
         matrix = unit + h / 2 * (free[: 2 * nx] + free[2 * nx :])
         K = (np.tensordot(free, start, 1) + np.tensordot(inverse, np.concatenate(inputs), 1)).reshape(2, *shape)
         end = start + h / 2 * (K[0] + K[1])
-        below, above = (matrix[rows, :nx] + matrix[rows, nx:] @ filtered for rows in (slice(nx, None), slice(nx)))
-        following = np.linalg.solve(above.T, below.T)
-        following = 0.5 * (following + following.T)
+        following = covariance_after(matrix, filtered)
         S_after = end[nx:] - np.tensordot(following, end[:nx], 1)
         products = [(1.0, S_after, end[:nx])]
         for g, row in enumerate(GAUSS_MATRIX):
             at = start + h * (row[0] * K[0] + row[1] * K[1])
             products.append((-h / 2, drifts[g], at[:nx]))
-            products.append((h / 2, weighted[g], np.tensordot(states[g], at[nx:], 1) + biases[g]))
+            products.append((h / 2, inputs_of_bias[g], np.tensordot(states[g], at[nx:], 1) + biases[g]))
         return S_after, following, tuple(products)
 
     def covariance(self, u: Array) -> tuple[Array, Array, Array]:

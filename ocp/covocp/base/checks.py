@@ -98,8 +98,10 @@ def one_number(name: str, what: str, value: Given) -> float:
 
 
 def bound_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Array, Array]:
-    """Lower and upper bounds as vectors of `size` numbers; infinite ones do not bind."""
-    return column(name, "lower bound", lower, size, inf=True), column(name, "upper bound", upper, size, inf=True)
+    """Lower and upper bounds as vectors of `size` numbers that do not cross; infinite ones do not bind."""
+    low, high = (column(name, f"{side} bound", v, size, inf=True) for side, v in (("lower", lower), ("upper", upper)))
+    check_bounds(name, low, high)
+    return low, high
 
 
 def data_column(name: str, what: str, value: Given, size: int, *, nan: bool = False) -> Any:

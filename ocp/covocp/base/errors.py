@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from covocp.solution.solution import Solution
 
@@ -180,6 +180,16 @@ def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
     lower = {word.casefold(): word for word in known}
     found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
     return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise
+
+
+def no_export_option(what: str, name: str, value: object, known: Sequence[str]) -> ExportError:
+    """The error of an option of `export_c` that means nothing to what is exported."""
+    return ExportError(
+        f"export_c has no option '{name}' for {what}.",
+        expected="one of " + ", ".join(known),
+        received=f"{name}={value!r}"[:100],
+        remedy=spelling(name, known, "leave it out"),
+    )
 
 
 def no_option(what: str, name: str, value: object, known: Iterable[str], beside: Iterable[str] = ()) -> ProblemError:

@@ -133,6 +133,12 @@ def unpack_symbolic(half: Expr, size: int) -> Any:
     return ca.reshape(half[order], size, size)
 
 
+def stacked(value: Expr, count: int) -> Array:
+    """Matrices side by side, as a mapped function returns them, one after the other: (count, rows, columns)."""
+    numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value)
+    return numbers.reshape(numbers.shape[0], count, numbers.shape[1] // count).transpose(1, 0, 2)
+
+
 def smallest_eigenvalue(matrices: ArrayLike) -> float:
     """Smallest eigenvalue over all the symmetric matrices of shape (..., n, n); inf where there is none."""
     full = np.asarray(matrices, dtype=float)
@@ -143,7 +149,7 @@ def smallest_eigenvalue(matrices: ArrayLike) -> float:
     return float(np.linalg.eigvalsh(full).min())
 
 
-def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERANCE) -> bool:
+def is_semidefinite(matrices: ArrayLike) -> bool:
     """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff."""
     full = np.asarray(matrices, dtype=float)
     if full.size == 0:
@@ -151,7 +157,7 @@ def is_semidefinite(matrices: ArrayLike, tolerance: float = SEMIDEFINITE_TOLERAN
     if not np.all(np.isfinite(full)):
         return False
     values = np.linalg.eigvalsh(full)
-    return bool(np.all(values[..., 0] >= -tolerance * np.maximum(np.abs(values[..., -1]), 1e-300)))
+    return bool(np.all(values[..., 0] >= -SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[..., -1]), 1e-300)))
 
 
 def standard_deviations(covariances: ArrayLike) -> Array:

@@ -10,9 +10,13 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import linear_solve
+from covocp.base.matrices import Array
 
 # Nodes of the two-stage Gauss method, shares of a step, both of weight 1/2.
-GAUSS_NODES = (0.5 - np.sqrt(3.0) / 6.0, 0.5 + np.sqrt(3.0) / 6.0)
+GAP = np.sqrt(3.0) / 6.0
+GAUSS_NODES = (0.5 - GAP, 0.5 + GAP)
+# a of `gauss_transition`.
+SHARE = 0.5 - 2.0 * GAP
 
 
 def classical_step(rate: Callable[[Any, float], Any], value: Expr, h: Expr, first: Expr = None) -> Any:
@@ -41,6 +45,11 @@ def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr)
     )
 
 
+def interpolated(values: Array, old: Array, new: Array) -> Array:
+    """Columns, (K, n), interpolated linearly from their places to others."""
+    return np.array([np.interp(new, old, column) for column in values.T]).reshape(values.shape[1], new.size).T
+
+
 def simpson_weight(j: int, count: int) -> float:
     """Weight of point j of `count` equal steps, an even number, in the integral over [0, 1] by Simpson's rule."""
     return (1 if j in (0, count) else 4 if j % 2 else 2) / (3 * count)
@@ -49,8 +58,8 @@ def simpson_weight(j: int, count: int) -> float:
 def gauss_transition(points: Any, unit: Any, solve: Callable[[Any, Any], Any]) -> Any:
     """D = I + V, V = h/2 (H1 Y1 + H2 Y2), of the two-stage Gauss method with stages Y1, Y2 = Y1 + 2 g V.
 
-    With g = sqrt(3)/6 and a = 1/2 - 2 g the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1 without a
-    solve, and inserting it leaves one system of the size of H instead of twice that:
+    With g = sqrt(3)/6 (GAP) and a = 1/2 - 2 g (SHARE) the first stage is (I - g h H1) Y1 = I + a V, so V is had from Y1
+    without a solve, and inserting it leaves one system of the size of H instead of twice that:
 
         [(I - g h H2)(I - g h H1) - a h/2 (H1 + H2)] Y1 = I - g h H2.
 
@@ -62,12 +71,56 @@ def gauss_transition(points: Any, unit: Any, solve: Callable[[Any, Any], Any]) -
         unit: the identity.
         solve: (matrix, right side) -> solution.
     """
+    left, right, matrix = _eliminated(points, unit)
+    return unit + (right @ solve(matrix, left) - unit) / SHARE
+
+
+def gauss_step(points: Any, forcing: Any, start: Expr, unit: Any, solve: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+    """The change of y over a step of y' = H y + f by the two-stage Gauss method, and its transition D.
+
+    Args:
+        points: h H at the two nodes, expressions.
+        forcing: h f there.
+        start: y.
+        unit: the identity.
+        solve: (matrix, right side) -> solution.
+    """
+    left, right, matrix = _eliminated(points, unit)
+    first, second = forcing
+    ahead = start + GAP * first
+    stages = solve(matrix, ca.horzcat(left @ ahead + SHARE / 2 * (first + second), left))
+    return (right @ stages[:, 0] - ahead) / SHARE, unit + (right @ stages[:, 1:] - unit) / SHARE
+
+
+def _eliminated(points: Any, unit: Any) -> tuple[Any, Any, Any]:
+    """I - g h H2, I - g h H1, and the matrix of the system that is left."""
     first, second = points
-    g = np.sqrt(3.0) / 6.0
-    a = 0.5 - 2.0 * g
-    left, right = unit - g * second, unit - g * first
-    stage = solve(left @ right - a / 2 * (first + second), left)
-    return unit + (right @ stage - unit) / a
+    left, right = unit - GAP * second, unit - GAP * first
+    return left, right, left @ right - SHARE / 2 * (first + second)
+
+
+def riccati_step(matrix: Expr, covariance: Expr, solve: Callable[[Any, Any], Any]) -> Any:
+    """(D21 + D22 E)(D11 + D12 E)^-1, transposed: E after a step with the transition D; symmetric up to rounding."""
+    size = covariance.shape[0]
+    moved = matrix[:, :size] + matrix[:, size:] @ covariance
+    return solve(moved[:size, :].T, moved[size:, :].T)
+
+
+def covariance_after(matrix: Array, covariance: Array) -> Array:
+    """A covariance after a step of a Riccati equation with the transition D."""
+    after = riccati_step(matrix, covariance, np.linalg.solve)
+    return np.asarray(0.5 * (after + after.T))
+
+
+def lyapunov_after(matrix: Array, covariance: Array) -> Array:
+    """The same for a Lyapunov equation: D12 is zero, and what rounding leaves there does not count.
+
+    In Mars entry (feet and radians) it would change the expected cost by 5e-7 of itself.
+    """
+    size = covariance.shape[0]
+    moved = matrix[size:, :size] + matrix[size:, size:] @ covariance
+    after = np.linalg.solve(matrix[:size, :size].T, moved.T)
+    return np.asarray(0.5 * (after + after.T))
 
 
 def gauss_matrix(points: Any, size: int, solver: str) -> Expr:

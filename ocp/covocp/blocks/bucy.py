@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import factorial
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.gains import weighted
 from covocp.base.riccati_rates import riccati_rate
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.updates import row_matrix
@@ -64,9 +66,9 @@ def rate(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, *, gain: Expr = None, cros
 
 def _best(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, C: Expr) -> tuple[Any]:
     """The rate with the best gain; correlation moves into drift and noise."""
-    seen = definite_solve(U, M, "measurement noise U")
-    share = definite_solve(U, C.T, "measurement noise U").T
-    return (symmetric(riccati_rate(E, F - share @ M, Q - share @ C.T, M.T @ seen)),)
+    solve = partial(definite_solve, what="measurement noise U")
+    seen, share = weighted(M, U, solve), weighted(C.T, U, solve)
+    return (symmetric(riccati_rate(E, F - share @ M, Q - share @ C.T, seen @ M)),)
 
 
 def _given(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, C: Expr, K: Expr) -> tuple[Any]:

@@ -5,12 +5,14 @@ Slopes are taken at the estimate: F at the one after the last measurement, H at 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
 
 from covocp.base.arguments import checked, whole
 from covocp.base.expressions import Expr
+from covocp.base.gains import kalman_gain
 from covocp.base.quadrature import classical_step
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
@@ -105,7 +107,8 @@ def bucy_slopes(x: Expr, P: Expr, y: Expr, process: tuple[Any, Any], measurement
     F, H = ca.jacobian(f, x), ca.jacobian(h, x)
     if not y.shape[0]:
         return [ca.densify(f), *apply(lambda P, F, Q: (F @ P + P @ F.T + Q,), P, F, noise)]
-    (gain,) = apply(lambda P, H, U: (definite_solve(U, H @ P, "measurement noise").T,), P, H, density)
+    solve = partial(definite_solve, what="measurement noise")
+    (gain,) = apply(lambda P, H, U: (kalman_gain(P, H, U, solve),), P, H, density)
     return [ca.densify(f + gain @ (y - h)), bucy.rate(P, F, H, noise, density)]
 
 

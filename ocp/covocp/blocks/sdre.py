@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.gains import weighted
 from covocp.blocks import values
 from covocp.blocks.algebraic import continuous
 from covocp.blocks.factorisation import as_rows, dependence
@@ -92,10 +93,11 @@ def filter_gain(x: Expr, A0: Expr, A: Expr, H: Expr, W: Expr, V: Expr) -> StateL
     v = values.numeric("V", values.weight("V", V, rows.shape[0], definite=True))
     state, rest = dependence(x, A, size)
     riccati = _solution((state, rest.T), constant.T, rows.T, w, v)
-    weighted = np.linalg.solve(v, rows).T
+
+    seen = weighted(rows, v)
 
     def gain(estimate: ArrayLike, time: float = 0.0) -> Array:
-        return np.asarray(riccati(estimate) @ weighted)
+        return np.asarray(riccati(estimate) @ seen)
 
     return gain
 

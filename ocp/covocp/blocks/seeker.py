@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from covocp.base.arguments import checked, is_number, one_of, optional, positive, truth, whole
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
-from covocp.base.matrices import half_indices, half_length
+from covocp.base.matrices import half_indices, half_length, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.checked_function import CheckedFunction
@@ -90,7 +90,7 @@ class Estimate:
         return np.asarray(gradient(self._deviations()))
 
     def _deviations(self) -> Array:
-        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return standard_deviations(self.covariance)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, truth
 from covocp.base.expressions import Expr
+from covocp.base.gains import innovation_gain, kalman_gain
 from covocp.base.short_repr import short_repr
 from covocp.blocks.algebraic import Words, frozen, sorted_modes, stabilising, weights
 from covocp.blocks.duality import Estimation, dual
@@ -78,9 +79,9 @@ def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: b
     phi, rows, U = matrices[0].T, matrices[1].T, matrices[3]
     unit = np.eye(len(prior))
     if discrete:
-        gain = np.linalg.solve(rows @ prior @ rows.T + U, rows @ prior).T
+        gain, _ = innovation_gain(prior, rows, U, np.linalg.solve)
         posterior, error = joseph_form(prior, gain, rows, U), (unit - gain @ rows) @ phi
     else:
-        gain = np.linalg.solve(U, rows @ prior).T
+        gain = kalman_gain(prior, rows, U)
         posterior, error = prior, phi - gain @ rows
     return Filter(prior=frozen(prior), posterior=frozen(posterior), gain=frozen(gain), eigenvalues=sorted_modes(error))

@@ -13,6 +13,7 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.gains import innovation_gain
 from covocp.blocks.arithmetic import (
     apply,
     definite_solve,
@@ -202,10 +203,15 @@ def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
 
 
 def present(residual: Expr, y: Expr, H: Expr, R: Expr) -> tuple[Any, Any, Any]:
-    """Residual, H and R without the rows that are missing: these become 0 = 0 x + noise of variance 1, uncorrelated."""
+    """Residual, H and R without the rows that are missing."""
     there = is_there(y)
+    return where(there, residual), *without(there, H, R)
+
+
+def without(there: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
+    """H and R without the rows that are missing: these become 0 = 0 x + noise of variance 1, uncorrelated."""
     kept = diagonal(there)
-    return where(there, residual), kept @ H, kept @ R @ kept + diagonal(1 - there)
+    return kept @ H, kept @ R @ kept + diagonal(1 - there)
 
 
 def joseph_form(P: Expr, L: Expr, H: Expr, R: Expr) -> Any:
@@ -214,19 +220,19 @@ def joseph_form(P: Expr, L: Expr, H: Expr, R: Expr) -> Any:
     return symmetric(remaining @ P @ remaining.T + L @ R @ L.T)
 
 
-def _gain(P: Expr, H: Expr, R: Expr) -> Any:
-    """L = M H'(H M H' + R)^-1."""
-    seen = H @ P
-    return definite_solve(symmetric(seen @ H.T + R), seen, "covariance of the innovation, H P H' + R,").T
+def definite_gain(P: Expr, H: Expr, R: Expr) -> Any:
+    """L = M H'(H M H' + R)^-1, by a solver for positive definite matrices."""
+    what = "covariance of the innovation, H P H' + R,"
+    return innovation_gain(P, H, R, lambda S, seen: definite_solve(symmetric(S), seen, what))[0]
 
 
 def _joseph(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
-    L = _gain(P, H, R)
+    L = definite_gain(P, H, R)
     return L @ residual, joseph_form(P, L, H, R)
 
 
 def _standard(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
-    L = _gain(P, H, R)
+    L = definite_gain(P, H, R)
     return L @ residual, symmetric(P - L @ (H @ P))
 
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from covocp.base.arguments import checked, mapping, optional, positive, truth
-from covocp.base.errors import ExportError, spelling, warn_user
+from covocp.base.errors import ExportError, no_export_option, warn_user
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
@@ -287,12 +287,7 @@ def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) 
     allowed = ("name", "precision", "overwrite", "tolerance", *known)
     for name, value in given.items():
         if value is not None and name not in known:
-            raise ExportError(
-                f"export_c has no option '{name}' for {what}.",
-                expected="one of " + ", ".join(allowed),
-                received=f"{name}={value!r}"[:100],
-                remedy=spelling(name, allowed, "leave it out"),
-            )
+            raise no_export_option(what, name, value, allowed)
 
 
 def _check_choice(name: str, value: Given, choices: tuple[str, ...]) -> None:

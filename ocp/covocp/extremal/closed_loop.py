@@ -21,14 +21,14 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, unpack, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, simpson_weight
-from covocp.base.riccati_rates import inverse
+from covocp.base.matrices import Array, stacked, unpack, unpack_symbolic
+from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after, simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
-from covocp.statement.interval import Interval, one_sided
+from covocp.statement.interval import Interval, model_symbols, one_sided
 from covocp.statement.statement import Loop, Statement
 from covocp.transcription.steps import KEPT
 
@@ -120,12 +120,12 @@ def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
     at = values[::m]
     columns = extremal.columns()
     loop = _loop(st)
-    gain = np.asarray(loop.gain.map(n + 1)(*columns).full())
+    gain = loop.gain.map(n + 1)(*columns)
     return ClosedLoop(
         E=at[:, :size, :size],
         Xhat=at[:, size:, size:],
         Z=at[:, :size, size:],
-        gain=gain.reshape(-1, n + 1, size).transpose(1, 0, 2),
+        gain=stacked(gain, n + 1),
         cost=cost,
         other_cost=other,
         conservation=_conservation(extremal, fine, values, statistics),
@@ -157,17 +157,10 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
     step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
-    joint = np.zeros((2 * size, 2 * size))
-    joint[:size, :size] = statistics.initial
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
-    values[0] = joint
-    matrices = np.asarray(step.full()).reshape(4 * size, n * m, 4 * size).transpose(1, 0, 2)
-    half = 2 * size
-    for k, D in enumerate(matrices):
-        moved = D[half:, :half] + D[half:, half:] @ joint
-        joint = np.linalg.solve(D[:half, :half].T, moved.T).T  # W = 0: D12 vanishes
-        joint = 0.5 * (joint + joint.T)
-        values[k + 1] = joint
+    values[0, :size, :size] = statistics.initial
+    for k, D in enumerate(stacked(step, n * m)):
+        values[k + 1] = lyapunov_after(D, values[k])
     return values
 
 
@@ -176,19 +169,13 @@ def loop_substeps(extremal: Extremal) -> int:
     st, count = extremal.statement, extremal.mesh.intervals + 1
     x, u, e, t, duration, p = extremal.columns()
     size = len(st.augmented)
-
-    def each(value: Expr) -> Array:
-        numbers = np.asarray(value.full())
-        return numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
-
-    F, G = (each(v) for v in _loop(st).expansion.map(count)(x, u, t, duration, p)[:2])
-    C = each(_loop(st).gain.map(count)(x, u, e, t, duration, p))
-    block = next(b for b in st.matrices if b.estimation)
+    F, G = (stacked(v, count) for v in _loop(st).expansion.map(count)(x, u, t, duration, p)[:2])
+    C = stacked(_loop(st).gain.map(count)(x, u, e, t, duration, p), count)
     loops = [F - G @ C]
     if st.measurement is not None:
-        _, M, U = (each(v) for v in st.measurement.map(count)(x, u, t, duration, p))
-        E = unpack(extremal.trajectory.e[:, block.span], size)
-        loops.append(F - E @ M.transpose(0, 2, 1) @ np.linalg.solve(U, M))
+        _, M, U = (stacked(v, count) for v in st.measurement.map(count)(x, u, t, duration, p))
+        E = unpack(extremal.trajectory.e[:, st.estimation.span], size)
+        loops.append(F - kalman_gain(E, M, U) @ M)
     rates = [np.abs(np.linalg.eigvals(matrix)).max(axis=1, initial=0.0) for matrix in loops]
     h = np.diff(extremal.time)
     stiff = max(float((np.maximum(rate[1:], rate[:-1]) * h).max(initial=0.0)) for rate in rates)
@@ -199,7 +186,7 @@ def loop_substeps(extremal: Extremal) -> int:
 def design_statistics(extremal: Extremal) -> Statistics:
     """The statistics that the design assumes."""
     st = extremal.statement
-    block = next(b for b in st.matrices if b.estimation)
+    block = st.estimation
     return Statistics(
         initial=unpack(st.boundary_values(extremal.parameters)[2][block.span], block.size),
         density=densities(st),
@@ -210,11 +197,11 @@ def design_statistics(extremal: Extremal) -> Statistics:
 @lru_cache(maxsize=KEPT)
 def densities(statement: Statement) -> ca.Function:
     """(state, control, time, duration, parameters) -> densities Q of the process and U of the measurement noise."""
-    symbolic: Any = statement.symbolic
-    arguments = [symbolic.sym(f"a{i}", k) for i, k in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
+    x, u, _, *rest = model_symbols(statement)
+    arguments = [x, u, *rest]
     noise = _loop(statement).slopes(*arguments).Q
     measured = statement.measurement
-    density = symbolic(0, 0) if measured is None else measured(*arguments)[2]
+    density = ca.DM(0, 0) if measured is None else measured(*arguments)[2]
     return ca.Function("densities", arguments, [noise, ca.densify(density)])
 
 
@@ -236,14 +223,13 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
     common, q = Interval.symbols(statement), symbolic.sym("q", density.size1_in(4))
     duration, p, h = common.duration, common.parameters, common.h
     fa, fb = (ca.vertcat(*statement.rates(*common.at(c, z[:nx], z[nx:]))[:2]) for c, z in ((0.0, za), (1.0, zb)))
-    block = next(b for b in statement.matrices if b.estimation)
     loop = _loop(statement)
     points = []
     for c in GAUSS_NODES:
         z, u, t = hermite(za, zb, h * fa, h * fb, c), common.control(c), common.time(c)
         F, G = loop.slopes(z[:nx], u, t, duration, p)[:2]
         C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
-        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][block.span], size), (t, duration, p))
+        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][statement.estimation.span], size), (t, duration, p))
         noise, measured = density(z[:nx], u, t, duration, q)
         drift = ca.blockcat([[F - K @ M, symbolic.zeros(size, size)], [-K @ M, F - G @ C]])
         spread = K @ measured @ K.T
@@ -260,7 +246,7 @@ def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ..
     if statement.measurement is None:
         return E[:, :0], E[:0, :]
     _, M, U = statement.measurement(x, u, *rest)
-    return E @ M.T @ inverse(U), ca.densify(M)
+    return kalman_gain(E, M, U), ca.densify(M)
 
 
 def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Statistics) -> float | None:
@@ -287,7 +273,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
         return None
     noise = np.asarray(statistics.density.map(count)(*arguments, true)[0].full()).reshape(size, count, size)
     growth = np.einsum("iw,ikj,jw->kw", kept, noise[uncertain][:, :, uncertain], kept).reshape(n, m + 1, -1)
-    weights = np.array([1.0 if j in (0, m) else 4.0 if j % 2 else 2.0 for j in range(m + 1)]) / (3 * m)
+    weights = np.array([simpson_weight(j, m) for j in range(m + 1)])
     grown = np.cumsum(np.einsum("k,j,kjw->kw", np.diff(extremal.time), weights, growth), axis=0)
     variance = np.einsum("iw,kij,jw->kw", kept, X[::m], kept)
     error = np.abs(variance[1:] - variance[0] - grown)
@@ -344,7 +330,7 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     }
     if not best:
         return terms, None
-    block = next(b for b in st.matrices if b.backward)
+    block = st.matrices[st.behind[0]]
     at_start = unpack(t.e[0, block.span], size)
     return terms, float(k.item()) + running + 0.5 * float(np.sum(at_start * joint[0][:size, :size])) + other
 
@@ -354,8 +340,7 @@ def _running(statement: Statement) -> ca.Function:
     """(all six, joint covariance) -> L, its second-order part by (E-1) with Z, 1/2 tr(S Q + C'B C E) of (E-20)."""
     symbolic: Any = statement.symbolic
     size = len(statement.augmented)
-    sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
-    six = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    six = model_symbols(statement)
     joint = symbolic.sym("joint", 2 * size, 2 * size)
     loop = _loop(statement)
     plain = (*six[:2], *six[3:])
@@ -367,7 +352,7 @@ def _running(statement: Statement) -> ca.Function:
     fed = ca.trace(A @ X) + ca.trace(B @ C @ Xhat @ C.T) - 2 * ca.trace(N @ C @ (Xhat - Z.T))
     other = symbolic(0)
     if statement.behind:
-        block = next(b for b in statement.matrices if b.backward)
+        block = statement.matrices[statement.behind[0]]
         S = unpack_symbolic(six[2][block.span], size)
         other = ca.trace(S @ Q) + ca.trace(C.T @ B @ C @ E)
     return ca.Function("running", [*six, joint], [loop.running(*plain), fed / 2, other / 2])

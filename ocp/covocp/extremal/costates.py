@@ -64,10 +64,6 @@ def impulses(extremal: Extremal) -> Array:
     return np.asarray(jumps)
 
 
-def _stack(extremal: Extremal) -> Any:
-    return ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
-
-
 @lru_cache(maxsize=KEPT)
 def adjoint_interval(statement: Statement, substeps: int, step: StepKind, *, nominal: bool = False) -> ca.Function:
     """Adjoint of one discrete control interval; with `nominal` of the nominal alone, without cost.
@@ -108,7 +104,8 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
         return _costates_both_ways(extremal)
     last = np.concatenate(terminal_costates(extremal))
     interval = adjoint_interval(st, extremal.mesh.substeps, extremal.mesh.step)
-    costates, slopes, by_duration = _swept(extremal, interval, last, impulses(extremal), _stack(extremal))
+    z = ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
+    costates, slopes, by_duration = _swept(extremal, interval, last, impulses(extremal), z)
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 

@@ -22,7 +22,7 @@ from covocp.base.quadrature import hermite
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
-from covocp.statement.interval import one_sided
+from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.steps import KEPT, joint_interval, matrices_step, nominal_interval
 
@@ -189,21 +189,18 @@ class _Steps:
 
     def control(self, k: Expr, c: Array) -> Array:
         """Controls there, (m, nu)."""
-        u = self.extremal.controls
-        share = (1.0 - c if self.backward else c)[:, None]
-        held = self.extremal.mesh.control == "constant"
-        return np.asarray(u[k] if held else u[k] + share * (u[k + 1] - u[k]))
+        return self.extremal.control(k, 1.0 - c if self.backward else c)
 
     def fixed(self, count: int) -> tuple[Array, Array]:
         """Terminal time and parameters, a column each."""
-        duration, parameters = self.extremal.trajectory.duration, self.extremal.parameters
-        return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
+        return repeated(self.extremal.trajectory.duration, self.extremal.parameters, count)
 
     def advance(self, k: Expr, c: Array, d: Array, z: Array) -> Array:
         """The entries at the share d from those at c."""
         s, after = self.place(k, c), self.place(k, d)
         common = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :], *self.fixed(c.size))
-        function = _advance(self.extremal, tuple(self.rows), self.states is not None)
+        st, mesh = self.extremal.statement, self.extremal.mesh
+        function = _advance(st, mesh.step, mesh.linear_solver, tuple(self.rows), self.states is not None)
         if self.states is None:
             return mapped(function, z.T, *common)[0].T
         return mapped(function, z.T, self.states.at(s).T, self.states.at(after).T, *common)[0].T
@@ -244,17 +241,13 @@ class _Steps:
         return np.asarray(np.maximum(allowed, ROUNDOFF * self.size))
 
 
-def _definite(block: Block) -> bool:
-    """Whether a matrix is positive semidefinite: a covariance, or the weight S of a closed loop, which has its size."""
-    return bool(block.covariance or block.backward)
-
-
 def _variances(statement: Statement, rows: list[int]) -> Any:
     """Positions among the rows of both variances of an entry of a covariance, -1 of anything else; (2, rows)."""
     result = np.full((2, len(rows)), -1, dtype=np.intp)
     where = {row: i for i, row in enumerate(rows)}
     for block in statement.matrices:
-        if _definite(block) and statement.nx + block.span.start in where:
+        definite = block.covariance or block.backward  # a covariance, or the weight S of a closed loop, of its size
+        if definite and statement.nx + block.span.start in where:
             lower, columns = half_indices(block.size)
             entries = np.arange(block.span.start, block.span.stop) + statement.nx
             diagonal = entries[lower == columns]
@@ -265,9 +258,7 @@ def _variances(statement: Statement, rows: list[int]) -> Any:
 
 
 @lru_cache(maxsize=KEPT)
-def _advance_function(
-    statement: Statement, step: Expr, solver: str, rows: tuple[int, ...], matrices: bool
-) -> ca.Function:
+def _advance(statement: Statement, step: Expr, solver: str, rows: tuple[int, ...], matrices: bool) -> ca.Function:
     """One step of the integrator: (values, [x at both ends,] *common) -> values."""
     if matrices:
         positions = (
@@ -275,11 +266,6 @@ def _advance_function(
         )
         return matrices_step(statement, positions, step, solver)
     return joint_interval(statement, 1) if statement.coupled else nominal_interval(statement, 1, step)
-
-
-def _advance(extremal: Extremal, rows: tuple[int, ...], matrices: bool) -> ca.Function:
-    mesh = extremal.mesh
-    return _advance_function(extremal.statement, mesh.step, mesh.linear_solver, rows, matrices)
 
 
 def mapped(function: ca.Function, *columns: Array) -> list[Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.matrices import Array, unpack
+from covocp.base.matrices import Array, stacked, unpack
 from covocp.extremal.extremal import Extremal
 
 # Relative size of a negative eigenvalue that counts as roundoff, and of the smallest one of a measurement's density.
@@ -54,9 +54,9 @@ def impossible_density(extremal: Extremal) -> str:
 
 def _seen(extremal: Extremal, slope: Array) -> float:
     """What a measurement sees of the uncertainty: largest M E M' of any row and node, times T; inf without E."""
-    block = next((b for b in extremal.statement.matrices if b.estimation), None)
-    if block is None:
+    if not extremal.statement.estimated:
         return np.inf
+    block = extremal.statement.estimation
     E = unpack(extremal.trajectory.e[:, block.span], block.size)
     variances = np.einsum("rki,kij,rkj->rk", slope, E, slope)
     return float(np.nan_to_num(np.abs(variances)).max(initial=0.0)) * extremal.trajectory.duration
@@ -72,8 +72,7 @@ def _first_wrong(values: Array, count: int, least: float, seen: float) -> tuple[
             less: a sensor that is nearly switched off at some nodes is noisy there, not singular elsewhere.
         seen: what the measurement could see.
     """
-    size = values.shape[0]
-    matrices = np.asarray(values).reshape(size, count, size).transpose(1, 0, 2)
+    matrices = stacked(values, count)
     if np.ptp(matrices, axis=0).max(initial=0.0) == 0.0:
         matrices = matrices[:1]
     eigenvalues = np.linalg.eigvalsh(np.nan_to_num(matrices, nan=0.0, posinf=0.0, neginf=0.0))

@@ -10,14 +10,15 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import CovocpError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
-from covocp.statement.interval import Interval
+from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns
-from covocp.transcription.trajectory import Multipliers, Trajectory
+from covocp.transcription.trajectory import Multipliers, Trajectory, at_nodes
 
 # How a method says, among its counts, that it lost its way: it was stopped, or ended by itself.
 STOPPED, ENDED = "stopped", "ended"
@@ -59,19 +60,21 @@ class Extremal:
     @property
     def controls(self) -> Array:
         """Controls at all N + 1 nodes; a constant control holds its last value at the last node."""
-        u = self.trajectory.u
-        return u if u.shape[0] == self.mesh.intervals + 1 else np.vstack([u, u[-1:]])
+        return at_nodes(self.trajectory.u, self.mesh.nodes.size)
+
+    def control(self, k: Expr, c: Array) -> Array:
+        """Controls at shares c of the intervals k, (K, nu)."""
+        u = self.controls
+        return np.asarray(u[k] if self.mesh.control == "constant" else u[k] + c[:, None] * (u[k + 1] - u[k]))
 
     def columns(self) -> tuple[Array | float, ...]:
         """Arguments (x, u, e, t, T, p) at the nodes, a column each, for a mapped function of the statement."""
-        count = self.mesh.intervals + 1
         return (
             self.trajectory.x.T,
             self.controls.T,
             self.trajectory.e.T,
             self.time[None, :],
-            np.full((1, count), self.trajectory.duration),
-            np.tile(self.parameters[:, None], (1, count)),
+            *repeated(self.trajectory.duration, self.parameters, self.mesh.nodes.size),
         )
 
     def inequalities(self) -> Iterator[tuple[Conditions, str, Array]]:

@@ -30,15 +30,7 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
 @lru_cache(maxsize=8)
 def refined_mesh(mesh: Mesh) -> Mesh:
     """The mesh whose nodes are all points at which limits are imposed; its steps are those of the given one."""
-    p = mesh.points
-    parts = mesh.nodes[:-1, None] + np.diff(mesh.nodes)[:, None] * np.arange(p) / p
-    return replace(
-        mesh,
-        nodes=np.append(parts.ravel(), mesh.nodes[-1]),
-        substeps=mesh.substeps // p,
-        segments=tuple(p * length for length in mesh.segments),
-        points=1,
-    )
+    return replace(mesh.divided(mesh.points), substeps=mesh.substeps // mesh.points)
 
 
 @lru_cache(maxsize=8)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import casadi as ca
-import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Statement
@@ -69,12 +68,8 @@ def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list
     count = extremal.mesh.intervals + 1
     values = function.map(count)(*extremal.columns(), costates.state.T, costates.matrices.T)
     outputs = values if isinstance(values, (tuple, list)) else [values]
-    result = []
-    for value in outputs:
-        shape = (value.shape[0], count, value.shape[1] // count)
-        numbers = np.asarray(value.full()).reshape(shape).transpose(1, 0, 2)
-        result.append(numbers[:, :, 0] if numbers.shape[2] == 1 else numbers)
-    return result
+    result = [stacked(value, count) for value in outputs]
+    return [numbers[:, :, 0] if numbers.shape[2] == 1 else numbers for numbers in result]
 
 
 def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:

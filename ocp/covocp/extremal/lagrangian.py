@@ -12,15 +12,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.statement import Columns, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, full_interval, nominal_interval
+from covocp.transcription.steps import KEPT, full_interval, moving_interval, nominal_interval
 
 
 def node_size(statement: Statement) -> int:
@@ -98,8 +97,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
 @lru_cache(maxsize=KEPT)
 def _interval_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     """(nodes, controls, T, parameters) -> slopes of the ends of the intervals, (n, N n), (n, N nu), (n, N nu)."""
-    st = statement
-    step = full_interval(st, mesh.substeps, mesh.step) if st.coupled else nominal_interval(st, mesh.substeps, mesh.step)
+    step = moving_interval(statement, mesh.substeps, mesh.step)
     symbols = step.mx_in()
     end = step(*symbols)[0]
     slopes = [ca.densify(ca.jacobian(end, symbols[i])) for i in range(3)]
@@ -116,11 +114,5 @@ def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
     common = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
     values = _interval_slopes(st, mesh)(z[:-1].T, *common)
-    n, count = z.shape[1], mesh.intervals
-
-    def each(value: Expr) -> Array:
-        numbers = np.asarray(value.full())
-        return numbers.reshape(n, count, -1).transpose(1, 0, 2)
-
-    A, first, last = (each(v) for v in values)
+    A, first, last = (stacked(v, mesh.intervals) for v in values)
     return A, first, last

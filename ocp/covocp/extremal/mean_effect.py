@@ -21,11 +21,12 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, unpack_symbolic
-from covocp.base.riccati_rates import inverse
+from covocp.base.gains import kalman_gain
+from covocp.base.matrices import Array, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
 
@@ -83,18 +84,11 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
             return None
         cost += h[k] / 2 * float(c @ state + e @ after)
         states[k + 1] = state = after
-    at_end = st.loop.terminal.jacobian()(
-        extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters, *_terminal(extremal)
-    )
+    end = (extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters)
+    at_end = st.loop.terminal.jacobian()(*end, *st.loop.terminal(*end))
     unknowns = [i for b in st.of_kind("unknown") for i in range(b.span.start, b.span.stop)]
     slope = np.hstack([np.asarray(at_end[0].full())[0, : n - len(unknowns)], np.asarray(at_end[2].full())[0, unknowns]])
     return MeanEffect(mean=states[:, :n], estimate=states[:, n:], cost=cost + float(slope @ states[-1, :n]))
-
-
-def _terminal(extremal: Extremal) -> Any:
-    """Values of the terminal function, which its Jacobian wants as arguments."""
-    loop: Any = extremal.statement.loop
-    return loop.terminal(extremal.trajectory.x[-1], extremal.trajectory.duration, extremal.parameters)
 
 
 def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, Array, Array]:
@@ -112,8 +106,8 @@ def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, A
         [np.dstack([loop.X, with_estimate]), np.dstack([with_estimate.transpose(0, 2, 1), loop.Xhat])], 1
     )
     values = _curved(st).map(count)(*columns, spread[part].transpose(1, 0, 2).reshape(2 * n, -1))
-    drift, forcing, slope = (np.asarray(v.full()) for v in values)
-    return drift.reshape(2 * n, count, 2 * n).transpose(1, 0, 2), forcing.T, slope.T
+    drift, forcing, slope = (stacked(v, count) for v in values)
+    return drift, forcing[:, :, 0], slope[:, :, 0]
 
 
 @lru_cache(maxsize=KEPT)
@@ -124,7 +118,7 @@ def _curved(st: Statement) -> ca.Function:
     assert loop is not None
     assert st.nominal is not None
     m = int(loop.gain.size1_out(0))
-    x, u, e, t, duration, p = six = [symbolic.sym(f"a{i}", k) for i, k in enumerate((st.nx, st.nu, st.ne, 1, 1, st.np))]
+    x, u, e, t, duration, p = six = model_symbols(st)
     spread = symbolic.sym("spread", 2 * n, 2 * n)
     unknowns = sum(b.size for b in st.of_kind("unknown"))
     z = symbolic.sym("z", n + m)  # augmented state and the controls that are fed back
@@ -137,8 +131,8 @@ def _curved(st: Statement) -> ca.Function:
     measured, M, U = symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0)
     if st.measurement is not None:
         measured, M, U = st.measurement(*at)
-    E = unpack_symbolic(e[next(b for b in st.matrices if b.estimation).span], n)
-    K = E @ M.T @ inverse(U) if measured.shape[0] else symbolic.zeros(n, 0)
+    E = unpack_symbolic(e[st.estimation.span], n)
+    K = kalman_gain(E, M, U)
     C = loop.gain(*six)
     seen = ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -C]])
     both = ca.vertcat(rate, measured)

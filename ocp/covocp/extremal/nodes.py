@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, unpack
+from covocp.base.gains import kalman_gain
+from covocp.base.matrices import Array, stacked, unpack
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import one_sided
 
@@ -34,17 +35,14 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
 def filter_gains(extremal: Extremal) -> Array | None:
     """Kalman gain K = E M' U^-1 at the nodes [Schmidt 2.5-3]."""
     st = extremal.statement
-    block = next((b for b in st.matrices if b.estimation), None)
-    if block is None or st.measurement is None:
+    if not st.estimated or st.measurement is None:
         return None
+    block = st.estimation
     x, u, _, t, duration, p = extremal.columns()
     count = extremal.mesh.intervals + 1
-    _, jacobian, density = st.measurement.map(count)(x, u, t, duration, p)
-    size, m = block.size, density.shape[0]
-    M = np.asarray(jacobian.full()).reshape(m, count, size).transpose(1, 0, 2)
-    U = np.asarray(density.full()).reshape(m, count, m).transpose(1, 0, 2)
-    E = unpack(extremal.trajectory.e[:, block.span], size)
+    _, M, U = (stacked(v, count) for v in st.measurement.map(count)(x, u, t, duration, p))
+    E = unpack(extremal.trajectory.e[:, block.span], block.size)
     try:
-        return np.asarray(np.linalg.solve(U, M @ E).transpose(0, 2, 1))
+        return np.asarray(kalman_gain(E, M, U))
     except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
         return None

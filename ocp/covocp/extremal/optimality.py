@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, standard_deviations
+from covocp.base.matrices import Array, stacked, standard_deviations
 from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
@@ -20,6 +20,7 @@ from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.statement.interval import model_symbols, repeated
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.stiffness import state_jacobian
@@ -238,9 +239,8 @@ def _path_slopes(extremal: Extremal) -> Array:
     result = np.zeros((mesh.control_nodes, st.nu))
     if not st.path.size:
         return result
-    symbolic: Any = st.symbolic
-    symbols = [symbolic.sym(f"a{i}", n) for i, n in enumerate((st.nx, st.nu, st.ne, 1, 1, st.np))]
-    weights = symbolic.sym("mu", st.path.size)
+    symbols = model_symbols(st)
+    weights = symbols[0].sym("mu", st.path.size)
     slope = ca.gradient(ca.dot(weights, st.path.function(*symbols)), symbols[1])
     function = ca.Function("slopes", [*symbols, weights], [ca.densify(slope)])
     count = mesh.intervals + 1
@@ -277,14 +277,13 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
             (u[:-1] + j / 2 * (ends - u[:-1])).T,
             z[:, st.nx :].T,
             extremal.time[None, :-1] + j / 2 * h.T,
-            np.full((1, n), extremal.trajectory.duration),
-            np.tile(extremal.parameters[:, None], (1, n)),
+            *repeated(extremal.trajectory.duration, extremal.parameters, n),
             costate[:, : st.nx].T,
             costate[:, st.nx :].T,
         )
-        slope, curvature = (np.asarray(v.full()) for v in function(*arguments))
-        slopes.append(np.where(free, slope.T, 0.0))
-        curvatures.append(curvature.reshape(st.nu, n, st.nu).transpose(1, 0, 2))
+        slope, curvature = (stacked(v, n) for v in function(*arguments))
+        slopes.append(np.where(free, slope[:, :, 0], 0.0))
+        curvatures.append(curvature)
     if (np.linalg.eigvalsh(curvatures)[..., 0] <= 0).any():
         return float("nan")
     steps = np.linalg.solve(curvatures[1], np.array(slopes)[..., None])[..., 0]
@@ -326,8 +325,7 @@ def _explicit_pairs(extremal: Extremal) -> int | None:
     st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
     if mesh.step != "rodas":
         return max(1, mesh.substeps)
-    slopes = np.asarray(state_jacobian(st).map(n + 1)(*extremal.columns()).full())
-    matrices = slopes.reshape(st.nx, n + 1, st.nx).transpose(1, 0, 2)
+    matrices = stacked(state_jacobian(st).map(n + 1)(*extremal.columns()), n + 1)
     rates = np.abs(np.linalg.eigvals(matrices)).max(axis=1)
     needed = float((np.maximum(rates[1:], rates[:-1]) * np.diff(extremal.time)).max()) / STIFFNESS_PER_STEP
     return int(np.ceil(needed)) if needed <= LARGEST_SUBSTEPS else None

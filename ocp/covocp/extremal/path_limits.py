@@ -10,6 +10,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import OF_RANGE, Dense, mapped
 from covocp.extremal.extremal import Extremal
+from covocp.statement.interval import repeated
 
 # Points that are looked at together: what bounds the memory.
 TOGETHER = 1 << 15
@@ -104,14 +105,13 @@ def _sizes(lower: Array, upper: Array, largest: Array) -> Array:
 
 def _values(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
     """States and path constraints at normalised times s of the intervals k, (K, rows)."""
-    st, mesh, u = extremal.statement, extremal.mesh, extremal.controls
+    st, mesh = extremal.statement, extremal.mesh
     z = dense.at(s)
     x = z[:, : st.nx]
     if not st.path.size:
         return x
-    c = ((s - mesh.nodes[k]) / np.diff(mesh.nodes)[k])[:, None]
-    controls = u[k] if mesh.control == "constant" else u[k] + c * (u[k + 1] - u[k])
+    controls = extremal.control(k, (s - mesh.nodes[k]) / np.diff(mesh.nodes)[k])
     duration = extremal.trajectory.duration
-    fixed = np.full((1, s.size), duration), np.tile(extremal.parameters[:, None], (1, s.size))
+    fixed = repeated(duration, extremal.parameters, s.size)
     rows = mapped(st.path.function, x.T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed)[0]
     return np.hstack([x, rows.T])

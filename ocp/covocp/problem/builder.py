@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -13,37 +13,31 @@ from covocp.base.checks import (
     as_number,
     bound_columns,
     caller,
-    check_bounds,
     check_inside,
     check_kind,
     check_positive,
-    check_symmetric,
     column,
     density_matrix,
-    is_scalar,
     is_symbolic,
 )
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import pack_symbolic
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.boundary_values import check_free, end_value
 from covocp.problem.checks import (
     as_expression,
     check_constrains,
-    check_limits,
     check_name,
     check_size,
     column_expression,
-    find_name,
+    limit_columns,
     scale_column,
 )
 from covocp.problem.declarations import (
     Constraint,
     Control,
     Declarations,
-    Dynamics,
     Free,
     Gain,
     Guess,
@@ -58,7 +52,10 @@ from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
 from covocp.problem.measurement_information import stated_noise
+from covocp.problem.rates import with_rate
 from covocp.statement.statement import Statement
+
+Entry = TypeVar("Entry")
 
 
 @methods_one_at_a_time
@@ -181,13 +178,8 @@ class Problem:
         """
         size = self._declare(name, shape)
         low, high = bound_columns(name, lower, upper, size)
-        check_bounds(name, low, high)
-        declaration = State(
-            name=name,
-            symbol=ca.MX.sym(name, size),
-            size=size,
-            where=caller(),
-            unit=unit,
+        entry = State(
+            **_symbol(name, size, unit),
             initial=end_value(name, "initial", initial, low, high),
             final=end_value(name, "final", final, low, high),
             lower=low,
@@ -196,8 +188,7 @@ class Problem:
             scale=scale_column(name, scale, size),
             variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
         )
-        self._change(self._declarations.adding(states=declaration))
-        return declaration.symbol
+        return self._add("states", entry).symbol
 
     @checked(unit=text)
     def unknown(self, name: str, mean: Given, variance: Given, *, unit: str = "") -> ca.MX:
@@ -216,17 +207,12 @@ class Problem:
             ProblemError: name used twice, NaN or inf, variance not positive semidefinite or of the wrong size.
         """
         size = self._declare(name, int(np.size(as_number(name, "mean", mean))))
-        declaration = Unknown(
-            name=name,
-            symbol=ca.MX.sym(name, size),
-            size=size,
-            where=caller(),
-            unit=unit,
+        entry = Unknown(
+            **_symbol(name, size, unit),
             mean=column(name, "mean", mean, size),
             variance=density_matrix(name, "variance", variance, size),
         )
-        self._change(self._declarations.adding(unknowns=declaration))
-        return declaration.symbol
+        return self._add("unknowns", entry).symbol
 
     @checked(unit=text)
     def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
@@ -236,16 +222,11 @@ class Problem:
             ProblemError: name used twice, NaN or inf.
         """
         size = self._declare(name, int(np.size(as_number(name, "value", value))))
-        declaration = Parameter(
-            name=name,
-            symbol=ca.MX.sym(name, size),
-            size=size,
-            where=caller(),
-            unit=unit,
+        entry = Parameter(
+            **_symbol(name, size, unit),
             value=column(name, "value", value, size),
         )
-        self._change(self._declarations.adding(parameters=declaration))
-        return declaration.symbol
+        return self._add("parameters", entry).symbol
 
     @checked(unit=text)
     def control(
@@ -269,20 +250,14 @@ class Problem:
         """
         size = self._declare(name, shape)
         low, high = bound_columns(name, lower, upper, size)
-        check_bounds(name, low, high)
-        declaration = Control(
-            name=name,
-            symbol=ca.MX.sym(name, size),
-            size=size,
-            where=caller(),
-            unit=unit,
+        entry = Control(
+            **_symbol(name, size, unit),
             lower=low,
             upper=high,
             guess=guess,
             scale=scale_column(name, scale, size),
         )
-        self._change(self._declarations.adding(controls=declaration))
-        return declaration.symbol
+        return self._add("controls", entry).symbol
 
     @checked(unit=text)
     def symmetric(
@@ -321,7 +296,7 @@ class Problem:
         if lower is not None and initial is not None and not is_symbolic(initial):
             diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
             check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
-        declaration = declare_matrix(
+        entry = declare_matrix(
             name,
             labels=tuple(str(i) for i in range(size)),
             where=caller(),
@@ -332,8 +307,7 @@ class Problem:
             guess=guess,
             covariance=lower is not None and lower >= 0,
         )
-        self._change(self._declarations.adding(matrices=declaration))
-        return declaration.matrix
+        return self._add("matrices", entry).matrix
 
     def estimation_covariance(self, initial: Given = None) -> EstimationCovariance:
         """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
@@ -365,35 +339,7 @@ class Problem:
         Raises:
             ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
         """
-        own = self._declarations
-        name = find_name(symbol, "dynamics", list(own.named), (*own.states, *own.matrices))
-        for state in own.states:
-            if state.name == name:
-                value = as_expression(name, "rate", rate, (state.size, 1))
-                density = None if noise is None else density_matrix(name, "noise density", noise, state.size)
-                break
-        else:
-            matrix = next((entry for entry in own.matrices if entry.name == name and not entry.estimation), None)
-            if matrix is None or noise is not None:
-                raise ProblemError(
-                    f"dynamics() does not apply to '{name}'" + (" with noise." if matrix else "."),
-                    expected="a state, or a symmetric matrix without noise",
-                    received=f"'{name}'",
-                    remedy="unknowns are constant, and the estimation covariance has its rate already",
-                )
-            full = as_expression(name, "rate", rate, (matrix.size, matrix.size))
-            check_symmetric(name, "rate", full)
-            value, density = pack_symbolic(full), None
-        if name in own.rates:
-            raise ProblemError(
-                f"The rate of '{name}' is given twice.",
-                expected="one call of dynamics() for each state",
-                received=f"a first one at {own.rates[name].where}",
-                remedy="remove one of them",
-            )
-        one = density is not None and is_scalar(noise)
-        entry = Dynamics(rate=value, noise=density, where=caller(), one_density=one)
-        self._change(own.adding(rates={name: entry}))
+        self._change(with_rate(self._declarations, symbol, rate, noise))
 
     @checked(unit=text)
     def measurement(
@@ -416,7 +362,7 @@ class Problem:
         size = self._declare(name, value.shape[0])
         density, inverse = stated_noise(name, noise, information, size)
         entry = Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
-        self._change(self._declarations.adding(measurements=entry))
+        self._add("measurements", entry)
 
     def minimize(self, running: Given = 0.0, terminal: Given = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].
@@ -505,10 +451,9 @@ class Problem:
         constants = [*(q.symbol for q in own.parameters), *(q.symbol for q in own.unknowns), own.time]
         check_constrains(label, value, constants)
         size = self._declare(label, value.shape[0])
-        low, high = bound_columns(label, lower, upper, size)
-        check_limits(label, low, high)
+        low, high = limit_columns(label, lower, upper, size)
         entry = Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller())
-        self._change(self._declarations.adding(constraints=entry))
+        self._add("constraints", entry)
 
     def statement(self) -> Statement:
         """The frozen problem that solvers read; built once and kept until something is added.
@@ -525,6 +470,16 @@ class Problem:
         check_name(name, list(self._declarations.named))
         return check_size(name, size)
 
+    def _add(self, group: str, entry: Entry) -> Entry:
+        """One more declaration in a group."""
+        self._change(self._declarations.adding(**{group: entry}))
+        return entry
+
     def _change(self, declarations: Declarations) -> None:
         """Other declarations from now on: another statement, and other doubts about it."""
         self._declarations, self._statement, self.doubts_told = declarations, None, False
+
+
+def _symbol(name: str, size: int, unit: str) -> dict[str, Any]:
+    """What every symbol has."""
+    return {"name": name, "symbol": ca.MX.sym(name, size), "size": size, "where": caller(), "unit": unit}

@@ -10,7 +10,7 @@ import numpy as np
 
 from covocp.base.arguments import is_number
 from covocp.base.arguments import is_whole as is_whole
-from covocp.base.checks import check_bounds, column, is_symbolic, shape_error
+from covocp.base.checks import bound_columns, column, is_symbolic, shape_error
 from covocp.base.errors import ProblemError, kind_and_name, shown, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, real_numbers
@@ -167,21 +167,23 @@ def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None
         )
 
 
-def check_limits(name: str, lower: Array, upper: Array) -> None:
-    """Bounds of a constraint must not cross, and one of them must bind."""
-    if (lower > upper).any() and (upper == 0).all():
+def limit_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Array, Array]:
+    """Bounds of a constraint, which must not cross, and one of them must bind."""
+    low = column(name, "lower bound", lower, size, inf=True)
+    if (low > 0).any() and is_number(upper) and upper == 0:
         raise ProblemError(
             f"The bounds of '{name}' cross.",
             expected="lower <= upper",
-            received=f"lower = {lower.max():g}, upper = 0 (which it is unless given)",
+            received=f"lower = {low.max():g}, upper = 0 (which it is unless given)",
             remedy="give the upper bound too; upper=numpy.inf where there is none",
         )
-    check_bounds(name, lower, upper)
-    for i in np.flatnonzero(np.isneginf(lower) & np.isposinf(upper)):
-        entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
+    low, high = bound_columns(name, lower, upper, size)
+    for i in np.flatnonzero(np.isneginf(low) & np.isposinf(high)):
+        entry = f"component {i} of '{name}'" if size > 1 else f"'{name}'"
         raise ProblemError(
             f"{entry} has no bound.",
             expected="a finite lower or upper bound",
             received="lower = -inf, upper = inf",
             remedy="give lower= or upper=, or remove the constraint",
         )
+    return low, high

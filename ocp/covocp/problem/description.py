@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.matrices import Array, half_indices
 from covocp.base.pages import Part, Section, Sentence, Table, number
 from covocp.problem.formulas import formulas
+from covocp.statement.statement import entry_names, half_names
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
@@ -62,7 +63,7 @@ class _Written:
         expressions = dict(_expressions(problem))
         vectors: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
         symbols = [entry.symbol for entry in vectors] + [matrix.symbol for matrix in problem.matrices]
-        names = [_entry_names(entry) for entry in vectors] + [_half_names(matrix) for matrix in problem.matrices]
+        names = [entry_names((q,)) for q in vectors] + [half_names(q.name, q.labels) for q in problem.matrices]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
@@ -117,18 +118,6 @@ def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
         yield ("constraint", constraint.name), constraint.expression
 
 
-def _entry_names(entry: Any) -> list[str]:
-    """Names of the entries of a vector."""
-    return [entry.name] if entry.size == 1 else [f"{entry.name}[{i}]" for i in range(entry.size)]
-
-
-def _half_names(matrix: Any) -> list[str]:
-    """Names of the entries of the half-vector of a matrix."""
-    rows, columns = half_indices(matrix.size)
-    labels = matrix.labels
-    return [f"{matrix.name}[{labels[i]}, {labels[j]}]" for i, j in zip(rows, columns, strict=True)]
-
-
 def _table(columns: list[str], rows: list[list[str]], code: tuple[int, ...] = ()) -> Section:
     """A section of one table of words without the columns that are empty; an empty one where there are no rows."""
     kept = [j for j in range(len(columns)) if any(row[j] for row in rows)]
@@ -179,7 +168,7 @@ def _states(problem: Problem, written: _Written) -> Section:
     rows = []
     for q in problem.states:
         initial, final = _free(written("initial", q.name)), _free(written("final", q.name))
-        columns = (_entry_names(q), [q.unit] * q.size, initial, final, _ranges(q.lower, q.upper))
+        columns = (entry_names((q,)), [q.unit] * q.size, initial, final, _ranges(q.lower, q.upper))
         rows += _shortened([list(row) for row in zip(*columns, written.diagonal("variance", q.name), strict=True)])
     return _table(["state", "unit", "at 0", "at T", "bounds", "variance at 0"], rows)
 
@@ -187,7 +176,7 @@ def _states(problem: Problem, written: _Written) -> Section:
 def _unknowns(problem: Problem, written: _Written) -> Section:
     rows = []
     for q in problem.unknowns:
-        columns = (_entry_names(q), [q.unit] * q.size, [number(v) for v in q.mean])
+        columns = (entry_names((q,)), [q.unit] * q.size, [number(v) for v in q.mean])
         rows += _shortened([list(row) for row in zip(*columns, written.diagonal("variance", q.name), strict=True)])
     return _table(["unknown", "unit", "mean", "variance"], rows)
 
@@ -196,7 +185,7 @@ def _values(kind: str, entries: Sequence[tuple[Any, list[str]]], what: str) -> S
     """Vectors with one column of data."""
     rows = []
     for q, values in entries:
-        rows += _shortened([list(row) for row in zip(_entry_names(q), [q.unit] * q.size, values, strict=True)])
+        rows += _shortened([list(row) for row in zip(entry_names((q,)), [q.unit] * q.size, values, strict=True)])
     return _table([kind, "unit", what], rows)
 
 
@@ -204,7 +193,7 @@ def _matrices(problem: Problem, written: _Written) -> Section:
     """Symmetric matrices: their entries; of large ones, and where the others are zero, those of the diagonal."""
     rows = []
     for q in problem.matrices:
-        names = _half_names(q)
+        names = half_names(q.name, q.labels)
         ends = [
             _free(written(kind, q.name)) if value is not None else [FREE if kind == "initial" else ""] * len(names)
             for kind, value in (("initial", q.initial), ("final", q.final))
@@ -227,7 +216,7 @@ def _rates(problem: Problem, written: _Written) -> Section:
         given = problem.rates.get(state.name)
         rates = ["(not given yet)"] * state.size if given is None else written("rate", state.name)
         noise = [""] * state.size if given is None or given.noise is None else written.diagonal("noise", state.name)
-        columns = ([f"d {name}/dt" for name in _entry_names(state)], [f"= {rate}" for rate in rates], noise)
+        columns = ([f"d {name}/dt" for name in entry_names((state,))], [f"= {rate}" for rate in rates], noise)
         rows += _shortened([list(row) for row in zip(*columns, strict=True)])
     for matrix in problem.matrices:
         if matrix.estimation:
@@ -237,7 +226,7 @@ def _rates(problem: Problem, written: _Written) -> Section:
         else:
             given = problem.rates.get(matrix.name)
             own = [f"= {rate}" for rate in written("rate", matrix.name)] if given is not None else []
-            names = [f"d {name}/dt" for name in _half_names(matrix)]
+            names = [f"d {name}/dt" for name in half_names(matrix.name, matrix.labels)]
             filled = zip(names, own or ["= (not given yet)"] * len(names), strict=True)
             rows += _shortened([[*row, ""] for row in filled])
     return [*_table(["rate", "", "noise density"], rows, code=(0, 1)), *notes]

@@ -13,15 +13,9 @@ from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
+from covocp.statement.statement import entry_names
 
 AugmentedEntry = State | Unknown
-
-
-def augmented_names(entries: Sequence[AugmentedEntry]) -> tuple[str, ...]:
-    """Names of the rows of the estimation covariance: states, then unknowns."""
-    return tuple(
-        entry.name if entry.size == 1 else f"{entry.name}[{i}]" for entry in entries for i in range(entry.size)
-    )
 
 
 def with_estimation(declarations: Declarations, initial: Given = None) -> Declarations:
@@ -35,7 +29,7 @@ def with_estimation(declarations: Declarations, initial: Given = None) -> Declar
         ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
     """
     entries = declarations.augmented
-    labels = augmented_names(entries)
+    labels = entry_names(entries)
     if not labels:
         raise ProblemError(
             "There is nothing to estimate.",

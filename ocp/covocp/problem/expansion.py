@@ -13,24 +13,20 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Declarations, Expansion, Expected
+from covocp.problem.rates import process_noise
+from covocp.statement.statement import entry_names
 
 
 def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
-    entries: list[Any] = [*problem.states, *problem.unknowns]
     check_dynamics(problem.states, problem.rates)
-    augmented = [entry.symbol for entry in entries]
+    augmented = [entry.symbol for entry in problem.augmented]
     controls = [entry.symbol for entry in problem.controls]
     count = sum(entry.size for entry in problem.unknowns)
     rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
-    noises = [problem.rates[s.name].noise for s in problem.states]
-    noise = ca.diagcat(
-        *(ca.MX(s.size, s.size) if q is None else q for s, q in zip(problem.states, noises, strict=True)),
-        ca.MX(count, count),
-    )
     by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
     at_end = _slope(expected.terminal, augmented).T
-    weight = _weight_matrix(expected.terminal_weight, entries, "terminal weight")
+    weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
     end = _slope(at_end, augmented) + (0 if weight is None else weight)
     _check_terminal_weights(problem, end)
     return Expansion(
@@ -39,7 +35,7 @@ def expand(problem: Declarations, expected: Expected) -> Expansion:
         A=_slope(by_state, augmented),
         B=_control_weights(problem, expected, _slope(by_control, controls)),
         N=_slope(by_state, controls),
-        Q=noise,
+        Q=process_noise(problem),
         end=end,
         running=expected.running,
         terminal=expected.terminal,
@@ -49,8 +45,7 @@ def expand(problem: Declarations, expected: Expected) -> Expansion:
 
 def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
     """M and U of all measurements."""
-    entries: list[Any] = [*problem.states, *problem.unknowns]
-    augmented = [entry.symbol for entry in entries]
+    augmented = [entry.symbol for entry in problem.augmented]
     if not problem.measurements:
         return ca.MX(0, size), ca.MX(0, 0)
     value = ca.vertcat(*(m.expression for m in problem.measurements))
@@ -101,7 +96,7 @@ def _control_weights(problem: Declarations, expected: Expected, curvature: Expr)
                 blocks.append((given[a.name] if a is b else ca.MX(a.size, b.size)) if replaced else block)
             rows.append(ca.horzcat(*blocks))
         weights = ca.vertcat(*rows)
-    names = [e.name if e.size == 1 else f"{e.name}[{i}]" for e in problem.controls for i in range(e.size)]
+    names = entry_names(problem.controls)
     constant = not ca.symvar(weights)  # constants that CasADi has not folded among them
     numbers = ca.evalf(weights).full() if constant else None
     for i, name in enumerate(names):

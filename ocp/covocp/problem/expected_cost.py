@@ -48,12 +48,12 @@ from covocp.problem.declarations import (
     State,
     declare_matrix,
 )
-from covocp.problem.estimation_covariance import augmented_names, with_estimation
+from covocp.problem.estimation_covariance import with_estimation
 from covocp.problem.expansion import expand, measurement_slope
 from covocp.problem.freeze import freeze
 from covocp.problem.measurement_information import inverse_density
 from covocp.statement.names import name_of, split_entry
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Statement, entry_names
 
 # Names of what the derived problem adds to the user's symbols.
 FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
@@ -70,11 +70,10 @@ def expected_cost(
             received=repr(gain)[:100],
             remedy="correct gain=, or leave it out",
         )
-    entries: list[Any] = [*problem.states, *problem.unknowns]
     return Expected(
         running=as_expression("minimize_expected", "running cost", running, (1, 1)),
         terminal=as_expression("minimize_expected", "terminal cost", terminal, (1, 1)),
-        terminal_weight=_by_name("terminal_weight", terminal_weight, entries),
+        terminal_weight=_by_name("terminal_weight", terminal_weight, problem.augmented),
         control_weight=_by_name("control_weight", control_weight, problem.controls),
         gain=gain,
         where=caller(),
@@ -208,8 +207,7 @@ def deterministic(problem: Declarations) -> Declarations:
 
 def _check_random(problem: Declarations) -> None:
     """Something must be uncertain, or the expected cost is the deterministic one."""
-    entries: list[Any] = [*problem.states, *problem.unknowns]
-    variances = [entry.variance for entry in entries]
+    variances = [entry.variance for entry in problem.augmented]
     densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     started = [m.initial for m in problem.matrices if m.estimation]
     uncertain = [*(started or variances), *densities]
@@ -284,7 +282,7 @@ def _inverse(density: Expr) -> Any:
 
 def _with_feedback(problem: Declarations, expansion: Expansion) -> tuple[Declarations, Any, Expansion]:
     """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
-    labels = augmented_names([*problem.states, *problem.unknowns])
+    labels = entry_names(problem.augmented)
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
     weight = _inverse(expansion.B)
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
@@ -298,7 +296,7 @@ def _with_free_gain(
     problem: Declarations, expansion: Expansion, gain: Gain, information: Expr
 ) -> tuple[Declarations, Any, Expansion]:
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
-    labels = augmented_names([*problem.states, *problem.unknowns])
+    labels = entry_names(problem.augmented)
     size, rows = len(labels), sum(control.size for control in problem.controls)
     pattern, low, high, guess = _gain_entries(gain, (rows, size))
     where = np.flatnonzero(pattern.ravel(order="F"))

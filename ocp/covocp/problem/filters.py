@@ -14,6 +14,7 @@ from covocp.blocks.bucy import time_step
 from covocp.blocks.extended import Estimated, bucy_slopes, corrected_by, propagated
 from covocp.blocks.updates import Form, Missing
 from covocp.problem.builder import Problem
+from covocp.problem.rates import process_noise
 from covocp.statement.statement import Statement
 
 
@@ -128,7 +129,7 @@ class _System:
         nominal: Any = statement.nominal
         rate = ca.vertcat(nominal(*at)[0][:estimated], kind.zeros(means.size))
         self.rate = ca.Function("rate", [x, t, u], [ca.densify(rate)])
-        expression = statement.expression(_process_noise(problem, means.size))
+        expression = statement.expression(process_noise(problem.declarations))
         noise = expression(state, control, kind.zeros(statement.ne), *at[2:])
         self.noise = ca.Function("noise", [x, t, u], [ca.densify(noise)])
         self.measurement: ca.Function | None = None
@@ -146,12 +147,3 @@ def _parameters(statement: Statement) -> tuple[Array, Array]:
     """Values of the known parameters, means of the unknowns."""
     count = sum(block.length for block in statement.of_kind("unknown"))
     return statement.values[: statement.np - count], statement.values[statement.np - count :]
-
-
-def _process_noise(problem: Problem, unknowns: int) -> Any:
-    """Density of the process noise of the augmented state, in the user's symbols."""
-    noises: list[Any] = []
-    for state in problem.declarations.states:
-        density = problem.declarations.rates[state.name].noise
-        noises.append(ca.MX(state.size, state.size) if density is None else density)
-    return ca.diagcat(*noises, ca.MX(unknowns, unknowns))

@@ -18,9 +18,9 @@ from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.base.short_repr import short_repr
 from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
-from covocp.problem.estimation_covariance import augmented_names
 from covocp.problem.measurement_information import check_readings, inverse_density
-from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement
+from covocp.problem.rates import process_noise
+from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement, entry_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ def freeze(problem: Declarations) -> Statement:
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
         guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
         scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
-        augmented=augmented_names(problem.augmented),
+        augmented=entry_names(problem.augmented),
         coupled=coupled,
         symbolic=stacked.symbolic,
         autonomous=not ca.depends_on(everything, t),
@@ -284,17 +284,11 @@ def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any
 
 def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measurement: Expr) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
-    size = stacked.estimated + stacked.unknowns
     constants = ca.DM.zeros(stacked.unknowns, 1)
     drift = _augmented_jacobian(stacked, ca.vertcat(rates[: stacked.estimated], constants))
-    noises = []
-    for state in (entry for entry in problem.states if entry.estimated):
-        density = problem.rates[state.name].noise
-        noises.append(ca.DM(state.size, state.size) if density is None else stacked.substitute(density)[0])
-    count = sum(entry.size for entry in problem.unknowns)
-    noise = ca.diagcat(*noises, ca.DM(count, count))
+    (noise,) = stacked.substitute(process_noise(problem))
     if measurement is None:
-        return drift, noise, stacked.symbolic(size, size)
+        return drift, noise, stacked.symbolic(*drift.shape)
     _, jacobian, density = measurement
     blocks = [
         (stacked.substitute(m.noise)[0], None if m.information is None else stacked.substitute(m.information)[0])

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
 from covocp.base.errors import CovocpError, ProblemError, shown
 from covocp.base.expressions import Given
+from covocp.base.gains import weighted
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
@@ -219,7 +220,7 @@ def extended_filter(
     half = pack(values.numeric("covariance", values.weight("covariance", covariance, size)))
     process = values.numeric("W", values.weight("W", W, size))
     noise = values.numeric("V", values.weight("V", V, len(rows), definite=True))
-    weighted = np.linalg.solve(noise, rows).T
+    seen = weighted(rows, noise)
 
     def rate(state: Given, t: Given, u: Given, y: Given) -> Any:
         estimate = ca.SX.sym("estimate", size)
@@ -227,7 +228,7 @@ def extended_filter(
         tangent = ca.substitute(ca.jacobian(slope, estimate), estimate, state[:size])
         slope = ca.substitute(slope, estimate, state[:size])
         P = unpack_symbolic(state[size + len(sums) :], size)
-        correction = P @ ca.DM(weighted) @ (y - ca.DM(rows) @ state[:size])
+        correction = P @ ca.DM(seen) @ (y - ca.DM(rows) @ state[:size])
         growth = pack_symbolic(kalman.rate(P, tangent, rows, process, noise))
         return ca.vertcat(slope + correction, ca.DM(sums) @ state[:size], growth)
 

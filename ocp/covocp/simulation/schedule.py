@@ -14,10 +14,11 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, pack, unpack_symbolic
-from covocp.base.riccati_rates import inverse
 from covocp.base.short_repr import short_repr
-from covocp.blocks.arithmetic import apply, definite_solve, symmetric
+from covocp.blocks.arithmetic import apply
+from covocp.blocks.updates import definite_gain
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
 
@@ -188,9 +189,9 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
     }
     step = symbolic.sym("step")
     if kind == "perturbation":
-        at, half = design.model(x, u, t, T, p), estimation_half(st, e)
-        parts |= {"K": kalman_gain(half, n, at.M, at.U), "F": at.F, "G": at.G, "M": at.M, "Hu": at.Hu, "h": at.h}
-        parts["early"] = early_gain(unpack_symbolic(half, n), at.M, at.U, step)
+        at, E = design.model(x, u, t, T, p), unpack_symbolic(estimation_half(st, e), n)
+        parts |= {"K": kalman_gain(E, at.M, at.U), "F": at.F, "G": at.G, "M": at.M, "Hu": at.Hu, "h": at.h}
+        parts["early"] = early_gain(E, at.M, at.U, step)
     shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
     assert shapes["C"] == (m, n)
     return Coefficients(
@@ -203,22 +204,11 @@ def estimation_half(statement: Given, e: Given) -> Any:
     return e[next(b for b in statement.matrices if b.estimation).span]
 
 
-def kalman_gain(half: Given, size: int, M: Given, U: Given) -> Any:
-    """Kalman gain K = E M' U^-1, (n, r), of the half-vector of E [Schmidt 2.5-3]; no columns without measurements."""
-    E = unpack_symbolic(half, size)
-    return E @ M.T @ inverse(U) if M.shape[0] else type(half).zeros(size, 0)
-
-
 def early_gain(E: Given, M: Given, U: Given, h: Given) -> Any:
     """Gain E M'(M E M' + 2 U/h)^-1, (n, r), of what half a step measures, E known before it; bounded at any h."""
     if not M.shape[0]:
         return type(E).zeros(E.shape[0], 0)
-
-    def law(E: Given, M: Given, U: Given, h: Given) -> tuple[Any]:
-        seen = h * (M @ E)
-        return (definite_solve(symmetric(seen @ M.T) + 2 * U, seen, "noise of the innovation").T,)
-
-    return apply(law, E, M, ca.densify(U), h)[0]
+    return apply(lambda E, M, U, h: (definite_gain(h * E, M, 2 * U),), E, M, ca.densify(U), h)[0]
 
 
 def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 from covocp.base.checks import as_number, check_density, check_kind
 from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, unpack
+from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import Statistics, close_loop, densities
 from covocp.extremal.extremal import Extremal
@@ -31,7 +31,7 @@ from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
 from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
 from covocp.transcription.grading import graded
-from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.mesh import Mesh, Options, control_places
 from covocp.transcription.nlp import check_costs
 
 # Relative difference of rates or slopes above which the truth is another system.
@@ -149,7 +149,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
 def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> tuple[Array, float]:
     """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
     nodes, duration = mesh.nodes, statement.duration.guess
-    at = nodes if mesh.control == "linear" else 0.5 * (nodes[1:] + nodes[:-1])
+    at = control_places(nodes, mesh.control)
     if nominal is None:
         return controls_guess(statement, nodes, mesh.control, sign=0.0), duration
     if isinstance(nominal, Solution):
@@ -267,8 +267,7 @@ def _check_densities(extremal: Extremal, truth: Statistics) -> None:
     values = truth.density.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
     check_density("truth", "initial covariance", truth.initial, definite=False)
     for what, value in zip(("process noise density", "measurement noise density"), values, strict=True):
-        numbers = np.asarray(value.full())
-        matrices = numbers.reshape(numbers.shape[0], count, -1).transpose(1, 0, 2)
+        matrices = stacked(value, count)
         if matrices.size:
             smallest = np.linalg.eigvalsh(np.nan_to_num(matrices))[:, 0]
             worst = int(np.argmin(np.where(np.isfinite(matrices).all(axis=(1, 2)), smallest, -np.inf)))

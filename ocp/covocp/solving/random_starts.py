@@ -13,7 +13,7 @@ from covocp.base.matrices import Array
 from covocp.extremal.extremal import Guess
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import check_model, control_scale, controls_guess, is_plain, starts
-from covocp.transcription.mesh import Mesh
+from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import base_run, bend_size, completed, ranked, targets
 from covocp.transcription.steering import Run, steer
 
@@ -106,7 +106,7 @@ def _steered(run: Run, u: Array) -> Array:
 
 def _wave(statement: Statement, mesh: Mesh, flat: Array, generator: np.random.Generator) -> Array:
     """A smooth random function for each control: a few cosines with random coefficients."""
-    at = mesh.nodes if mesh.control == "linear" else 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
+    at = control_places(mesh.nodes, mesh.control)
     orders = np.arange(WAVES)
     columns = [np.zeros((at.size, 0))]
     for block in statement.controls:

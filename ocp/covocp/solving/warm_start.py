@@ -11,13 +11,14 @@ import numpy as np
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
+from covocp.base.quadrature import interpolated
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
 from covocp.statement.names import name_of
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.mesh import Mesh
+from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import own_start, ranked
-from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.steering import quadrature_weights, resampled
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 
@@ -76,9 +77,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     own = solution.mesh
     same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
     sample = solution.at(mesh.nodes * solution.duration)
-    at_controls = sample
-    if mesh.control == "constant":
-        at_controls = solution.at(0.5 * (mesh.nodes[:-1] + mesh.nodes[1:]) * solution.duration)
+    at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
     plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     t, m = solution.trajectory, solution.multipliers
@@ -102,7 +101,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     constraints = (statement.path.size, statement.start.size, statement.end.size)
     if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
         return Guess(trajectory=trajectory, warm=True)
-    costates = _resample(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
     return Guess(
         trajectory=trajectory,
         multipliers=_multipliers(m, own, mesh),
@@ -132,14 +131,6 @@ def _check_common(statement: Statement, solution: Solution) -> None:
         )
 
 
-def _resample(values: Array, old: Array, new: Array) -> Array:
-    """Columns interpolated linearly from old nodes to new ones."""
-    if np.array_equal(old, new):
-        return values
-    columns = [np.interp(new, old, column) for column in values.T]
-    return np.array(columns).reshape(values.shape[1], new.size).T
-
-
 def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
     """Multipliers on another mesh: those at nodes are densities times the weights of the nodes."""
     if np.array_equal(old.nodes, new.nodes) and (old.control, old.points) == (new.control, new.points):
@@ -147,10 +138,9 @@ def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
     before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, new))
 
     def at_nodes(values: Array) -> Array:
-        return _resample(values / before, old.nodes, new.nodes) * after
+        return interpolated(values / before, old.nodes, new.nodes) * after
 
-    places = [m.nodes if m.control == "linear" else 0.5 * (m.nodes[1:] + m.nodes[:-1]) for m in (old, new)]
-    controls = _resample(multipliers.controls / quadrature_weights(old)[:, None], *places)
+    controls = resampled(multipliers.controls / quadrature_weights(old)[:, None], old, new)
     return replace(
         multipliers,
         path=at_nodes(multipliers.path_at_nodes),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 
 # Share of an interval by which its ends are moved inside where the model is told the time, see `one_sided`.
@@ -90,8 +92,13 @@ class Interval(NamedTuple):
         return Interval(*(ca.reshape(ca.vertcat(*each), each[0].shape[0], n * count) for each in entries))
 
 
-def model_symbols(statement: Statement, kind: Any = None) -> list[Expr]:
+def repeated(duration: float, parameters: Array, count: int) -> tuple[Array, Array]:
+    """Terminal time and parameters, a column for each of several points."""
+    return np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
+
+
+def model_symbols(statement: Statement) -> list[Expr]:
     """Symbols of the arguments of the model: state, control, half-vectors, time, duration, parameters."""
-    kind = statement.symbolic if kind is None else kind
+    kind: Any = statement.symbolic
     sizes = (statement.nx, statement.nu, statement.ne, 1, 1, statement.np)
     return [kind.sym(f"a{i}", size) for i, size in enumerate(sizes)]

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import bound_columns, check_bounds, column
+from covocp.base.checks import bound_columns, column
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length, unpack_indices
@@ -234,7 +234,5 @@ def control_limits(statement: Statement, count: int, given: Given) -> Limits:
                 received=repr(pair)[:100],
                 remedy=f"give limits={{'{block.name}': (lower, upper)}}",
             )
-        low, high = bound_columns(block.name, pair[0], pair[1], block.size)
-        check_bounds(block.name, low, high)
-        lower[block.span], upper[block.span] = low, high
+        lower[block.span], upper[block.span] = bound_columns(block.name, pair[0], pair[1], block.size)
     return lower, upper

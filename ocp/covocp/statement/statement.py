@@ -11,7 +11,7 @@ and leaves out those that it cannot depend on. `parameters` stacks the known par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -261,6 +261,16 @@ class Statement:
         """Positions among `matrices` of those that run backward in time."""
         return tuple(i for i, block in enumerate(self.matrices) if block.backward)
 
+    @cached
+    def estimated(self) -> bool:
+        """Whether the covariance of the estimation error is among the matrices."""
+        return any(block.estimation for block in self.matrices)
+
+    @cached
+    def estimation(self) -> Block:
+        """Block of the covariance of the estimation error, where there is one."""
+        return next(block for block in self.matrices if block.estimation)
+
     def entries(self, positions: tuple[int, ...]) -> list[int]:
         """Entries of the stacked half-vectors that belong to some of the matrices."""
         return [k for i in positions for k in range(self.matrices[i].span.start, self.matrices[i].span.stop)]
@@ -284,11 +294,7 @@ class Statement:
     @cached
     def matrix_names(self) -> tuple[str, ...]:
         """Names of the entries of the stacked half-vectors, such as 'E[x, b]'."""
-        names: list[str] = []
-        for block in self.matrices:
-            rows, columns = half_indices(block.size)
-            names += [f"{block.name}[{block.labels[i]}, {block.labels[j]}]" for i, j in zip(rows, columns, strict=True)]
-        return tuple(names)
+        return tuple(name for block in self.matrices for name in half_names(block.name, block.labels))
 
     @cached
     def state_names(self) -> tuple[str, ...]:
@@ -301,6 +307,11 @@ class Statement:
         return entry_names(self.controls)
 
 
-def entry_names(blocks: tuple[Block, ...]) -> tuple[str, ...]:
+def entry_names(blocks: Iterable[Any]) -> tuple[str, ...]:
     """Names of the entries of some stacked vectors."""
     return tuple(block.name if block.size == 1 else f"{block.name}[{i}]" for block in blocks for i in range(block.size))
+
+
+def half_names(name: str, labels: tuple[str, ...]) -> list[str]:
+    """Names of the entries of the half-vector of a matrix, such as 'E[x, b]'."""
+    return [f"{name}[{labels[i]}, {labels[j]}]" for i, j in zip(*half_indices(len(labels)), strict=True)]

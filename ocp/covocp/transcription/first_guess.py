@@ -13,10 +13,11 @@ from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack, real_numbers, unpack
+from covocp.base.quadrature import interpolated
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.mesh import Mesh
+from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, full_interval, nominal_interval
+from covocp.transcription.steps import KEPT, moving_interval, nominal_interval
 
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.
@@ -25,7 +26,7 @@ BENDING = 1.0
 
 def controls_guess(statement: Statement, nodes: Array, control: str, sign: float = 1.0) -> Array:
     """Controls at the nodes (N+1 or N, nu): the user's guess, bent where it is one number."""
-    at = nodes if control == "linear" else 0.5 * (nodes[:-1] + nodes[1:])
+    at = control_places(nodes, control)
     columns = []
     for block in statement.controls:
         guess = statement.guesses[block.name]
@@ -72,8 +73,7 @@ def evaluate_guess(block: Block, guess: Given, at: Array) -> Array:
     if numbers.ndim == 2 and numbers.shape == (block.size, at.size) and numbers.shape != (at.size, block.size):
         numbers = numbers.T
     if numbers.ndim == 2 and numbers.shape[1] == block.size and numbers.shape[0] > 1 and numbers.shape[0] != at.size:
-        own = np.linspace(0.0, 1.0, numbers.shape[0])
-        numbers = np.stack([np.interp(at, own, column) for column in numbers.T], axis=1)
+        numbers = interpolated(numbers, np.linspace(0.0, 1.0, numbers.shape[0]), at)
     if numbers.shape != (at.size, block.size) or not np.isfinite(numbers).all():
         raise ProblemError(
             f"The guess of '{block.name}' does not fit.",
@@ -202,11 +202,7 @@ def _short(values: Array) -> str:
 @lru_cache(maxsize=KEPT)
 def _simulation(statement: Statement, mesh: Mesh) -> ca.Function:
     """All intervals in sequence, from the start."""
-    if statement.coupled:
-        interval = full_interval(statement, mesh.substeps, mesh.step)
-    else:
-        interval = nominal_interval(statement, mesh.substeps, mesh.step)
-    return interval.mapaccum("simulate", mesh.intervals)
+    return moving_interval(statement, mesh.substeps, mesh.step).mapaccum("simulate", mesh.intervals)
 
 
 def simulate_states(

@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, unpack
+from covocp.base.matrices import Array, stacked, unpack
+from covocp.base.quadrature import covariance_after, interpolated
 from covocp.base.short_repr import short_repr
+from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
@@ -145,7 +147,7 @@ def _steepness(
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
         if form is not None and block.backward == backward and (block.estimation or block.backward):
             first = _first_value(statement, guess, parameters, block)
-            forms = _forms(form, block.size, guess, parameters, times, backward)
+            forms = _forms(form, guess, parameters, times, backward)
             values = _passage(first, forms, times)
             rates = np.maximum(rates, _changes(values, forms))
             drift = forms[0] - values @ forms[2]
@@ -164,7 +166,7 @@ def _first_value(statement: Statement, guess: Trajectory, parameters: Array, blo
 
 
 def _forms(
-    form: Expr, size: int, guess: Trajectory, parameters: Array, times: Array, backward: bool
+    form: Expr, guess: Trajectory, parameters: Array, times: Array, backward: bool
 ) -> tuple[Array, Array, Array]:
     """F, Q, W in the direction of travel at some distances from the end, along the guess; (points, n, n) each."""
     duration = guess.duration
@@ -172,14 +174,10 @@ def _forms(
     s = 1.0 - s if backward else s
     own = np.linspace(0.0, 1.0, guess.x.shape[0])
     at = own if guess.u.shape[0] == own.size else 0.5 * (own[1:] + own[:-1])
-    x, u = (
-        np.array([np.interp(s, nodes, column) for column in values.T]).reshape(values.shape[1], s.size)
-        for nodes, values in ((own, guess.x), (at, guess.u))
-    )
-    columns = (np.full((1, s.size), duration), np.tile(parameters[:, None], (1, s.size)))
-    values = form.map(s.size)(x, u, (duration * s)[None, :], *columns)
+    x, u = (interpolated(values, nodes, s).T for nodes, values in ((own, guess.x), (at, guess.u)))
+    values = form.map(s.size)(x, u, (duration * s)[None, :], *repeated(duration, parameters, s.size))
     sign = -1.0 if backward else 1.0
-    result = [sign * np.asarray(v.full()).reshape(size, s.size, size).transpose(1, 0, 2) for v in values]
+    result = [sign * stacked(v, s.size) for v in values]
     return tuple(np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0) for v in result)  # type: ignore[return-value]
 
 
@@ -195,9 +193,7 @@ def _passage(first: Array, forms: tuple[Array, Array, Array], times: Array) -> A
     try:
         for k in range(count - 1):
             D = np.linalg.solve(unit - h[k] / 2 + square[k], unit + h[k] / 2 + square[k])
-            moved = D[:, :size] + D[:, size:] @ values[k]
-            after = np.linalg.solve(moved[:size].T, moved[size:].T)
-            values[k + 1] = 0.5 * (after + after.T)
+            values[k + 1] = covariance_after(D, values[k])
     except np.linalg.LinAlgError:  # what comes after the point that cannot be stepped from counts as settled
         pass
     values[~np.isfinite(values).all(axis=(1, 2))] = 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,9 +80,7 @@ def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
 
 def _divided(mesh: Mesh, u: Array, parts: int) -> tuple[Mesh, Array]:
     """The mesh with each interval in equal parts, and the same controls on it."""
-    c = np.arange(parts) / parts
-    nodes = np.append((mesh.nodes[:-1, None] + c * np.diff(mesh.nodes)[:, None]).ravel(), mesh.nodes[-1])
-    divided = replace(mesh, nodes=nodes, segments=tuple(parts * length for length in mesh.segments), points=1)
+    c, divided = np.arange(parts) / parts, mesh.divided(parts)
     if mesh.control == "constant":
         return divided, np.repeat(u, parts, axis=0)
     between = u[:-1, None, :] + c[None, :, None] * np.diff(u, axis=0)[:, None, :]

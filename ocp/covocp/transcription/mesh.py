@@ -143,10 +143,22 @@ class Mesh:
         """Number of control values: N + 1 (linear) or N (constant)."""
         return self.intervals + (self.control == "linear")
 
+    def divided(self, parts: int) -> Mesh:
+        """The mesh with each interval in equal parts, whose steps are those of the interval."""
+        c = np.arange(parts) / parts
+        inside = self.nodes[:-1, None] + c * np.diff(self.nodes)[:, None]
+        segments = tuple(parts * length for length in self.segments)
+        return replace(self, nodes=np.append(inside.ravel(), self.nodes[-1]), segments=segments, points=1)
+
     @property
     def starts(self) -> tuple[int, ...]:
         """Node at which each segment starts, and the last node."""
         return tuple(np.cumsum([0, *self.segments]).tolist())
+
+
+def control_places(nodes: Array, control: str) -> Array:
+    """Normalised times of the control values: the nodes, or the middles of the intervals."""
+    return nodes if control == "linear" else 0.5 * (nodes[1:] + nodes[:-1])
 
 
 @dataclass(frozen=True, kw_only=True)

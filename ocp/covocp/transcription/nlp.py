@@ -17,6 +17,8 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Scaled residual above which a constraint of a failed run is reported as violated.
 VIOLATION = 1e-6
+# Settings of CasADi's nlpsol in which it is silent and does not raise.
+QUIET = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "calc_lam_p": False}
 
 
 @dataclass(frozen=True, kw_only=True)

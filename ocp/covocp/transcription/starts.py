@@ -16,7 +16,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
+from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import (
     check_model,
@@ -29,11 +31,11 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
-from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, explicit_substeps
+from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, control_places, explicit_substeps
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
 from covocp.transcription.steps import KEPT
 from covocp.transcription.stiffness import stiffness
-from covocp.transcription.trajectory import Trajectory
+from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # A bend is halved until its second half moves the states as its first half does, up to this share, or until it moves
 # none by more than FAINT of its scale.
@@ -179,17 +181,12 @@ def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[in
     for block in statement.states:
         guess = statement.guesses[block.name]
         if guess is not None:
-            path[:, block.span] = _on(coarse, mesh, evaluate_guess(block, guess, mesh.nodes))
+            path[:, block.span] = interpolated(evaluate_guess(block, guess, mesh.nodes), mesh.nodes, coarse.nodes)
     start = starts(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
     run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat))
     return run.clip(resampled(track(run, rows, path[:, list(rows)], flat), coarse, mesh))
-
-
-def _on(coarse: Mesh, mesh: Mesh, values: Array) -> Array:
-    """Values at the nodes of a mesh at those of a coarser one."""
-    return np.stack([np.interp(coarse.nodes, mesh.nodes, column) for column in values.T], axis=1)
 
 
 def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
@@ -315,7 +312,7 @@ def _distinct(judged: list[_Judged]) -> list[_Judged]:
 
 def _unsymmetric(run: Run, u: Array, flat: Array) -> Array:
     """Controls with a little of the bend, which follows their direction."""
-    at = run.mesh.nodes if run.mesh.control == "linear" else 0.5 * (run.mesh.nodes[1:] + run.mesh.nodes[:-1])
+    at = control_places(run.mesh.nodes, run.mesh.control)
     bend = run.units * (1.0 - at[:, None])
     return np.asarray(u + REMAINDER * np.where(np.sum((u - flat) * bend, axis=0) < 0, -1.0, 1.0) * bend)
 
@@ -323,7 +320,7 @@ def _unsymmetric(run: Run, u: Array, flat: Array) -> Array:
 def _shapes(run: Run, flat: Array, own: Array) -> Iterator[Array]:
     """Controls from which the ranking begins."""
     nu = run.statement.nu
-    at = run.mesh.nodes if run.mesh.control == "linear" else 0.5 * (run.mesh.nodes[1:] + run.mesh.nodes[:-1])
+    at = control_places(run.mesh.nodes, run.mesh.control)
     patterns = np.eye(nu) if nu <= APART else np.vstack([np.ones(nu), np.where(np.arange(nu) % 2, -1.0, 1.0)])
     yield own
     yield flat
@@ -348,14 +345,12 @@ def _merit(run: Run, u: Array) -> tuple[float, float]:
     cost = running + float(st.terminal(x[-1], e[-1], duration, p))
     lower, upper = st.state_bounds
     violation = float((np.maximum(lower - x, x - upper) / run.divisors).max(initial=0.0))
-    at_nodes = u if u.shape[0] == x.shape[0] else np.vstack([u, u[-1:]])
     count = x.shape[0]
-    columns = (x.T, at_nodes.T, e.T, run.mesh.nodes[None, :] * duration, np.full((1, count), duration))
+    columns = (x.T, at_nodes(u, count).T, e.T, run.mesh.nodes[None, :] * duration, *repeated(duration, p, count))
     for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(count - 1, count))):
         if conditions.size:
             chosen = [c[:, at] for c in columns]
-            number = chosen[0].shape[1]
-            rows = conditions.function.map(number)(*chosen, np.tile(p[:, None], (1, number))).full().T
+            rows = conditions.function.map(chosen[0].shape[1])(*chosen).full().T
             limits = [np.nan_to_num(v, posinf=0.0, neginf=0.0) for v in (conditions.lower, conditions.upper)]
             size = np.maximum.reduce([np.abs(rows).max(axis=0), np.abs(limits[0]), np.abs(limits[1])])
             excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
-from covocp.transcription.mesh import Mesh
+from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import KEPT, nominal_interval
 
@@ -245,5 +245,4 @@ def track(run: Run, rows: tuple[int, ...], path: Array, plain: Array) -> Array:
 
 def resampled(values: Array, old: Mesh, new: Mesh) -> Array:
     """Controls of one mesh on another, interpolated linearly."""
-    places: list[Any] = [m.nodes if m.control == "linear" else 0.5 * (m.nodes[1:] + m.nodes[:-1]) for m in (old, new)]
-    return np.stack([np.interp(places[1], places[0], column) for column in values.T], axis=1)
+    return interpolated(values, *(control_places(mesh.nodes, mesh.control) for mesh in (old, new)))

@@ -31,7 +31,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, hermite, simpson_weight
+from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, hermite, riccati_step, simpson_weight
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.rosenbrock import between, implicit_interval
@@ -190,9 +190,7 @@ def _slope(statement: Statement, *point: Expr) -> Expr:
 def _gauss_step(matrix: Expr, half: Expr, size: int, solver: str) -> Any:
     """Half-vector of E+ = (D21 + D22 E)(D11 + D12 E)^-1, symmetrised."""
     covariance = unpack_symbolic(half, size)
-    below = matrix[size:, :size] + matrix[size:, size:] @ covariance
-    above = matrix[:size, :size] + matrix[:size, size:] @ covariance
-    return pack_symbolic(linear_solve(above.T, below.T, solver))
+    return pack_symbolic(riccati_step(matrix, covariance, lambda above, below: linear_solve(above, below, solver)))
 
 
 def _strang_step(parts: Expr, half: Expr, size: int, solver: str) -> Any:
@@ -283,6 +281,11 @@ def early(interval: Interval) -> Expr:
 
 
 @lru_cache(maxsize=KEPT)
+def moving_interval(statement: Statement, substeps: int, step: StepKind) -> ca.Function:
+    """The interval of what cannot be told apart: x and e stacked where rates of x contain e, else x."""
+    return (full_interval if statement.coupled else nominal_interval)(statement, substeps, step)
+
+
 def full_interval(statement: Statement, substeps: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """Nominal and half-vectors over one control interval with the given covariance step.
 

@@ -25,6 +25,11 @@ class Trajectory:
     __repr__ = short_repr
 
 
+def at_nodes(u: Array, nodes: int) -> Array:
+    """Control values at all nodes; a constant control holds its last value at the last node."""
+    return u if u.shape[0] == nodes else np.vstack([u, u[-1:]])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Multipliers:
     """Multipliers of the constraints of a statement, in the units of cost per unit of the constraint.

@@ -7,7 +7,6 @@ import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from covocp.base.pages import lines_as_html
 from covocp.base.threads import methods_one_at_a_time
 from covocp.export.compiled.building import TIMEOUT, Build, Sources, build
 from covocp.export.compiled.library import Laws, Library, laws_of
-from covocp.export.laws.law import CODES, Law
+from covocp.export.laws.law import CODES, Law, span
 from covocp.export.text.self_test import POINTS, SEED, reference
 
 TIMED_SECONDS = 0.2  # of each law in `time`
@@ -295,7 +294,7 @@ class CPackage:
         """Python and the virtual machine."""
         known = reference(law, POINTS, SEED, self.precision)
         rows = known.rows[known.status == CODES["OK"]] if (known.status == CODES["OK"]).any() else known.rows
-        columns = [[row[place] for place in _places(law)] for row in rows]
+        columns = [[row[span(law.inputs, port.name)] for port in law.inputs] for row in rows]
 
         def calls(count: int) -> float:
             begin = time.perf_counter()
@@ -334,9 +333,3 @@ def _duration(nanoseconds: float) -> str:
         if nanoseconds >= 0.9995 * size:  # what would be rounded to 1000 of the smaller unit
             return f"{nanoseconds / size:.3g} {unit}"
     return f"{nanoseconds:.3g} ns"
-
-
-def _places(law: Law) -> list[slice]:
-    """Where the inputs lie in a row."""
-    ends = np.cumsum([0, *(port.size for port in law.inputs)]).tolist()
-    return [slice(i, j) for i, j in pairwise(ends)]

@@ -22,9 +22,11 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.gains import innovation_gain
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.base.matrices import Array
-from covocp.base.quadrature import GAUSS_NODES
+from covocp.base.quadrature import GAUSS_NODES, gauss_step
+from covocp.blocks.updates import without
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
@@ -164,14 +166,12 @@ def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
 def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Array:
     """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits."""
     m = design.sizes[1]
-    time = ca.MX.sym("time")
-    now = tables.at(time)
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
-    x, u, e = (np.asarray(v.full()) for v in ca.Function("nominal", [time], [now.x, now.u, now.e])(0.0))
+    x, u, e = (values[0] for values in tables.rows(np.zeros(1)))
     zeros |= {
-        "control": np.clip(u[:m].ravel(), *design.limits),
-        "nominal_control": u[:m].ravel(),
-        "nominal_state": x.ravel(),
+        "control": np.clip(u[:m], *design.limits),
+        "nominal_control": u[:m],
+        "nominal_state": x,
     }
     zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
     return np.concatenate(list(zeros.values()))
@@ -180,6 +180,12 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Arr
 def solved(matrix: Expr, right: Expr) -> Any:
     """matrix^-1 right: written out in scalars where the expressions are SX, by QR factors otherwise."""
     return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else linear_solve(matrix, right, COMPILED_SOLVER)
+
+
+def solved_in_units(spread: Expr, right: Expr) -> Any:
+    """`solved` for a covariance, in units of its standard deviations."""
+    units = ca.diag(1.0 / ca.sqrt(ca.diag(spread)))
+    return units @ solved(units @ spread @ units, units @ right)
 
 
 def _predict(
@@ -193,33 +199,22 @@ def _predict(
         nominal: at both Gauss points of the step.
         at: their times [s].
         h: length of the step [s].
-
-    The elimination of the stages is that of `covocp.base.quadrature.gauss_transition`, with an affine part.
     """
     st, (n, m, _) = design.statement, design.sizes
-    unit, units = ca.DM.eye(n), ca.diag(ca.DM(design.units))
-    inverse = ca.diag(1.0 / ca.DM(design.units))
+    units, inverse = ca.diag(ca.DM(design.units)), ca.diag(1.0 / ca.DM(design.units))
     kind = design.symbolic if n <= SCALAR_SIZE else ca.MX
     own, error, du, dt = kind.sym("y", n), kind.sym("E", n, n), kind.sym("held", m), kind.sym("h")
     symbols = [[kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("t")] for _ in at]
     slopes = [design.model(*three)[:2] for three in symbols]
-    (H1, g1), (H2, g2) = (
-        (dt * (inverse @ F @ units), dt * (inverse @ (G @ (du - three[1][:m]))))
-        for (F, G), three in zip(slopes, symbols, strict=True)
-    )
-    begin = inverse @ own
-    g = np.sqrt(3.0) / 6.0
-    a = 0.5 - 2.0 * g
-    left, right = unit - g * H2, unit - g * H1
-    asked = ca.horzcat(left @ (begin + g * g1) + a / 2 * (g1 + g2), left)
-    stages = solved(left @ right - a / 2 * (H1 + H2), asked)
-    value = own + units @ (right @ stages[:, 0] - begin - g * g1) / a
-    move = units @ (unit + (right @ stages[:, 1:] - unit) / a) @ inverse
+    points = [dt * (inverse @ F @ units) for F, _ in slopes]
+    forcing = [dt * (inverse @ (G @ (du - three[1][:m]))) for (_, G), three in zip(slopes, symbols, strict=True)]
+    change, transition = gauss_step(points, forcing, inverse @ own, ca.DM.eye(n), solved)
+    value, move = own + units @ change, units @ transition @ inverse
     spread = move @ error @ move.T + dt * design.noise(*symbols[1])
     inputs = [own, error, du, dt, *symbols[0], *symbols[1]]
     function = ca.Function("predict", inputs, [ca.densify(value), ca.densify(spread)])
-    points = [(now.x, now.u, t) for now, t in zip(nominal, at, strict=True)]
-    value, spread = function(*given, h, *points[0], *points[1])
+    nodes = [(now.x, now.u, t) for now, t in zip(nominal, at, strict=True)]
+    value, spread = function(*given, h, *nodes[0], *nodes[1])
     return value, spread
 
 
@@ -244,11 +239,7 @@ def _corrected(
     E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
-    kept = ca.diag(present)
-    rows = kept @ M
-    spread = h * (rows @ E @ rows.T) + kept @ U @ kept + ca.diag(1 - present)
-    units = ca.diag(1.0 / ca.sqrt(ca.diag(spread)))
-    L = (units @ solved(units @ spread @ units, h * (units @ rows @ E))).T
+    L, _ = innovation_gain(h * E, *without(present, M, U), solved_in_units)
     missing = ca.sum1(present) < r
     outputs = [ca.densify(v) for v in (y + L @ residual, C, L, missing)]
     function = ca.Function("correct", [y, E, held, measured, h, x, u, e, t], outputs)
@@ -263,10 +254,7 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
     known = np.clip(np.nan_to_num(time, posinf=tables.duration, neginf=0.0), 0.0, tables.duration)
     steps = tables.duration * 10.0 ** random.uniform(-4.0, -1.5, count)
     last = np.clip(known - np.where(random.uniform(size=count) < 0.1, -steps, steps), 0.0, tables.duration)
-    at = ca.MX.sym("time")
-    now = tables.at(at)
-    F = ca.Function("nominal", [at], [now.x, now.u, now.e])
-    x, u, e = (np.asarray(v.full()) for v in F.map(count)(known[None, :]))
+    x, u, e = (values.T for values in tables.rows(known))
     model = design.model(x, u, known[None, :])
     expected, M, U = model.h, model.M, model.U
     C, E = (np.asarray(v.full()) for v in design.gain.map(count)(x, u, e, known[None, :]))

@@ -113,7 +113,7 @@ def design_of(solution: Solution, limits: Given) -> Design:
     F, G, A, B, N, Q = statement.loop.slopes(x, u, *rest)
     h, M, U = statement.measurement(x, u, *rest)
     slope = ca.jacobian(h, u)[:, :m]
-    block = next(b for b in statement.matrices if b.estimation)
+    block = statement.estimation
     C, E = statement.loop.gain(x, u, e, *rest), unpack_symbolic(e[block.span], n)
     return Design(
         statement=statement,

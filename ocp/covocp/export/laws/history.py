@@ -114,6 +114,14 @@ class History:
         x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
         return Nominal(x=x, u=u, e=e)
 
+    def rows(self, t: Array) -> tuple[Array, Array, Array]:
+        """x, u, e at some times, a row for each."""
+        time = ca.MX.sym("time")
+        now = self.at(time)
+        values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
+        x, u, e = (np.asarray(v.full()).T for v in values)
+        return x, u, e
+
 
 def history(solution: Solution, precision: str) -> History:
     """The tables of a solution.

@@ -5,33 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
-from covocp.base.quadrature import GAUSS_NODES, gauss_transition
+from covocp.base.matrices import Array, stacked
+from covocp.base.quadrature import GAUSS_NODES, gauss_transition, lyapunov_after
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 
 # Times that differ by less than this share of a period are the same.
 WHOLE = 1e-9
-
-
-def nominal_values(tables: History, t: Array) -> tuple[Array, Array, Array]:
-    """x, u, e at some times, rows."""
-    time = ca.MX.sym("time")
-    now = tables.at(time)
-    values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
-    x, u, e = (np.asarray(v.full()).T for v in values)
-    return x, u, e
-
-
-def stacked(value: Expr, count: int) -> Array:
-    """Matrices beside each other as (count, rows, columns)."""
-    array = np.asarray(value.full())
-    return array.reshape(array.shape[0], count, -1).transpose(1, 0, 2)
 
 
 class Period(NamedTuple):
@@ -99,7 +82,7 @@ class Moves:
         n, m, _ = self.sizes
         z = np.eye(n + m + 1)
         for i in self.steps(k):
-            z, P = self.state[i] @ z, _moved(self.noise[i], P)
+            z, P = self.state[i] @ z, lyapunov_after(self.noise[i], P)
         return Period(transition=z[:n, :n], held=z[:n, n : n + m], offset=z[:n, n + m :], covariance=P)
 
     def measuring(self, k: int) -> tuple[Array, Array, Array]:
@@ -112,7 +95,7 @@ class Moves:
         n, m, r = self.sizes
         z, P = np.eye(n + r + m), np.zeros((n + r, n + r))
         for i in self.steps(k):
-            z, P = self.measured[i] @ z, _moved(self.measured_noise[i], P)
+            z, P = self.measured[i] @ z, lyapunov_after(self.measured_noise[i], P)
         return z[: n + r, :n], z[: n + r, n + r :], P
 
     def weighed(self, k: int, S: Array) -> Array:
@@ -124,7 +107,7 @@ class Moves:
         P = np.zeros((n + m, n + m))
         P[:n, :n] = S
         for i in reversed(self.steps(k)):
-            P = _moved(self.weight[i], P)
+            P = lyapunov_after(self.weight[i], P)
         return P
 
 
@@ -148,7 +131,7 @@ class _Point:
     @staticmethod
     def at(design: Design, tables: History, t: Array, h: Array) -> _Point:
         """At some times, for steps of some lengths."""
-        x, u, _ = nominal_values(tables, t)
+        x, u, _ = tables.rows(t)
         columns = x.T, u.T, t[None, :]
         F, G, _, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
         Q = h * stacked(design.noise.map(t.size)(*columns), t.size)
@@ -174,13 +157,6 @@ def _lyapunov(drifts: list[Array], noises: list[Array]) -> Array:
     zero = np.zeros_like(drifts[0])
     pairs = zip(drifts, noises, strict=True)
     return _transitions([_blocks([[-F.transpose(0, 2, 1), zero], [Q, F]], 2 * n) for F, Q in pairs])
-
-
-def _moved(D: Array, P: Array) -> Array:
-    """P after a step of a Lyapunov equation: its D12 vanishes."""
-    n = P.shape[0]
-    moved = np.linalg.solve(D[:n, :n].T, (D[n:, :n] + D[n:, n:] @ P).T)
-    return np.asarray(0.5 * (moved + moved.T))
 
 
 def _transitions(H: list[Array]) -> Array:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, half_length, pack, unpack
+from covocp.base.matrices import Array, pack, pack_symbolic, unpack
 from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
@@ -172,7 +172,4 @@ def _half(column: Expr, size: int) -> Any:
     """Half-vector of a flat symmetric matrix, numbers or an expression; its symmetric part."""
     if isinstance(column, np.ndarray):
         return pack(column.reshape(size, size))
-    rows, columns = np.triu_indices(size)
-    lower, upper = (columns * size + rows).tolist(), (rows * size + columns).tolist()
-    assert len(lower) == half_length(size)
-    return 0.5 * (column[lower] + column[upper])
+    return pack_symbolic(ca.reshape(column, size, size))

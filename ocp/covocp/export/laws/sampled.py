@@ -27,8 +27,10 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, pack, unpack_symbolic
+from covocp.base.gains import innovation_gain
+from covocp.base.matrices import Array, pack, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
     STATUSES,
@@ -43,7 +45,7 @@ from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.export.laws.moves import WHOLE, Moves, nominal_values, stacked
+from covocp.export.laws.moves import WHOLE, Moves
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
@@ -207,12 +209,10 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
     for k in range(1, count + 1):
         Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
-        spreads.append(M[k] @ P @ M[k].T + U[k] / period)
-        gain = np.linalg.solve(spreads[k], M[k] @ P).T
-        rest = np.eye(n) - gain @ M[k]
-        P = rest @ P @ rest.T + gain @ (U[k] / period) @ gain.T
-        P = 0.5 * (P + P.T)
+        gain, spread = innovation_gain(P, M[k], U[k] / period, np.linalg.solve)
+        P = joseph_form(P, gain, M[k], U[k] / period)
         gains.append(gain)
+        spreads.append(spread)
     L = np.array(gains)
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
     parts |= {"g": g, "L": L}
@@ -234,7 +234,7 @@ def _correlations(spreads: Array) -> Array:
 
 def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
     """x, u, e, h, M, H, U, C at the samples."""
-    x, u, e = nominal_values(tables, t)
+    x, u, e = tables.rows(t)
     h, M, H, U = (stacked(v, t.size) for v in design.model(x.T, u.T, t[None, :])[2:])
     C = stacked(design.gain.map(t.size)(x.T, u.T, e.T, t[None, :])[0], t.size)
     return x, u, e, h, M, H, U, C

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ExportError, spelling
+from covocp.base.errors import ExportError, no_export_option
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
@@ -26,9 +26,8 @@ from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.solver import Solver
 from covocp.transcription.mesh import Options
-from covocp.transcription.nlp import NLP
-from covocp.transcription.scales import choose_scales
-from covocp.transcription.steering import quadrature_weights
+from covocp.transcription.nlp import NLP, QUIET
+from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.transcribing import transcribe
 
 # In the NLP's own units: what counts as solved, and what the solvers are asked for. Interior-point methods end with a
@@ -44,8 +43,6 @@ ROUNDING, APART = 1e-6, 1e-2
 UNREACHED = 1e-5
 # Multipliers below this are rounding: taken for reached, their bounds make the first active set of the QP dependent.
 INACTIVE = 1e-9
-# Shooting states are scaled by more than their magnitude where the Hessian is of limited memory, as for Ipopt.
-STRETCH = 10.0
 TOLERANCE = 1e-8
 # Problems near that of the export by which a solver is tried, and how many of them it may fail to solve.
 TRIALS, FAILURES = 6, 3
@@ -117,12 +114,7 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
     for name in options:
         if name not in known:
-            raise ExportError(
-                f"export_c has no option '{name}' for a problem.",
-                expected="one of " + ", ".join(allowed),
-                received=f"{name}={options[name]!r}"[:100],
-                remedy=spelling(name, allowed, "leave it out"),
-            )
+            raise no_export_option("a problem", name, options[name], allowed)
     task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
     own = dict(options.get("plugin_options") or {})
     failure = ""
@@ -161,8 +153,7 @@ def _task(problem: Problem, options: dict[str, Any]) -> _Task:
     mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
     scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
     if mesh.eliminated and statement.matrices:
-        weights = quadrature_weights(mesh)
-        scales = replace(scales, x=STRETCH * scales.x, u=scales.u * np.sqrt(weights.mean() / weights)[:, None])
+        scales = evened(scales, mesh)
     nlp = transcribe(statement, mesh, scales)
     scale = _cost_scale(nlp, solution)
     multipliers = _multipliers(nlp, solution, scale)
@@ -205,8 +196,7 @@ def _hessians(nlp: NLP, method: str, own: Mapping[str, Any]) -> list[bool]:
 
 def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of the plugin."""
-    settings: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
-    settings["calc_lam_p"] = False
+    settings: dict[str, Any] = dict(QUIET)
     if method == "sqpmethod":
         settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": ASKED, "tol_pr": ASKED}
         settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from textwrap import indent
+
 from covocp.base.matrices import Array
 from covocp.export.laws.law import Law, Port, span
 from covocp.export.text.casadi_code import Sizes, core_name
@@ -49,8 +51,8 @@ def _called(package: str, law: Law, work: str = "iw_, w_") -> str:
     return f"{core_name(package, law)}(arg_, res_, {work}, 0) != 0"
 
 
-def _body(lines: list[str], indent: str = "    ") -> str:
-    return "\n".join(f"{indent}{line}" if line else "" for line in lines)
+def _body(lines: list[str]) -> str:
+    return indent("\n".join(lines), "    ")
 
 
 def _address(port: Port, owner: str = "") -> str:
