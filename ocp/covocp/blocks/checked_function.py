@@ -10,19 +10,22 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.blocks.values import array, is_symbolic, wrong_argument
 
+# Deviation from length one of what was measured or stored in single precision.
+UNIT = 1e-3
+
 
 class CheckedFunction(ca.Function):
     """A function of dense columns whose numbers are looked at before it is evaluated.
 
     Columns must be finite and of the right length, given as numbers, flat arrays or columns; those named in `gaps` may
-    hold NaN, which stands for a missing reading. Expressions go through as to any casadi.Function. The result is a flat
+    hold NaN, which stands for a missing reading, and those named in `units` must have length one. Expressions go through as to any casadi.Function. The result is a flat
     array, or a tuple of them, where all arguments are numbers.
     """
 
-    def __init__(self, function: ca.Function, gaps: tuple[str, ...] = ()) -> None:
-        """A copy of the function; `gaps`: names of the inputs that may be missing."""
+    def __init__(self, function: ca.Function, gaps: tuple[str, ...] = (), units: tuple[str, ...] = ()) -> None:
+        """A copy of the function; `gaps`: names of the inputs that may be missing; `units`: of those of length one."""
         super().__init__(function)
-        self.gaps = gaps
+        self.gaps, self.units = gaps, units
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """The value of the function.
@@ -52,12 +55,14 @@ class CheckedFunction(ca.Function):
         if np.isinf(numbers).any() or (name not in self.gaps and np.isnan(numbers).any()):
             expected = "finite numbers" + (", or NaN where the reading is missing" if name in self.gaps else "")
             raise wrong_argument(name, expected, f"{numbers.ravel()}"[:100])
+        if name in self.units and np.isfinite(numbers).all() and abs(np.linalg.norm(numbers) - 1.0) > UNIT:
+            raise wrong_argument(name, "numbers of length one", f"{numbers.ravel()}"[:100])
         return ca.DM(numbers.ravel())
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies keep what may be missing."""
-        return _restored, (self.serialize(), self.gaps)
+        return _restored, (self.serialize(), self.gaps, self.units)
 
 
-def _restored(text: str, gaps: tuple[str, ...]) -> CheckedFunction:
-    return CheckedFunction(ca.Function.deserialize(text), gaps)
+def _restored(text: str, gaps: tuple[str, ...], units: tuple[str, ...] = ()) -> CheckedFunction:
+    return CheckedFunction(ca.Function.deserialize(text), gaps, units)

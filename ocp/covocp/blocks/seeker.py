@@ -21,6 +21,7 @@ from covocp.base.matrices import half_indices, half_length, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.checked_function import CheckedFunction
+from covocp.blocks.differences import LARGEST, independent, is_usable
 from covocp.blocks.eigenvalues import is_definite, symmetric_eigen
 from covocp.blocks.quadratic import gradient, hessian, parameters, regressor_row, spread, transition
 from covocp.blocks.square_root import factor, in_turn, triangular
@@ -28,9 +29,6 @@ from covocp.blocks.values import array, numeric, wrong_argument
 
 Array = NDArray[np.float64]
 Newton = Literal["modified", "plain", "never"]
-
-# Positions and values beyond this count as missing: their squares would leave the range of numbers.
-LARGEST = 1e30
 
 
 class Memory(NamedTuple):
@@ -385,11 +383,6 @@ def _joined(parts: _Parts) -> Expr:
     return ca.vertcat(ca.vec(parts.positions.T), parts.values, parts.readings, parts.point, parts.zeta, *half)
 
 
-def _is_usable(reading: Expr) -> Expr:
-    """1 where a number is finite and its square a number too."""
-    return ca.fabs(reading) <= LARGEST
-
-
 def _update_function(settings: _Settings, layout: Memory) -> CheckedFunction:
     """(memory, position, value) -> memory."""
     memory = ca.SX.sym("memory", layout.factor.stop)
@@ -397,8 +390,8 @@ def _update_function(settings: _Settings, layout: Memory) -> CheckedFunction:
     old = _parts(memory, settings, layout)
     located = ca.SX(1)
     for i in range(settings.inputs):
-        located = ca.logic_and(located, _is_usable(position[i]))
-    there = ca.logic_and(located, _is_usable(value))
+        located = ca.logic_and(located, is_usable(position[i]))
+    there = ca.logic_and(located, is_usable(value))
     x, f = ca.if_else(located, position, old.point), where(there, value)
     moved = _moved(old, x, settings)
     new = _updated(moved, x, f, there, settings)
@@ -436,30 +429,14 @@ def _updated(old: _Parts, x: Expr, f: Expr, there: Expr, settings: _Settings) ->
     rows = regressor_row(steps)
     gradient_now = gradient(old.zeta)
     noise = settings.noise + settings.position_noise**2 * ca.sumsqr(gradient_now)
-    rows, residuals, variances = _independent(rows, residuals, noise, settings)
     enough = ca.logic_and(there, old.readings >= settings.start)
     used = ca.vertcat(*(ca.logic_and(enough, old.readings > j) for j in range(settings.window)))
-    rows = where(ca.repmat(used, 1, rows.shape[1]), rows)
+    if settings.reuse:
+        rows, residuals, variances = independent(rows, residuals, used, settings.window * noise)
+    else:
+        rows, variances = where(ca.repmat(used, 1, rows.shape[1]), rows), 2 * noise * ca.DM.ones(settings.window)
     zeta, root = in_turn(old.zeta, lower, where(used, residuals - rows @ old.zeta), rows, variances)
     return old._replace(zeta=zeta, lower=triangular(root))
-
-
-def _independent(rows: Expr, values: Expr, noise: Expr, settings: _Settings) -> tuple[Expr, Expr, Expr]:
-    """Rows with independent noise and their variances, (3).
-
-    With the covariance noise (I + 1 1') the best guess of the noise of row j by those before it is their mean times
-    (j - 1) / j, and 1 + 1/j is left. Row j needs the rows before it only, so a window that is not full is none other.
-    """
-    if not settings.reuse:
-        return rows, values, 2 * noise * ca.DM.ones(settings.window)
-    row_sum, value_sum = ca.SX(1, rows.shape[1]), ca.SX(1, 1)
-    new_rows, new_values = [], []
-    for j in range(settings.window):
-        new_rows.append(rows[j, :] - row_sum / (j + 1))
-        new_values.append(values[j] - value_sum / (j + 1))
-        row_sum, value_sum = row_sum + rows[j, :], value_sum + values[j]
-    variances = settings.window * noise * (1 + 1 / ca.DM(range(1, settings.window + 1)))
-    return ca.vertcat(*new_rows), ca.vertcat(*new_values), variances
 
 
 def _step_function(settings: _Settings, layout: Memory) -> CheckedFunction:

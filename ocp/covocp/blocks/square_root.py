@@ -180,16 +180,22 @@ def in_turn(x: Expr, L: Expr, residual: Expr, H: Expr, variances: Expr) -> tuple
     Returns:
         Estimate and square root, no longer triangular, of its covariance.
     """
-    step = 0 * x
+    return in_turn_with_surprise(x, L, residual, H, variances)[:2]
+
+
+def in_turn_with_surprise(x: Expr, L: Expr, residual: Expr, H: Expr, variances: Expr) -> tuple[Any, Any, Any]:
+    """As `in_turn`, and the surprise r'S^-1 r of the residual r, whose covariance is S."""
+    step, surprise = 0 * x, 0
     for i in range(H.shape[0]):
         h, r = H[i : i + 1, :], variances[i, 0]
         seen = (h @ L).T
         spread = (seen.T @ seen)[0, 0] + r
         check_divisor(spread)
         gain = (L @ seen) / spread
-        step = step + gain * (residual[i, 0] - (h @ step)[0, 0])
+        left = residual[i, 0] - (h @ step)[0, 0]
+        step, surprise = step + gain * left, surprise + left**2 / spread
         L = L - (gain / (1 + (r / spread) ** 0.5)) @ seen.T
-    return x + step, L
+    return x + step, L, surprise
 
 
 def _measurement_update(correct: Correction, x: Expr, L: Expr, y: Expr, H: Expr, V: Expr) -> tuple[Any, Any]:
