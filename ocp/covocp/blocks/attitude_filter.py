@@ -19,6 +19,7 @@ from covocp.base.matrices import half_indices, half_length, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.differences import independent, is_usable
+from covocp.blocks.quaternions import quaternion_product
 from covocp.blocks.square_root import in_turn_with_surprise, triangular
 
 Array = NDArray[np.float64]
@@ -162,35 +163,14 @@ def joined(parts: Parts) -> Any:
     return ca.densify(ca.vertcat(*whole))
 
 
-def conjugate_product(first: Expr, second: Expr) -> Any:
-    """conj(p) q of two quaternions (scalar first): the rotation from the attitude p to the attitude q, (4, 1)."""
-    w, v, s, u = first[0], -first[1:], second[0], second[1:]
-    return ca.vertcat(w * s - ca.dot(v, u), w * u + s * v + ca.cross(v, u))
-
-
 def turn_between(before: Expr, after: Expr) -> Any:
     """phi of e^(-phi^x) = C_after C_before', (2), of two unit quaternions, (3, 1) [rad]."""
-    turn = conjugate_product(before, after)
+    turn = quaternion_product(ca.vertcat(before[0], -before[1:]), after)
     w, v = turn[0], turn[1:]
     square = ca.sumsqr(v)
     sine = ca.sqrt(ca.fmax(square, 1e-40))
     angle = 2 * ca.atan2(sine, ca.fabs(w))
     return ca.if_else(w < 0, -1, 1) * ca.if_else(square > 1e-40, angle / sine, 2) * v
-
-
-def turned(attitude: Expr, vector: Expr) -> Any:
-    """The attitude e^(-d^x) C as a unit quaternion, (1), (4, 1)."""
-    half = 0.5 * ca.sqrt(ca.fmax(ca.sumsqr(vector), 1e-40))
-    w, v = ca.cos(half), 0.5 * ca.sin(half) / half * vector
-    s, u = attitude[0], attitude[1:]
-    new = ca.vertcat(s * w - ca.dot(u, v), s * v + w * u + ca.cross(u, v))
-    return new / ca.sqrt(ca.sumsqr(new))
-
-
-def rotation(attitude: Expr) -> Any:
-    """C of a unit quaternion, (3, 3)."""
-    w, v = attitude[0], attitude[1:]
-    return (w**2 - ca.sumsqr(v)) * ca.SX.eye(AXES) + 2 * v @ v.T - 2 * w * ca.skew(v)
 
 
 def located(old: Parts, attitude: Expr) -> tuple[Any, Any]:

@@ -24,6 +24,7 @@ from covocp.blocks.attitude_filter import Correction, GradientEstimate, Memory
 from covocp.blocks.attitude_options import Options, Settings, settings_of
 from covocp.blocks.checked_function import CheckedFunction
 from covocp.blocks.excitation import sine
+from covocp.blocks.quaternions import from_quaternion, quaternion_step
 from covocp.blocks.square_root import triangular
 from covocp.blocks.values import array, wrong_argument
 from covocp.blocks.zone_programs import MOST_ROWS, SILENT, projection, projection_by_solver, reduced
@@ -307,7 +308,7 @@ def _update_function(settings: Settings, layout: Memory, guide: Guidance, *, smo
     old = filters.parts(memory, layout)
     correction = filters.corrected(old, attitude, power, settings.filter)
     new = filters.recorded(old, attitude, power)
-    gradient, factor, direction = guide(correction, filters.rotation(new.attitude))
+    gradient, factor, direction = guide(correction, from_quaternion(new.attitude))
     new = new._replace(
         guided=new.attitude,
         steps=old.steps + 1,
@@ -333,7 +334,7 @@ def _solved_update(update: ca.Function, settings: Settings, zones: tuple[Zone, .
     memory, attitude, power = (ca.MX.sym(f"argument_{k}", s.numel()) for k, s in enumerate(_reading(layout)))
     new = ca.Function.__call__(update, memory, attitude, power)
     place = ca.SX.sym("attitude", filters.QUATERNION)
-    rows = ca.Function("rows", [place], list(zone_rows(filters.rotation(place), zones)))(new[layout.attitude])
+    rows = ca.Function("rows", [place], list(zone_rows(from_quaternion(place), zones)))(new[layout.attitude])
     near = projection_by_solver(new[layout.direction], *rows, settings.kappa)
     direction = _smoothed(memory[layout.direction], near, settings)
     whole = ca.vertcat(new[: layout.direction.start], direction)
@@ -352,4 +353,4 @@ def _step_function(settings: Settings, layout: Memory) -> CheckedFunction:
     ]
     d = where(parts.steps > 0, settings.kappa * parts.direction + ca.vertcat(*excitation))
     names: Any = (["memory"], ["desired"])
-    return CheckedFunction(ca.Function("step", [memory], [ca.densify(filters.turned(parts.attitude, d))], *names))
+    return CheckedFunction(ca.Function("step", [memory], [ca.densify(quaternion_step(parts.attitude, d))], *names))

@@ -10,6 +10,7 @@ from covocp.blocks.attitude_guidance import projected as projected
 from covocp.blocks.attitude_guidance import unconstrained as unconstrained
 from covocp.blocks.attitude_options import Options as Options
 from covocp.blocks.zones import Zone as Zone
+from covocp.blocks.zones import ZoneLike as ZoneLike
 from covocp.blocks.zones import zone as zone
 from covocp.blocks.zones import zone_rows as zone_rows
 from covocp.blocks.zones import zones_of as zones_of

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from covocp.base.arguments import checked, positive, truth, whole
+from covocp.base.arguments import checked, optional, positive, truth, whole
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
@@ -81,6 +81,7 @@ def _function_of(count: int, names: str) -> Callable[[Any], str]:
     runs=whole(1, 10**6),
     seed=whole(0, None),
     average=truth,
+    reading=optional(_function_of(3, "memory, measured, t")),
     every=whole(1),
 )
 def simulate_sampled(
@@ -97,6 +98,7 @@ def simulate_sampled(
     runs: int = 1,
     seed: int = 0,
     average: bool = True,
+    reading: ca.Function | None = None,
     every: int = 1,
 ) -> SampledSimulation:
     """Plant and sensor at a fast rate, a law with a memory at a slow one.
@@ -117,6 +119,8 @@ def simulate_sampled(
         seed: of the noise; run i has the same noise whatever the number of runs.
         average: the law is given the mean of the measurements of a period; False: the last one. A mean of which one
             measurement is NaN is NaN.
+        reading: (memory, measured, t) -> memory, of every measurement but the last one of a period, which the law is
+            given as it is (whatever `average`); None: the law is given one value a period.
         every: number of steps between two times of the histories of the plant.
 
     Returns:
@@ -131,14 +135,16 @@ def simulate_sampled(
     first = values.numeric("held", values.matrix("held", held)).ravel()
     first = np.broadcast_to(first, plant.size1_in(1)) if first.size == 1 else first
     _check_sizes(plant, sensor, law, own.size, first.size)
-    loop = _Loop(plant, sensor, law, int(runs), start, own, first)
+    if reading is not None:
+        _check_reading(reading, own.size, sensor.size1_out(0))
+    loop = _Loop(plant, sensor, law, int(runs), start, own, first, reading)
     streams = [
         np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(seed), spawn_key=(i,))))
         for i in range(int(runs))
     ]
     for k in range(slow):
         loop.fly(k, fast, float(step), streams, every=int(every))
-        loop.decide((k + 1) * fast * float(step), average=bool(average), count=fast)
+        loop.decide((k + 1) * fast * float(step), average=bool(average) and reading is None, count=fast)
     return loop.histories()
 
 
@@ -154,11 +160,13 @@ class _Loop:
         start: Array,
         memory: Array,
         held: Array,
+        reading: ca.Function | None,
     ) -> None:
         self.runs = runs
         width = padded(runs)
         self.plant, self.sensor = vectorise(plant, width, (2,)), vectorise(sensor, width, (1,))
         self.law: Columns | SampledLaw = vectorise(law, width, (2,)) if isinstance(law, ca.Function) else law
+        self.reading = None if reading is None else vectorise(reading, width, (2,))
         self.state = np.repeat(start[:, :1], width, axis=1)
         self.state[:, :runs] = start
         self.held, self.memory = np.repeat(held[:, None], width, axis=1), np.repeat(memory[:, None], width, axis=1)
@@ -185,6 +193,8 @@ class _Loop:
             self.state[:, ~(np.abs(self.state).max(axis=0, initial=0.0) < LARGEST)] = np.nan
             self.last = _evaluated(self.sensor, self.state, (number + 1) * step, noise)
             self.total += self.last
+            if self.reading is not None and j + 1 < steps:
+                self.memory = _evaluated(self.reading, self.memory, self.last, (number + 1) * step)
             if (number + 1) % every == 0:
                 self.times.append((number + 1) * step)
                 self.states.append(self._kept(self.state))
@@ -275,6 +285,18 @@ def _runs_of(name: str, given: ArrayLike, size: int, runs: int) -> Array:
         expected = f"finite numbers of shape ({size},), the state of the plant, or ({runs}, {size})"
         raise values.wrong_argument(name, expected, f"shape {numbers.shape}")
     return numbers.T.copy()
+
+
+def _check_reading(reading: ca.Function, memory: int, measured: int) -> None:
+    """What is done with a measurement inside a period fits to the law.
+
+    Raises:
+        ProblemError: it does not.
+    """
+    found = (reading.size1_in(0), reading.size1_in(1), reading.size1_out(0))
+    if found != (memory, measured, memory):
+        expected = f"(memory ({memory},), measured ({measured},), t) -> memory ({memory},)"
+        raise values.wrong_argument("reading", expected, f"{found}")
 
 
 def _check_sizes(plant: ca.Function, sensor: ca.Function, law: SampledLaw, memory: int, held: int) -> None:
