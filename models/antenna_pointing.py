@@ -157,3 +157,32 @@ def _sensor(patch: Patch, source: Array, rate: Array) -> ca.Function:
     direction = so3.exp(-t * ca.SX(ca.DM(rate))) @ ca.DM(source) if rate.any() else ca.SX(ca.DM(source))
     power = patch.power(so3.from_quaternion(x[:4]), direction)
     return ca.Function("sensor", [x, t, noise], [ca.vertcat(x[:4], power + NOISE * noise)])
+
+
+def problem(*, duration: float = 25.0, torque: float = LARGEST_TORQUE) -> co.Problem:
+    """The slew from rest to rest to the best attitude between the zones, with everything known; least torque.
+
+    Args:
+        duration: [s].
+        torque: largest about each axis [N m].
+
+    Returns:
+        The problem, with states "attitude" (unit quaternion), "rate" [rad/s] and "wheels" [rad/s], control "torque"
+        [N m]; the exclusion zone is a path constraint, in the inclusion zone the slew ends.
+    """
+    body, forbidden = Spacecraft(), attitude_seeking.zones_of(ZONES[:1])[0]
+    start, end = (np.asarray(so3.to_quaternion(C)) for C in (INITIAL_ATTITUDE, BEST_ATTITUDE))
+    end = end if start @ end > 0 else -end
+    ocp = co.Problem(duration=duration, name="Slew of the antenna")
+    along = [lambda s, i=i: (1 - s) * start[i] + s * end[i] for i in range(4)]
+    q = ocp.state("attitude", 4, initial=start, final=[None, *end[1:]], guess=lambda s: [f(s) for f in along])
+    rate = ocp.state("rate", 3, initial=np.zeros(3), final=np.zeros(3), unit="rad/s")
+    wheels = ocp.state("wheels", 3, initial=np.zeros(3), unit="rad/s", scale=10.0)
+    tau = ocp.control("torque", 3, lower=-torque, upper=torque, unit="N m")
+    half = ca.vertcat(0, rate) / 2
+    ocp.dynamics(q, ca.vertcat(-ca.dot(q[1:], half[1:]), q[0] * half[1:] + ca.cross(q[1:], half[1:])))
+    ocp.dynamics(rate, body.acceleration(rate, wheels, tau))
+    ocp.dynamics(wheels, -tau / body.wheel)
+    ocp.subject_to(forbidden.value(so3.from_quaternion(q)), lower=0.0, upper=np.inf, name="exclusion zone")
+    ocp.minimize(ca.sumsqr(tau))
+    return ocp

@@ -6,6 +6,7 @@ know nothing of problems, grids or solvers.
 
 from __future__ import annotations
 
+from covocp.blocks import attitude_seeking as attitude_seeking
 from covocp.blocks import kalman as kalman
 from covocp.blocks import peak_seeking as peak_seeking
 from covocp.blocks import riccati as riccati
