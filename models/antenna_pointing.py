@@ -93,7 +93,7 @@ def simulate(
     if source_rate is not None:
         rate = _vector("source_rate", source_rate, direction=False)
     found = co.simulate_sampled(
-        _plant(body),
+        plant(body),
         _sensor(patch, towards, rate),
         law.law(),
         initial=np.concatenate([start, np.zeros(STATES - 4)]),
@@ -144,8 +144,15 @@ def _vector(name: str, value: npt.ArrayLike, *, direction: bool = True) -> Array
     return numbers / np.linalg.norm(numbers) if direction else numbers
 
 
-def _plant(body: Spacecraft) -> ca.Function:
-    """A sample of the control."""
+def plant(body: Spacecraft) -> ca.Function:
+    """A sample of the control, 0.1 s, as `simulate_sampled` takes it.
+
+    Args:
+        body: the spacecraft.
+
+    Returns:
+        casadi.Function (x (10,), desired (4,), t, noise (0,)) -> x: quaternion, angular velocity, wheel speeds.
+    """
     x, desired = ca.SX.sym("x", STATES), ca.SX.sym("desired", 4)
     t, noise = ca.SX.sym("t"), ca.SX.sym("noise", 0)
     return ca.Function("spacecraft", [x, desired, t, noise], [body.step(x, desired, STEP)], {"cse": True})

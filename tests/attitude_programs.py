@@ -132,7 +132,9 @@ class Literal:
                 [K, np.zeros((3, N)), case.prior],
             ]
         )
-        second = np.block([[np.array([[case.largest_step**2]]), case.kappa * b[None]], [case.kappa * b[:, None], np.eye(3)]])
+        second = np.block(
+            [[np.array([[case.largest_step**2]]), case.kappa * b[None]], [case.kappa * b[:, None], np.eye(3)]]
+        )
         rows = np.concatenate([case.kappa * case.A @ b - case.beta + zeta, zeta])
         return rows, scaled_half(first), scaled_half(second)
 

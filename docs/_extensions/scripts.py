@@ -67,6 +67,7 @@ GALLERY = (
             "model_reference",
             "peak_seeking_line",
             "formation_flight",
+            "antenna_pointing",
         ),
     ),
     (
@@ -80,6 +81,7 @@ GALLERY = (
             "export_kalman_dropouts",
             "export_theta_d",
             "export_peak_seeker",
+            "export_attitude_seeking",
         ),
     ),
 )

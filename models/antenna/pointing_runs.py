@@ -183,19 +183,20 @@ class PointingRuns:
         ]
         return "\n".join(lines)
 
-    def plot(self, path: str | Path | None = None, run: int = 0) -> Any:
-        """Power, gradient errors with bounds, zones, torque, wheels and the path of the antenna axis of one run.
+    def plot(self, path: str | Path | None = None, run: int = 0, *, gradient: bool = False) -> Any:
+        """Power, zones, torque, wheels and the paths of the body axes of one run.
 
         Args:
             path: of the picture; None: not saved.
             run: which run.
+            gradient: the errors of the estimated gradient with their bounds instead.
 
         Returns:
             The matplotlib figure.
         """
-        from covocp.models.antenna.pointing_figure import draw
+        from covocp.models.antenna.pointing_figure import draw, draw_gradient
 
-        figure = draw(self, run)
+        figure = (draw_gradient if gradient else draw)(self, run)
         if path is not None:
             figure.savefig(path, dpi=120)
         return figure

@@ -259,7 +259,9 @@ def _check_count(zones: tuple[Zone, ...], remedy: str) -> None:
         ProblemError: too many.
     """
     if len(zones) > MOST_ROWS:
-        raise wrong_argument("zones", f"at most {MOST_ROWS} zones, whose active sets are gone through", f"{len(zones)}", remedy)
+        raise wrong_argument(
+            "zones", f"at most {MOST_ROWS} zones, whose active sets are gone through", f"{len(zones)}", remedy
+        )
 
 
 def _seeker(settings: Settings, zones: tuple[Zone, ...], guide: Guidance, *, solver: bool = False) -> AttitudeSeeker:

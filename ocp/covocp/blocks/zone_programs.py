@@ -259,7 +259,11 @@ def _weighted(estimate: Expr, covariance: Expr) -> _Weighted:
 
 def _bounded(cost: _Weighted, rows: Rows, kappa: float, penalty: float, radius: float) -> Constrained:
     """Bisection of ln(lambda) on |b(lambda)| = rho, which falls; lambda = 0 where the bound is not active."""
-    A, beta, s = kappa * (ca.SX(rows.matrix) @ cost.vectors), ca.SX(rows.bounds), ca.DM.ones(rows.matrix.shape[0], 1) * penalty
+    A, beta, s = (
+        kappa * (ca.SX(rows.matrix) @ cost.vectors),
+        ca.SX(rows.bounds),
+        ca.DM.ones(rows.matrix.shape[0], 1) * penalty,
+    )
 
     def solution(bound: Expr) -> tuple[Any, Any]:
         inverse = 1 / (cost.values + bound)

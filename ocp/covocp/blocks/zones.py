@@ -77,7 +77,9 @@ def zone(body: ArrayLike, direction: ArrayLike, degrees: float, kind: str, *, ma
     name = f"{kind} of {np.round(x, 4).tolist()}, {degrees:g} deg about {np.round(y, 4).tolist()}"
     angle = float(degrees) if kind == "inclusion" else 180.0 - float(degrees)
     if not is_number(margin) or not 0 <= margin < angle:
-        raise wrong_argument("margin", f"a number from 0 to what a zone has, {angle:g} deg ({name})", f"{margin!r}"[:60])
+        raise wrong_argument(
+            "margin", f"a number from 0 to what a zone has, {angle:g} deg ({name})", f"{margin!r}"[:60]
+        )
     return Zone(body=x, direction=-y if kind == "exclusion" else y, angle=float(np.radians(angle - margin)), name=name)
 
 
