@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import shown
+from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Expr, Given
 from covocp.blocks.rotation_entries import (
     Entries,
@@ -67,7 +67,7 @@ def runge_kutta_step(dynamics: Dynamics, matrix: Expr, state: Expr, h: Expr) -> 
 
     def rates(sigma: Expr, x: Expr) -> tuple[Any, Any]:
         C = start.value if sigma is None else evaluated(_turned, start, read_vector("sigma", sigma))
-        omega, rate = _rates(dynamics(C, x), x)
+        omega, rate = _rates(_called("dynamics", dynamics, C, x), x)
         return (omega if sigma is None else _vector_rate(sigma, omega)), rate
 
     first = rates(None, x)
@@ -126,7 +126,7 @@ def body_gradient(function: Expr, matrix: Expr) -> Any:
         raise wrong_argument("function", "an expression, or a function of C", shown(function))
     kind = type(at.value) if is_symbolic(at.value) else ca.MX
     symbol = kind.sym("C", 3, 3)
-    value = function(symbol)
+    value = _called("function", function, symbol)
     value = value if isinstance(value, kind) else kind(casadi_matrix("function", value))
     law = ca.Function("body_gradient", [symbol], [_gradient(value, symbol)])
     if is_symbolic(at.value):
@@ -143,6 +143,21 @@ def _gradient(value: Expr, symbol: Expr) -> Any:
         raise wrong_argument("function", "a function of one entry", "shape " + " x ".join(map(str, value.shape)))
     derivatives = ca.reshape(ca.densify(ca.jacobian(value, symbol)), 3, 3)
     return evaluated(_body_gradient, read_matrix("function", derivatives), read_matrix("matrix", symbol))
+
+
+def _called(name: str, function: Callable[..., Any], *arguments: Expr) -> Any:
+    """What a function of the user returns.
+
+    Raises:
+        ProblemError: it fails.
+    """
+    try:
+        return function(*arguments)
+    except ProblemError:
+        raise
+    except Exception as error:  # whatever the user's function raises
+        expected = "a function of C" if len(arguments) == 1 else "a function of (C, x)"
+        raise wrong_argument(name, expected, f"{type(error).__name__}: {error}"[:200]) from error
 
 
 def _length(h: Given) -> Any:
