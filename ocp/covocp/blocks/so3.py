@@ -6,6 +6,9 @@ from covocp.blocks.quaternions import from_quaternion as from_quaternion
 from covocp.blocks.quaternions import quaternion_product as quaternion_product
 from covocp.blocks.quaternions import quaternion_step as quaternion_step
 from covocp.blocks.quaternions import to_quaternion as to_quaternion
+from covocp.blocks.rotation_steps import body_gradient as body_gradient
+from covocp.blocks.rotation_steps import increment as increment
+from covocp.blocks.rotation_steps import runge_kutta_step as runge_kutta_step
 from covocp.blocks.rotations import antisymmetric_part as antisymmetric_part
 from covocp.blocks.rotations import cross as cross
 from covocp.blocks.rotations import exp as exp
