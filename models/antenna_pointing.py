@@ -181,8 +181,7 @@ def problem(*, duration: float = 25.0, torque: float = LARGEST_TORQUE) -> co.Pro
     start, end = (np.asarray(so3.to_quaternion(C)) for C in (INITIAL_ATTITUDE, BEST_ATTITUDE))
     end = end if start @ end > 0 else -end
     ocp = co.Problem(duration=duration, name="Slew of the antenna")
-    along = [lambda s, i=i: (1 - s) * start[i] + s * end[i] for i in range(4)]
-    q = ocp.state("attitude", 4, initial=start, final=[None, *end[1:]], guess=lambda s: [f(s) for f in along])
+    q = ocp.state("attitude", 4, initial=start, final=[None, *end[1:]], guess=lambda s: (1 - s) * start + s * end)
     rate = ocp.state("rate", 3, initial=np.zeros(3), final=np.zeros(3), unit="rad/s")
     wheels = ocp.state("wheels", 3, initial=np.zeros(3), unit="rad/s", scale=10.0)
     tau = ocp.control("torque", 3, lower=-torque, upper=torque, unit="N m")

@@ -44,7 +44,7 @@ def draw(runs: PointingRuns, run: int) -> Any:
     _draw_sphere(figure.add_subplot(grid[0:2, 1], projection="3d"), runs, run)
     for axes in panels:
         axes.set(xlim=(0.0, runs.t[-1]), xlabel="t [s]")
-        axes.legend(fontsize="small", loc="upper right")
+        axes.legend(fontsize="small", loc="lower right" if axes is power else "upper right")
         axes.grid(alpha=0.3)
     return figure
 
@@ -110,6 +110,8 @@ def _draw_sphere(axes: Any, runs: PointingRuns, run: int) -> None:
         (line,) = axes.plot(*C[:, axis].T, lw=1.2, label=name)
         axes.plot(*C[:1, axis].T, "o", color=line.get_color(), ms=4)
     axes.plot(*runs.source.T, "r*", ms=10, label="source")
-    axes.set(xlabel="$a^1$", ylabel="$a^2$", zlabel="$a^3$", box_aspect=(1, 1, 1), title="paths from the dots on")
+    axes.set(
+        xlabel="$a^1$", ylabel="$a^2$", zlabel="$a^3$", xticks=[], yticks=[], zticks=[], title="paths from the dots on"
+    )
     axes.view_init(25, 150)
     axes.legend(fontsize="small", loc="upper left")

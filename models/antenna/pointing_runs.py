@@ -155,8 +155,8 @@ class PointingRuns:
 
     def _first(self) -> Array:
         """First time of each run at which all zones are kept, (runs,) [s]."""
-        kept = (self.zone_values >= 0).all(axis=-1)
-        return np.where(kept.any(axis=1), self.t[kept.argmax(axis=1)], np.inf)
+        kept = np.asarray((self.zone_values >= 0).all(axis=-1))
+        return np.where(np.any(kept, axis=1), self.t[kept.argmax(axis=1)], np.inf)
 
     def _since(self, holds: npt.NDArray[np.bool_]) -> Array:
         """Time from which on something holds until the end, (runs,) [s]; inf: it does not at the end."""
@@ -166,9 +166,10 @@ class PointingRuns:
 
     def __str__(self) -> str:
         """Shares that arrive, when, and how the zones are kept."""
+        share, hold = f"{self.success:.2f} of the runs", f"from {self.time_to_hold:.1f} s on"
         lines = [
             f"Antenna pointing: {len(self.power)} runs of {self.t[-1]:g} s, {self.filter}, settings {self.settings}",
-            f"  at least 95 % of {self.antenna.peak:g} W     {self.success:.2f} of the runs, from {self.time_to_hold:.1f} s on",
+            f"  at least 95 % of {self.antenna.peak:g} W     {share}, {hold}",
             f"  power at the end          median {np.median(self.final_power):.2f} W",
         ]
         if self.zone_values.shape[-1]:

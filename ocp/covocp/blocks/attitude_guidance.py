@@ -236,10 +236,9 @@ def constrained(
     """
     found, made = settings_of("constrained", settings, changes), zones_of(zones, margin)
     _check_count(made, "use projected(method='osqp')")
-    assert found.largest_step is not None
 
     def guide(correction: Correction, rotation: Expr) -> tuple[Any, Any, Any]:
-        program = {"kappa": found.kappa, "penalty": found.penalty, "largest_step": found.largest_step}
+        program: Any = {"kappa": found.kappa, "penalty": found.penalty, "largest_step": found.largest_step}
         covariance = correction.factor @ correction.factor.T
         kept = reduced(
             correction.gradient, covariance, zone_rows(rotation, made), **program, curvature=curvature
@@ -318,9 +317,10 @@ def _update_function(settings: Settings, layout: Memory, guide: Guidance, *, smo
         factor=factor,
         direction=_smoothed(old.direction, direction, settings) if smooth else direction,
     )
-    names: Any = _update_names()
+    given, made = _update_names()
+    options = {"cse": True}
     return _checked_update(
-        ca.Function("update", [memory, attitude, power], [filters.joined(new)], *names, {"cse": True})
+        ca.Function("update", [memory, attitude, power], [filters.joined(new)], given, made, options)
     )
 
 
@@ -336,8 +336,9 @@ def _solved_update(update: ca.Function, settings: Settings, zones: tuple[Zone, .
     memory, attitude, power = (ca.MX.sym(f"argument_{k}", s.numel()) for k, s in enumerate(_reading(layout)))
     new = ca.Function.__call__(update, memory, attitude, power)
     place = ca.SX.sym("attitude", filters.QUATERNION)
-    rows = ca.Function("rows", [place], list(zone_rows(from_quaternion(place), zones)))(new[layout.attitude])
-    near = projection_by_solver(new[layout.direction], *rows, settings.kappa)
+    seen: Any = zone_rows(from_quaternion(place), zones)
+    matrix, bounds = ca.Function("rows", [place], list(seen))(new[layout.attitude])
+    near = projection_by_solver(new[layout.direction], matrix, bounds, settings.kappa)
     direction = _smoothed(memory[layout.direction], near, settings)
     whole = ca.vertcat(new[: layout.direction.start], direction)
     return _checked_update(ca.Function("update", [memory, attitude, power], [whole], *_update_names()))

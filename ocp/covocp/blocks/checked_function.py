@@ -18,8 +18,8 @@ class CheckedFunction(ca.Function):
     """A function of dense columns whose numbers are looked at before it is evaluated.
 
     Columns must be finite and of the right length, given as numbers, flat arrays or columns; those named in `gaps` may
-    hold NaN, which stands for a missing reading, and those named in `units` must have length one. Expressions go through as to any casadi.Function. The result is a flat
-    array, or a tuple of them, where all arguments are numbers.
+    hold NaN, which stands for a missing reading, and those named in `units` must have length one. Expressions go
+    through as to any casadi.Function. The result is a flat array, or a tuple of them, where all arguments are numbers.
     """
 
     def __init__(self, function: ca.Function, gaps: tuple[str, ...] = (), units: tuple[str, ...] = ()) -> None:
