@@ -68,7 +68,16 @@ def test_the_reference_has_every_public_name_model_and_block():
     wanted |= {f"covocp.models.{path.stem}" for path in (ROOT / "models").glob("*.py") if path.stem != "__init__"}
     wanted |= {
         f"covocp.blocks.{name}"
-        for name in ("kalman", "riccati", "theta_d", "theta_d_series", "sdre", "peak_seeking", "so3")
+        for name in (
+            "kalman",
+            "riccati",
+            "theta_d",
+            "theta_d_series",
+            "sdre",
+            "peak_seeking",
+            "so3",
+            "attitude_seeking",
+        )
     }
     assert wanted <= documented
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 import covocp as co
-from covocp.blocks import kalman, peak_seeking, riccati, so3, theta_d
+from covocp.blocks import attitude_seeking, kalman, peak_seeking, riccati, so3, theta_d
 from covocp.simulation.laws import extended_filter, gain_filter
 from covocp.solving.solver import method_options
 from covocp.transcription.mesh import Options
@@ -286,6 +286,22 @@ def sampled_simulations() -> Iterator[tuple[str, str, Call]]:
         yield "Seeker.update", argument, lambda v, n=argument: seeker.update(**{**reading, n: v})
 
 
+def attitude_seekers() -> Iterator[tuple[str, str, Call]]:
+    """Of the laws of attitude seeking: zones, options and readings."""
+    zone = {"body": (0, 1, 0), "direction": (1, 0, 0), "degrees": 20.0, "kind": "inclusion", "margin": 0.0}
+    for argument, call in called(attitude_seeking.zone, **zone):
+        yield "zone", argument, call
+    for name in ("zones", "margin", "curvature", "method", "settings"):
+        yield "projected", name, lambda v, n=name: attitude_seeking.projected(**{"zones": [], "window": 1, n: v})
+    for name in attitude_seeking.Options.__annotations__:
+        yield "unconstrained", name, lambda v, n=name: attitude_seeking.unconstrained(**{"spacing": 1, n: v})
+    law = attitude_seeking.unconstrained(window=2)
+    reading = {"memory": law.initial(), "attitude": (1.0, 0.0, 0.0, 0.0), "power": 2.0}
+    for argument in reading:
+        yield "AttitudeSeeker.update", argument, lambda v, n=argument: law.update(**{**reading, n: v})
+    yield "AttitudeSeeker.initial", "attitude", law.initial
+
+
 SEEKER: dict[str, Any] = {
     "n": 1, "window": 3, "noise": 1.0, "drift": 0.1, "prior_covariance": 1.0, "prior": [0.0, 0.0], "start": 1,
     "transport": True, "reuse": True, "newton": "plain", "smallest_curvature": 0.1, "largest_step": 1.0,
@@ -319,6 +335,7 @@ def simulations() -> Iterator[tuple[str, str, Call]]:
     for argument in ("runs", "step", "process_noise", "measurement_noise", "seed", "observer", "law", "running"):
         yield "simulate_law with noise", argument, lambda v, n=argument: co.simulate_law(**{**noisy, n: v})
     yield from sampled_simulations()
+    yield from attitude_seekers()
     eye = np.eye(1)
     for argument, call in called(gain_filter, dynamics=plant, gain=lambda x, t: eye, H=eye, initial=[0.0]):
         yield "gain_filter", argument, call

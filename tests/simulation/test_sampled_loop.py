@@ -145,3 +145,27 @@ def test_wrong_functions_are_named():
     ):
         with pytest.raises(ProblemError, match=name):
             simulated(functions=functions)
+
+
+def test_readings_inside_a_period():
+    """The law gets the last measurement, `reading` all before it, each with its time; nothing is averaged."""
+    plant, sensor, law = parts(noise=0.1)
+    memory, measured, t = ca.SX.sym("memory", 2), ca.SX.sym("measured", 2), ca.SX.sym("t")
+    reading = ca.Function("reading", [memory, measured, t], [0.5 * memory + measured * t])
+    found = simulated(functions=(plant, sensor, law), reading=reading, runs=3, average=True)
+    single = simulated(functions=(plant, sensor, law), runs=3, average=False)
+    np.testing.assert_array_equal(found.measured[:, 0], single.measured[:, 0])
+    generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0, spawn_key=(1,))))
+    shocks, x, expected = generator.standard_normal((4, 2)), 1.0, np.zeros(2)
+    for j in range(4):
+        x = 0.9 * x + 0.01 * np.sin(STEP * j) + 0.1 * shocks[j, 0]
+        seen = np.array([x, x**2 + STEP * (j + 1) + 0.1 * shocks[j, 1]])
+        expected = 0.5 * expected + seen * STEP * (j + 1) if j < 3 else expected + seen
+    np.testing.assert_allclose(found.memory[1, 0], expected, rtol=1e-12)
+
+
+def test_readings_that_do_not_fit_are_named():
+    memory, measured, t = ca.SX.sym("memory", 2), ca.SX.sym("measured", 3), ca.SX.sym("t")
+    for wrong in (ca.Function("reading", [memory, measured, t], [memory]), lambda *given: given[0], 3):
+        with pytest.raises(ProblemError, match="'reading'"):
+            simulated(reading=wrong)
