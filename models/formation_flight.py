@@ -43,6 +43,7 @@ RECOMMENDED: dict[str, Any] = {
     "newton": "modified",
     "smallest_curvature": 0.8,
     "largest_step": 1.5,
+    "descent_gain": 0.05,  # of other steps, where one is chosen
 }
 PRINTED: dict[str, Any] = {
     "window": 15,
@@ -54,6 +55,7 @@ PRINTED: dict[str, Any] = {
     "newton": "plain",
     "switch": 6.0,
     "descent_gain": 0.05,
+    "smallest_curvature": 0.8,  # of the "modified" step, where it is chosen
 }
 COMMAND_GAIN = {"recommended": 1.0, "printed": 10.0}
 
@@ -102,7 +104,7 @@ def simulate(
     """
     field = drag_map() if drag is None else drag
     known = {"recommended": RECOMMENDED, "printed": PRINTED}[settings]
-    law = peak_seeking.seeker(2, **(known | changes))
+    law = peak_seeking.seeker(2, **peak_seeking.with_changes(known, changes))
     gain = COMMAND_GAIN[settings] if command_gain is None else float(command_gain)
     tracker = aircraft.tracker()
     begin = field.best + _pair("start", start)

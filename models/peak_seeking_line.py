@@ -46,6 +46,7 @@ RECOMMENDED: dict[str, Any] = {
     "newton": "modified",
     "smallest_curvature": 0.05,
     "largest_step": 5.0,
+    "descent_gain": 1.0,  # of other steps, where one is chosen
 }
 PRINTED: dict[str, Any] = {
     "window": WINDOW,
@@ -58,6 +59,7 @@ PRINTED: dict[str, Any] = {
     "definite": False,
     "descent_gain": 1.0,
     "switch": 0.005,
+    "smallest_curvature": 0.05,  # of the "modified" step, where it is chosen
 }
 
 
@@ -249,7 +251,7 @@ def simulate(
         ProblemError: an argument does not fit.
     """
     known = {"recommended": RECOMMENDED, "printed": PRINTED}[settings]
-    law = peak_seeking.seeker(1, **(known | changes))
+    law = peak_seeking.seeker(1, **peak_seeking.with_changes(known, changes))
     steps = np.atleast_1d(np.asarray(initial_steps, dtype=float))
     begin = float(start) / GAIN
     found = co.simulate_sampled(

@@ -6,6 +6,7 @@ docs/blocks/peak_seeking.md; the equations are numbered as there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -311,6 +312,23 @@ def seeker(
         start=first,
         _initial=memory,
     )
+
+
+def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `seeker` of which some are changed; what only a plain step knows goes with it.
+
+    Args:
+        settings: arguments by name.
+        changes: those that differ.
+
+    Returns:
+        All of them, without `switch` and `definite` of the settings where the step is no plain one any more.
+    """
+    merged = dict(settings) | dict(changes)
+    if merged.get("newton", "modified") != "plain":
+        for name in {"switch", "definite"} - set(changes):
+            merged.pop(name, None)
+    return merged
 
 
 def _prior(prior: Expr, size: int) -> Array:
