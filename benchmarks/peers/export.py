@@ -4,7 +4,8 @@
     python benchmarks/peers/export.py --quick     a tenth of a second for each number; prints only
 
 Nanoseconds of one call, medians of five measurements. The targets are a step of the first-order controller below 1
-microsecond, of the Mars controller and of an update of the peak seeker below 20; what misses its target is printed, the exit code is always 0.
+microsecond, of the Mars controller and an update of the peak seeker below 20; what misses its target is printed, the
+exit code is always 0.
 """
 
 from __future__ import annotations
