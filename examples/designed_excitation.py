@@ -11,7 +11,7 @@ import numpy as np
 import covocp as co
 from covocp.models import designed_excitation as model
 
-options = {"covariances": "states", "substeps": 2, "progress": False}
+options = {"substeps": 2, "progress": False}
 problem = model.problem()  # from rest at the command and back, 4.4 m in 120 s
 circling = model.circling()
 circle = co.evaluate(model.problem(begin=circling["begin"]), nominal=circling["nominal"])

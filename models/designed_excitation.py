@@ -69,8 +69,6 @@ def problem(
 ) -> co.Problem:
     """The path of given length and time that makes Hessian and gradient at the command best known.
 
-    `co.solve(problem(), covariances="states")` is the quick way: the matrix is a sum, its second derivatives are cheap.
-
     Args:
         inputs: n, 1 or 2.
         radius: r, unit of positions in the cost [m].
