@@ -67,12 +67,13 @@ def test_the_reference_has_every_public_name_model_and_block():
     wanted = {f"covocp.{name}" for name in co.__all__}
     wanted |= {f"covocp.models.{path.stem}" for path in (ROOT / "models").glob("*.py") if path.stem != "__init__"}
     wanted |= {
-        f"covocp.blocks.{name}" for name in ("kalman", "riccati", "theta_d", "theta_d_series", "sdre", "peak_seeking")
+        f"covocp.blocks.{name}"
+        for name in ("kalman", "riccati", "theta_d", "theta_d_series", "sdre", "peak_seeking", "so3")
     }
     assert wanted <= documented
 
 
-@pytest.mark.parametrize("name", ["kalman", "riccati", "theta_d"])
+@pytest.mark.parametrize("name", ["kalman", "riccati", "theta_d", "so3"])
 def test_the_reference_lists_what_a_block_takes_from_its_parts(name):
     code = ast.parse((HOUSE / "blocks" / f"{name}.py").read_text(encoding="utf-8"))
     imported = [entry for line in code.body if isinstance(line, ast.ImportFrom) for entry in line.names]

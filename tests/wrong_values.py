@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 import covocp as co
-from covocp.blocks import kalman, peak_seeking, riccati, theta_d
+from covocp.blocks import kalman, peak_seeking, riccati, so3, theta_d
 from covocp.simulation.laws import extended_filter, gain_filter
 from covocp.solving.solver import method_options
 from covocp.transcription.mesh import Options
@@ -182,7 +182,7 @@ def made() -> dict[str, Any]:
 Call = Callable[[Any], Any]
 
 
-def called(function: Call, **valid: Any) -> Iterator[tuple[str, Call]]:
+def called(function: Call, /, **valid: Any) -> Iterator[tuple[str, Call]]:
     """A call for each argument of a function, the others valid."""
     for argument in arguments_of(function):
         yield argument, lambda value, argument=argument: function(**{**valid, argument: value})
@@ -397,6 +397,28 @@ def laws() -> Iterator[tuple[str, str, Call]]:
         riccati.reference_input: {"A": np.array([[0.0, 1.0], [-1.0, -1.0]]), "B": b, "output": np.array([[1.0, 0.0]])},
         riccati.undetectable: {"A": two, "H": b.T},
         riccati.unstabilisable: {"A": two, "B": b},
+        so3.antisymmetric_part: {"matrix": np.eye(3)},
+        so3.body_gradient: {"function": ca.trace, "matrix": np.eye(3)},
+        so3.cross: {"vector": np.ones(3)},
+        so3.exp: {"vector": np.ones(3)},
+        so3.from_quaternion: {"quaternion": [1.0, 0.0, 0.0, 0.0]},
+        so3.increment: {"first": np.ones(3), "middle": np.ones(3), "last": np.ones(3), "h": 0.1},
+        so3.inverse_left_jacobian: {"vector": np.ones(3)},
+        so3.is_rotation: {"matrix": np.eye(3), "tolerance": 1e-6},
+        so3.left_jacobian: {"vector": np.ones(3)},
+        so3.log: {"matrix": np.eye(3)},
+        so3.principal: {"axis": 1, "angle": 0.1},
+        so3.project: {"matrix": np.eye(3)},
+        so3.quaternion_product: {"first": [1.0, 0.0, 0.0, 0.0], "second": [1.0, 0.0, 0.0, 0.0]},
+        so3.quaternion_step: {"quaternion": [1.0, 0.0, 0.0, 0.0], "vector": np.ones(3)},
+        so3.runge_kutta_step: {
+            "dynamics": lambda C, x: (x, x),
+            "matrix": np.eye(3),
+            "state": np.ones(3),
+            "h": 0.1,
+        },
+        so3.to_quaternion: {"matrix": np.eye(3)},
+        so3.vee: {"matrix": np.zeros((3, 3))},
         theta_d.expansion: {**series, "B": b, "R": one},
         theta_d.regulator: {**series, "B": b, "R": one},
         theta_d.filter_gain: {"x": x, "A0": series["A0"], "A": factor, "H": b.T, "W": two, "V": one},
