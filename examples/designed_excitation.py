@@ -5,6 +5,8 @@ How to move so that the Hessian and the gradient of an unknown function are best
 a circle.
 """
 
+from textwrap import fill
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -77,7 +79,7 @@ for shift, label, values in (
     errors.bar(places + shift, values, 0.4, label=label, color="0.3" if shift < 0 else "0.7")
 bars = [3.0 * found.measured()[1] for found in flights.values()]
 errors.errorbar(places + 0.2, [found.measured()[0] for found in flights.values()], bars, fmt="none", color="k")
-errors.set_xticks(places, [name.replace(", ", ",\n") for name in paths], fontsize="x-small")
+errors.set_xticks(places, [fill(name, 12) for name in paths], fontsize="x-small")
 errors.set(ylabel="mean square error [counts²]", title="the filter flown (bars: 3 standard errors)")
 figure.legend(*plan.get_legend_handles_labels(), loc="outside lower left", ncols=5, fontsize="small")
 errors.legend(fontsize="small")
