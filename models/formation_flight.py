@@ -11,6 +11,7 @@ gives neither aircraft nor map nor noises of the filter: `formation.aircraft` an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -20,6 +21,8 @@ import numpy.typing as npt
 import covocp as co
 from covocp.base.arguments import a, checked, is_number, one_of, optional, positive, whole
 from covocp.blocks import peak_seeking
+from covocp.models import designed_excitation
+from covocp.models.excitation.paths import Path
 from covocp.models.formation import aircraft
 from covocp.models.formation.drag_map import DragMap, drag_map
 from covocp.models.formation.flight_runs import FlightRuns
@@ -43,6 +46,7 @@ RECOMMENDED: dict[str, Any] = {
     "newton": "modified",
     "smallest_curvature": 0.8,
     "largest_step": 1.5,
+    "descent_gain": 0.05,  # of other steps, where one is chosen
 }
 PRINTED: dict[str, Any] = {
     "window": 15,
@@ -54,8 +58,30 @@ PRINTED: dict[str, Any] = {
     "newton": "plain",
     "switch": 6.0,
     "descent_gain": 0.05,
+    "smallest_curvature": 0.8,  # of the "modified" step, where it is chosen
 }
 COMMAND_GAIN = {"recommended": 1.0, "printed": 10.0}
+
+
+def problem(**changes: Any) -> co.Problem:
+    """The excitation that makes gradient and Hessian of the drag best known; `designed_excitation` in two inputs.
+
+    Args:
+        **changes: arguments of `designed_excitation.problem` that differ from the circle of 0.7 m in 120 s.
+
+    Returns:
+        The problem, with the noise of the drag, the prior of the law and the bandwidth of the tracker.
+
+    Raises:
+        ProblemError: an argument does not fit.
+    """
+    given = {
+        "radius": RADIUS,
+        "duration": SEEKING,
+        "noise": DRAG_DEVIATION**2 * aircraft.STEP,
+        "prior": RECOMMENDED["prior_covariance"],
+    }
+    return designed_excitation.problem(2, **(given | changes))
 
 
 @checked(
@@ -65,6 +91,7 @@ COMMAND_GAIN = {"recommended": 1.0, "printed": 10.0}
     turn=positive,
     command_gain=optional(positive),
     drag=optional(a(DragMap)),
+    path=optional(a(Path)),
 )
 def simulate(
     start: npt.ArrayLike = START,
@@ -76,6 +103,7 @@ def simulate(
     turn: float = TURN,
     command_gain: float | None = None,
     drag: DragMap | None = None,
+    path: Path | None = None,
     settings: str = "recommended",
     **changes: Any,
 ) -> FlightRuns:
@@ -91,6 +119,7 @@ def simulate(
         command_gain: of the filter of commands: 1 moves the command by the increment, 10 is the paper's; None: 1 with
             the recommended settings, 10 with the printed ones.
         drag: the map; None: that of `formation.drag_map`.
+        path: excitation that is flown instead of the circle, once, then held; such as `designed_excitation.path`.
         settings: "recommended", or "printed": the law of the paper with corrected signs.
         **changes: arguments of `blocks.peak_seeking.seeker` that differ from these settings.
 
@@ -102,16 +131,27 @@ def simulate(
     """
     field = drag_map() if drag is None else drag
     known = {"recommended": RECOMMENDED, "printed": PRINTED}[settings]
-    law = peak_seeking.seeker(2, **(known | changes))
+    law = peak_seeking.seeker(2, **peak_seeking.with_changes(known, changes))
     gain = COMMAND_GAIN[settings] if command_gain is None else float(command_gain)
     tracker = aircraft.tracker()
     begin = field.best + _pair("start", start)
+    if path is not None and path.position.shape[1] != 2:
+        raise co.ProblemError(
+            "The path of excitation does not fit.",
+            expected="positions to the right and above, (K, 2) [m]",
+            received=f"shape {path.position.shape}",
+            remedy="give a path in two inputs",
+        )
+
+    def excited(t: Any) -> Any:
+        return peak_seeking.circle(t, radius, turn) if path is None else path.at(t)
+
     trim = aircraft.trimmed(tracker, field.evaluate(begin)[1], begin)
     found = co.simulate_sampled(
-        _follower(tracker, field, gain, radius, turn),
+        _follower(tracker, field, gain, excited),
         _sensor(field),
         law.law(SEEKING),
-        initial=np.concatenate([trim.state, trim.sums, begin - _excitation(0.0, radius, turn)]),
+        initial=np.concatenate([trim.state, trim.sums, begin - excited(0.0)]),
         memory=law.initial(),
         step=aircraft.STEP,
         period=PERIOD,
@@ -120,7 +160,7 @@ def simulate(
         seed=seed,
         every=STORED,
     )
-    command = found.x[..., 15:] + _excitation(found.t, radius, turn)
+    command = found.x[..., 15:] + excited(found.t)
     return FlightRuns.of(found, command, law, tracker, field)
 
 
@@ -137,16 +177,11 @@ def _pair(name: str, value: npt.ArrayLike) -> Array:
     return numbers
 
 
-def _excitation(t: Any, radius: float, turn: float) -> Any:
-    """What is added to the commanded position (y, h) [m]."""
-    return peak_seeking.circle(t, radius, turn)
-
-
-def _follower(tracker: aircraft.Tracker, field: DragMap, gain: float, radius: float, turn: float) -> ca.Function:
+def _follower(tracker: aircraft.Tracker, field: DragMap, gain: float, excitation: Callable[[Any], Any]) -> ca.Function:
     """A step of (state, sums, command): tracker, aircraft in the wake, ramp of the command."""
     x, increment, t, noise = ca.MX.sym("x", 17), ca.MX.sym("increment", 2), ca.MX.sym("t"), ca.MX.sym("noise", 0)
     state, sums, command = x[:11], x[11:15], x[15:]
-    error = ca.vertcat(state[:9], state[9:] - command - _excitation(t, radius, turn))
+    error = ca.vertcat(state[:9], state[9:] - command - excitation(t))
     controls = -ca.DM(tracker.gain) @ ca.vertcat(error, sums)
     A, B, vortex = (ca.DM(part) for part in tracker.model)
     tracked = [aircraft.STATES.index(name) for name in aircraft.TRACKED]

@@ -26,6 +26,7 @@ import covocp as co
 from covocp.base.arguments import checked, is_number, one_of, positive, whole
 from covocp.base.short_repr import short_repr
 from covocp.blocks import kalman, peak_seeking
+from covocp.models import designed_excitation
 
 Array = npt.NDArray[np.float64]
 
@@ -33,6 +34,7 @@ MINIMUM = 2.4  # m
 CURVATURE = 0.13664  # f'' at the minimum [1/m^2]
 STEP, PERIOD = 1.0, 4.0  # of the plant and of the filter [s]
 GAIN = 0.2  # of the plant at rest
+BANDWIDTH = 1.0  # of the plant: its slowest pole [1/s]
 NOISE = 0.01  # variance of one value of f
 WINDOW = 10
 PLANT = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-5.0, -9.0, -5.0))
@@ -46,6 +48,7 @@ RECOMMENDED: dict[str, Any] = {
     "newton": "modified",
     "smallest_curvature": 0.05,
     "largest_step": 5.0,
+    "descent_gain": 1.0,  # of other steps, where one is chosen
 }
 PRINTED: dict[str, Any] = {
     "window": WINDOW,
@@ -58,7 +61,36 @@ PRINTED: dict[str, Any] = {
     "definite": False,
     "descent_gain": 1.0,
     "switch": 0.005,
+    "smallest_curvature": 0.05,  # of the "modified" step, where it is chosen
 }
+
+
+@checked(amplitude=positive, rate=positive, duration=positive)
+def problem(amplitude: float = 0.5, rate: float = 0.4, duration: float = 40.0) -> co.Problem:
+    """The excitation that makes slope and curvature best known, no longer than a sine; `designed_excitation`.
+
+    Args:
+        amplitude: of the sine it is compared with, the unit of positions [m].
+        rate: of that sine [rad/s].
+        duration: T [s]; 40 s are the ten readings of the window.
+
+    Returns:
+        The problem of `designed_excitation` for one input, with the noise of a value every 4 s, the prior of the law,
+        and the bandwidth of the plant, 1/s.
+
+    Raises:
+        ProblemError: an argument is not positive.
+    """
+    length = 4.0 * amplitude * rate * duration / (2.0 * np.pi)
+    return designed_excitation.problem(
+        1,
+        radius=amplitude,
+        duration=duration,
+        length=length,
+        noise=NOISE * PERIOD,
+        prior=RECOMMENDED["prior_covariance"],
+        acceleration=BANDWIDTH * length / duration,
+    )
 
 
 def function(x: Any) -> Any:
@@ -249,7 +281,7 @@ def simulate(
         ProblemError: an argument does not fit.
     """
     known = {"recommended": RECOMMENDED, "printed": PRINTED}[settings]
-    law = peak_seeking.seeker(1, **(known | changes))
+    law = peak_seeking.seeker(1, **peak_seeking.with_changes(known, changes))
     steps = np.atleast_1d(np.asarray(initial_steps, dtype=float))
     begin = float(start) / GAIN
     found = co.simulate_sampled(

@@ -4,7 +4,8 @@
     python benchmarks/peers/export.py --quick     a tenth of a second for each number; prints only
 
 Nanoseconds of one call, medians of five measurements. The targets are a step of the first-order controller below 1
-microsecond and of the Mars controller below 20; what misses its target is printed, the exit code is always 0.
+microsecond, of the Mars controller and an update of the peak seeker below 20; what misses its target is printed, the
+exit code is always 0.
 """
 
 from __future__ import annotations
@@ -23,12 +24,17 @@ import numpy as np
 from report import git, processor, version
 
 import covocp as co
-from covocp.blocks import kalman, theta_d
+from covocp.blocks import kalman, peak_seeking, theta_d
 from covocp.export import CPackage, export_c
-from covocp.models import agile_aircraft, mars_entry, unknown_lag
+from covocp.models import agile_aircraft, formation_flight, mars_entry, unknown_lag
 
 REPEATS = 5
-TARGETS = {("first-order controller", "step"): 1e3, ("Mars controller", "step"): 20e3}  # ns
+SEEKER = "peak seeker, 2 inputs, window 15"
+TARGETS = {
+    ("first-order controller", "step"): 1e3,
+    ("Mars controller", "step"): 20e3,
+    (SEEKER, "update"): 20e3,
+}  # ns
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "export_times.md"
 
 
@@ -44,6 +50,7 @@ def packages(folder: Path) -> dict[str, Callable[[], CPackage]]:
         "Mars controller, single precision": lambda: export_c(mars, folder / "mars_single", precision="single"),
         "Kalman filter, 4 states, 2 readings": lambda: export_c(kalman_functions(), folder / "kalman"),
         "θ-D servo and filter, 5 states": lambda: export_c(theta_d_functions(), folder / "theta"),
+        SEEKER: lambda: export_c(peak_seeking_functions(), folder / "seeker"),
         "re-planning of the lag, 20 intervals": lambda: export_c(unknown_lag.problem(), folder / "plan", intervals=20),
     }
 
@@ -68,6 +75,12 @@ def theta_d_functions() -> list[ca.Function]:
         theta_d.servo(x, A0, A, B, [0, 0, 0, 1, 0], s.Q, s.R, k=1.0, l=0.01),
         theta_d.filter_gain(x, A0, A, H, s.W, s.V, k=1.0, l=0.01),
     ]
+
+
+def peak_seeking_functions() -> list[ca.Function]:
+    """Update and step of the formation flight."""
+    law = peak_seeking.seeker(2, **formation_flight.RECOMMENDED)
+    return [law.update, law.step]
 
 
 def measured(name: str, package: CPackage, seconds: float) -> tuple[list[str], list[str]]:

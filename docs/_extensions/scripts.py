@@ -39,6 +39,7 @@ GALLERY = (
             "chain_of_masses",
             "noisy_integrator",
             "unknown_gain",
+            "designed_excitation",
         ),
     ),
     (

@@ -264,6 +264,30 @@ def test_noise_of_positions_counts_by_the_gradient():
     )
 
 
+@pytest.mark.parametrize(("length", "size"), [(1e-3, 1e4), (3.28, 1e-4)])
+def test_other_units_change_nothing(length, size):
+    """Positions times `length`, f times `size`: the same increments, times `length`."""
+    M, _, f = convex(2, 2)
+    generator = np.random.default_rng(0)
+    readings = [(x, f(x) + 0.1 * generator.standard_normal()) for x in generator.standard_normal((12, 2))]
+    of_b, of_M = size / length, size / length**2
+    unit = np.array([of_M, of_M, of_M, of_b, of_b])
+    spread, drift = np.array([9.0, 9.0, 9.0, 4.0, 4.0]), np.array([1.0, 1.0, 1.0, 2.0, 2.0]) * 1e-2
+    plain = peak_seeking.seeker(
+        2, 6, noise=0.01, drift=drift, prior_covariance=spread, smallest_curvature=0.2, largest_step=0.8,
+        position_noise=0.02,
+    )  # fmt: skip
+    other = peak_seeking.seeker(
+        2, 6, noise=0.01 * size**2, drift=drift * unit**2, prior_covariance=spread * unit**2,
+        smallest_curvature=0.2 * of_M, largest_step=0.8 * length, position_noise=0.02 * length,
+    )  # fmt: skip
+    first, second = fed(plain, readings), fed(other, [(length * x, size * value) for x, value in readings])
+    np.testing.assert_allclose(other.step(second), length * plain.step(first), rtol=1e-9)
+    np.testing.assert_allclose(
+        other.estimate(second).covariance, plain.estimate(first).covariance * np.outer(unit, unit), rtol=1e-8
+    )
+
+
 READING = st.tuples(
     st.lists(st.one_of(st.floats(-1e9, 1e9), st.sampled_from([0.0, 1.0, np.nan])), min_size=2, max_size=2),
     st.one_of(st.floats(-1e9, 1e9), st.sampled_from([0.0, np.nan])),
@@ -371,8 +395,8 @@ def test_exported_functions_agree_with_python(inputs, tmp_path):
     package = co.export_c([law.update, law.step], tmp_path / "seeker")
     package.build()
     assert package.check().ok
-    source = (tmp_path / "seeker" / "seeker.c").read_text(encoding="utf-8")
-    assert "alloc(" not in source
+    for name in ("seeker.c", "seeker_casadi.c"):
+        assert "alloc(" not in (tmp_path / "seeker" / name).read_text(encoding="utf-8")
 
 
 @pytest.mark.needs_cc

@@ -27,7 +27,7 @@ TABLE = {
     "robust, excitation": (9.0, LEFT, ROBUST | {"excitation": 0.5}, (1.00, 0.97, 1.00, 0.0)),
     "robust from 12": (12.0, LEFT, ROBUST, (0.99, 0.98, 1.00, 0.0)),
     "steepest descent": (
-        9.0, LEFT, PRINTED | {"newton": "never", "switch": None, "definite": True}, (0.0, 0.18, 0.0, 0.0),
+        9.0, LEFT, PRINTED | {"newton": "never"}, (0.0, 0.18, 0.0, 0.0),
     ),
     "outside, as printed": (20.0, LEFT, PRINTED | {"drift": (1e-3, 1e-2)}, (0.02, 0.04, 0.03, 0.96)),
 }  # fmt: skip
@@ -40,6 +40,17 @@ def test_shares_of_the_specification(name):
     found = (runs.inside(80.0), runs.inside(200.0), runs.hit(80.0), runs.lost())
     np.testing.assert_allclose(found, expected, atol=0.05)
     assert runs.samples[runs.estimate.known[0].argmax()] == 12.0
+
+
+def test_settings_change_one_by_one():
+    """The printed law with the robust step, and the robust one with a plain step, need no more than that word."""
+    robust = line.simulate(9.0, LEFT, runs=20, duration=40.0, settings="printed", newton="modified", largest_step=5.0)
+    same = line.simulate(9.0, LEFT, runs=20, duration=40.0, **ROBUST)
+    np.testing.assert_array_equal(robust.position, same.position)
+    plain = line.simulate(9.0, LEFT, runs=20, duration=40.0, newton="plain")
+    assert np.abs(plain.position - line.simulate(9.0, LEFT, runs=20, duration=40.0).position).max() > 0.0
+    with pytest.raises(ProblemError, match="'switch'"):
+        line.simulate(9.0, LEFT, switch=0.1)
 
 
 def test_far_outside_the_convex_region():

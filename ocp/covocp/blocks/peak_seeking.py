@@ -14,3 +14,4 @@ from covocp.blocks.quadratic import transport as transport
 from covocp.blocks.seeker import Estimate as Estimate
 from covocp.blocks.seeker import Seeker as Seeker
 from covocp.blocks.seeker import seeker as seeker
+from covocp.blocks.seeker import with_changes as with_changes

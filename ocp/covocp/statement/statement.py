@@ -271,6 +271,13 @@ class Statement:
         """Block of the covariance of the estimation error, where there is one."""
         return next(block for block in self.matrices if block.estimation)
 
+    @cached
+    def integrals(self) -> bool:
+        """Whether the matrices are integrals along the nominal: their rates depend on none of them."""
+        if self.estimated or self.behind or not self.matrices:
+            return False
+        return bool(self.rates.jac_sparsity(1, INPUTS.index("matrices")).nnz() == 0)
+
     def entries(self, positions: tuple[int, ...]) -> list[int]:
         """Entries of the stacked half-vectors that belong to some of the matrices."""
         return [k for i in positions for k in range(self.matrices[i].span.start, self.matrices[i].span.stop)]
