@@ -63,11 +63,19 @@ PRINTED: dict[str, Any] = {
 COMMAND_GAIN = {"recommended": 1.0, "printed": 10.0}
 
 
-def problem(**changes: Any) -> co.Problem:
+def problem(
+    radius: float = RADIUS,
+    duration: float = SEEKING,
+    ends: designed_excitation.Ends = "rest",
+    reach: float | None = None,
+) -> co.Problem:
     """The excitation that makes gradient and Hessian of the drag best known; `designed_excitation` in two inputs.
 
     Args:
-        **changes: arguments of `designed_excitation.problem` that differ from the circle of 0.7 m in 120 s.
+        radius: of the circle whose length the path has at most [m].
+        duration: of the path [s].
+        ends: "rest" at the command, or "free".
+        reach: largest distance from the command [m]; None: any.
 
     Returns:
         The problem, with the noise of the drag, the prior of the law and the bandwidth of the tracker.
@@ -75,13 +83,15 @@ def problem(**changes: Any) -> co.Problem:
     Raises:
         ProblemError: an argument does not fit.
     """
-    given = {
-        "radius": RADIUS,
-        "duration": SEEKING,
-        "noise": DRAG_DEVIATION**2 * aircraft.STEP,
-        "prior": RECOMMENDED["prior_covariance"],
-    }
-    return designed_excitation.problem(2, **(given | changes))
+    return designed_excitation.problem(
+        2,
+        radius=radius,
+        duration=duration,
+        ends=ends,
+        reach=reach,
+        noise=DRAG_DEVIATION**2 * aircraft.STEP,
+        prior=RECOMMENDED["prior_covariance"],
+    )
 
 
 @checked(

@@ -253,11 +253,14 @@ def test_missing_values_are_left_out_and_nothing_is_lost(arguments):
 
 
 def test_noise_of_positions_counts_by_the_gradient():
-    """Variance noise + (deviation |b|)^2, (1.3): the update of a filter whose noise is that."""
+    """Variance noise + deviation^2 E |b|^2, (1.3): the update of a filter whose noise is that.
+
+    With M and b of variance one, that of b_i is 1 + |d|^2 after a step d = (1, 0.5).
+    """
     prior, deviation = np.array([0.0, 0.0, 0.0, 3.0, -4.0]), 0.2
     given = USUAL | {"prior": prior}
     noisy = peak_seeking.seeker(2, 4, position_noise=deviation, **given)
-    plain = peak_seeking.seeker(2, 4, **(given | {"noise": 0.01 + (deviation * 5.0) ** 2}))
+    plain = peak_seeking.seeker(2, 4, **(given | {"noise": 0.01 + deviation**2 * (5.0**2 + 2 * 2.25)}))
     readings = [(np.zeros(2), 0.0), (np.array([1.0, 0.5]), 1.5)]
     np.testing.assert_allclose(
         noisy.estimate(fed(noisy, readings)).covariance, plain.estimate(fed(plain, readings)).covariance, rtol=1e-12
@@ -286,6 +289,15 @@ def test_other_units_change_nothing(length, size):
     np.testing.assert_allclose(
         other.estimate(second).covariance, plain.estimate(first).covariance * np.outer(unit, unit), rtol=1e-8
     )
+
+
+def test_drift_goes_on_while_readings_are_missing():
+    law = peak_seeking.seeker(1, 4, **(USUAL | {"drift": [0.3, 0.5], "prior": [1.0, 2.0], "transport": False}))
+    memory = fed(law, [(x, x**2) for x in (0.0, 1.0, 3.0)])
+    before = law.estimate(memory)
+    after = law.estimate(fed(law, [(np.nan, 1.0), (2.0, np.nan)], memory))
+    np.testing.assert_allclose(after.covariance - before.covariance, 2 * np.diag([0.3, 0.5]), rtol=1e-12, atol=1e-14)
+    np.testing.assert_array_equal(after.parameters, before.parameters)
 
 
 READING = st.tuples(

@@ -73,7 +73,7 @@ class Seeker:
         inputs: n.
         window: N, number of earlier readings that each new one is compared with.
         update: casadi.Function (memory, position (n,), value) -> memory; a reading with NaN moves the point of
-            expansion where the position is known, and is otherwise left out.
+            expansion where the position is known, adds the drift, and is otherwise left out.
         step: casadi.Function (memory) -> increment of the commanded position (n,), zero before the first update.
         layout: where things are in the memory.
         start: number of differences before the first update.
@@ -189,8 +189,9 @@ def seeker(
         n: number of inputs.
         window: N, number of earlier readings that each new one is compared with.
         noise: variance of one value of f, in its unit squared.
-        drift: W, what the covariance of zeta gains from one reading to the next: a number (times the identity), (p,)
-            (its diagonal) or (p, p). With transport it covers what is of third order in f only.
+        drift: W, what the covariance of zeta gains from one reading to the next, missing ones too: a number (times the
+            identity), (p,) (its diagonal) or (p, p). With transport it covers what is of third order in f, and changes
+            of f with time.
         prior_covariance: of zeta before the first update, in the same forms.
         prior: zeta at the first position, (p,); None: nothing is known, zero, and the prior covariance is the first
             update's, wherever that is.
@@ -208,7 +209,7 @@ def seeker(
         definite: "plain" steps only while M is positive definite (for a maximum: negative definite).
         maximum: seek a maximum of f.
         position_noise: standard deviation of each coordinate of a position that is measured, in units of position; it
-            acts as noise of f by the estimated gradient.
+            acts as noise of f by the mean square of the gradient at the newest position.
 
     Returns:
         The law; its functions are scalar operations only, so they go into problems, simulations and C code.

@@ -125,7 +125,8 @@ def update_function(settings: Settings, layout: Memory) -> CheckedFunction:
         readings=ca.fmin(old.readings + there, settings.window + 1),
         point=x,
         zeta=ca.if_else(there, new.zeta, moved.zeta),
-        lower=ca.if_else(there, new.lower, moved.lower),
+        # W is for the time between readings, also those that are missing; without W these change no bit.
+        lower=new.lower if np.any(settings.drift_factor) else ca.if_else(there, new.lower, moved.lower),
     )
     names: Any = (["memory", "position", "value"], ["memory_out"])
     function = ca.Function("update", [memory, position, value], [ca.densify(_joined(kept))], *names)
@@ -151,8 +152,9 @@ def _updated(old: _Parts, x: Expr, f: Expr, there: Expr, settings: Settings) -> 
     lower = triangular(beside(old.lower, drift)) if drift.nnz() else old.lower
     steps, residuals = old.positions - ca.repmat(x.T, settings.window, 1), old.values - f
     rows = regressor_row(steps)
-    gradient_now = gradient(old.zeta)
-    noise = settings.noise + settings.position_noise**2 * ca.sumsqr(gradient_now)
+    # The mean square of the gradient, which is not known exactly, is that of its estimate and its variances.
+    steepness = ca.sumsqr(gradient(old.zeta)) + ca.sumsqr(lower[-settings.inputs :, :])
+    noise = settings.noise + settings.position_noise**2 * steepness
     enough = ca.logic_and(there, old.readings >= settings.start)
     used = ca.vertcat(*(ca.logic_and(enough, old.readings > j) for j in range(settings.window)))
     if settings.reuse:

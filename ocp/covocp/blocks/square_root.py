@@ -97,7 +97,8 @@ def update_factor(
     """Measurement update of item 3 on factors.
 
     Forms: "array" triangularises [V, H L; 0, L]; "sequential" takes one row of the measurement after the other by
-    Potter's form, rows that are correlated made independent first: fewer operations where the rows are many.
+    Potter's form, rows that are correlated made independent first: fewer operations where the rows are many, but it
+    squares V, so that noises that are nearly dependent belong to "array".
 
     Args:
         estimate: before the measurement, shape (n,) or (n, 1).
