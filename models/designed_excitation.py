@@ -100,6 +100,13 @@ def problem(
             received=f"speed = {fastest:.3g} m/s",
             remedy="give a larger speed=, or a shorter length=",
         )
+    if begin is not None and (length is not None or ends != "rest"):
+        raise co.ProblemError(
+            "A path that is given has its own length and end.",
+            expected="begin= without length= and ends=",
+            received=f"length={length!r}, ends={ends!r}",
+            remedy="leave them out, or leave begin= out",
+        )
     first, last = _ends(inputs, ends, begin)
     ocp = co.Problem(duration, name=f"designed excitation, {inputs} input" + "s" * (inputs > 1))
     guess = start(inputs, 1, radius=radius, duration=duration)

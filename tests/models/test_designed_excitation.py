@@ -182,6 +182,7 @@ def test_paths_as_numbers_and_expressions():
         (lambda: model.problem(prior=[1.0, 2.0]), "prior"),
         (lambda: model.problem(prior=[1.0, 1.0, 1.0, 1.0, 0.0]), "prior"),
         (lambda: model.problem(begin=[0.0]), "begin"),
+        (lambda: model.problem(begin=[0.0, 0.7, 0.03, 0.0], length=3.0), "its own length"),
         (lambda: model.problem(length=10.0, speed=0.01), "speed"),
         (lambda: model.fly(model.classical(), runs=1), "'runs'"),
         (lambda: model.fly(model.classical(duration=15.0)), "too short"),
