@@ -23,6 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import casadi as ca
 import numpy as np
+from buffers import bound
 from report import git, processor, version
 from theta_d import compiled
 
@@ -70,15 +71,9 @@ def by_functions(update: ca.Function, step: ca.Function, memory: np.ndarray) -> 
     """The two functions called through their buffers: no object is made in a call."""
     own, place, value, increment = memory.copy(), np.zeros(2), np.zeros(1), np.zeros(2)
     new = np.zeros(memory.size)
-    learn, learning = update.buffer()
-    act, acting = step.buffer()
-    for i, array in enumerate((own, place, value)):
-        learn.set_arg(i, memoryview(array))
-    learn.set_res(0, memoryview(new))
-    act.set_arg(0, memoryview(new))
-    act.set_res(0, memoryview(increment))
+    learning, acting = bound(update, (own, place, value), new), bound(step, (new,), increment)
 
-    def batch(positions: np.ndarray, values: np.ndarray, _keep: object = (learn, act, update, step)) -> np.ndarray:
+    def batch(positions: np.ndarray, values: np.ndarray) -> np.ndarray:
         own[:] = memory
         increments = np.zeros((len(values), 2))
         for k in range(len(values)):

@@ -23,6 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import casadi as ca
 import numpy as np
+from buffers import bound
 from report import git, processor, version
 from scipy.linalg import solve_continuous_are
 
@@ -54,12 +55,9 @@ def riccati_batch(samples: np.ndarray) -> None:
 def buffered(law: ca.Function) -> Callable[[np.ndarray], None]:
     """A law called through its buffers: no object is made in a call."""
     x, t, u = np.zeros(5), np.zeros(1), np.zeros(1)
-    buffer, evaluate = law.buffer()
-    for i, array in enumerate((x, t)):
-        buffer.set_arg(i, memoryview(array))
-    buffer.set_res(0, memoryview(u))
+    evaluate = bound(law, (x, t), u)
 
-    def batch(samples: np.ndarray, _keep: object = (buffer, law, t, u)) -> None:
+    def batch(samples: np.ndarray) -> None:
         for sample in samples[:FAST]:
             x[:] = sample
             evaluate()

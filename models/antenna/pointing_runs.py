@@ -136,10 +136,16 @@ class PointingRuns:
 
     @property
     def violation(self) -> tuple[float, float]:
-        """Median and largest over the runs of the largest violation after that time, in cosine units."""
-        later = self.t >= self._first()[:, None]
+        """Median and largest of the largest violation after that time, in cosine units, over the runs that get there.
+
+        NaN where none does: a run that never kept the zones has nothing to violate later.
+        """
+        first = self._first()
+        if not np.isfinite(first).any():
+            return np.nan, np.nan
+        later = self.t >= first[:, None]
         worst = np.maximum(0.0, -self.zone_values.min(axis=-1, initial=0.0))
-        largest = np.where(later, worst, 0.0).max(axis=1)
+        largest = np.where(later, worst, 0.0).max(axis=1)[np.isfinite(first)]
         return float(np.median(largest)), float(largest.max())
 
     @property
@@ -166,23 +172,31 @@ class PointingRuns:
 
     def __str__(self) -> str:
         """Shares that arrive, when, and how the zones are kept."""
-        share, hold = f"{self.success:.2f} of the runs", f"from {self.time_to_hold:.1f} s on"
+        since = self.time_to_hold
+        share = f"{self.success:.2f} of the runs"
+        hold = f"held from {since:.1f} s on" if np.isfinite(since) else "not held by half of them"
         lines = [
             f"Antenna pointing: {len(self.power)} runs of {self.t[-1]:g} s, {self.filter}, settings {self.settings}",
             f"  at least 95 % of {self.antenna.peak:g} W     {share}, {hold}",
             f"  power at the end          median {np.median(self.final_power):.2f} W",
         ]
         if self.zone_values.shape[-1]:
-            median, largest = self.violation
-            lines.append(
-                f"  zones                     kept from {self.feasible_from:.1f} s on, "
-                f"later violation median {median:.3f}, largest {largest:.3f}"
-            )
+            lines.append(f"  zones                     {self._about_zones()}")
         lines += [
             f"  gradient                  {self.coverage:.3f} within 3 standard deviations",
             f"  largest torque            median {self.peak_torque:.2f} N m",
         ]
         return "\n".join(lines)
+
+    def _about_zones(self) -> str:
+        """How many runs get between the zones, when, and by how much they leave them again."""
+        reached = int(np.isfinite(self._first()).sum())
+        if not reached:
+            return "met by none"
+        median, largest = self.violation
+        when = f" first at {self.feasible_from:.1f} s" if np.isfinite(self.feasible_from) else ""
+        later = f"later violation of the cosine: median {median:.3f}, largest {largest:.3f}"
+        return f"met by {reached} of {len(self.power)}{when}, {later}"
 
     def plot(self, path: str | Path | None = None, run: int = 0, *, gradient: bool = False) -> Any:
         """Power, zones, torque, wheels and the paths of the body axes of one run.

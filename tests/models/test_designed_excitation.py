@@ -95,12 +95,12 @@ def test_a_fifth_less_than_the_circle(designed):
 def test_paths_that_may_end_anywhere_are_better_still(designed, within):
     anywhere = co.solve(model.problem(ends="free"), guess=within, **SMALL)
     assert np.linalg.norm(model.path(within).position, axis=1).max() < 0.7 * 1.01
-    assert within.cost < 0.66 * 8.031
+    assert within.cost < 0.66 * np.trace(model.covariance(model.classical())[-1])  # that is held against scipy above
     assert anywhere.cost < within.cost < designed.cost
 
 
 def test_other_starts_find_the_same(designed):
-    """Half the seeds of the multistart end in this minimum, none in a better one."""
+    """Random starts end in the minimum of the default guess."""
     costs = [co.solve(model.problem(), guess=model.start(2, seed), **SMALL).cost for seed in (2, 5, 12)]
     same = co.solve(model.problem(), **SMALL).cost
     np.testing.assert_allclose(costs, same, rtol=1e-4)
@@ -115,7 +115,7 @@ def test_filters_find_what_is_predicted(paths, name):
     assert abs(mean - np.trace(flights.once_covariance)) < 4 * error
     normalised = np.einsum("ri,ij,rj->r", flights.once, np.linalg.inv(flights.once_covariance), flights.once)
     assert normalised.mean() == pytest.approx(5.0, abs=4 * np.sqrt(10.0 / RUNS))
-    # means of 10 s know less than a continuous measurement, by at most a tenth or two here
+    # means of 10 s know less than a continuous measurement
     assert 1.0 < np.trace(flights.once_covariance) / np.trace(flights.continuous) < 1.2
     sought, spread = flights.measured("seeker")
     assert sought > mean - 4 * (error + spread)  # the seeker reuses readings: it cannot know more
@@ -147,7 +147,7 @@ def test_problems_of_the_models():
 
 
 def test_a_path_is_flown_by_the_aircraft(paths):
-    """The command follows the path, then holds its end; the estimate before the steps is as the filter predicts."""
+    """The command follows the path while the seeker waits, and the aircraft the command."""
     path = paths["designed"]
     runs = formation_flight.simulate(runs=8, duration=150.0, path=path)
     offset = runs.command[:, 0] - path.position[0]

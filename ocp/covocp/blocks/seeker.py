@@ -246,10 +246,15 @@ def seeker(
         sign=-1.0 if maximum else 1.0,
         position_noise=float(position_noise),
     )
+    return _made(settings, zeta, covariance)
+
+
+def _made(settings: Settings, zeta: Array, covariance: Array) -> Seeker:
+    """The law with its memory at the start: zeta and the factor of its covariance."""
     layout = Memory.of(settings.inputs, settings.window)
     memory = np.zeros(layout.factor.stop)
     memory[layout.parameters] = zeta
-    rows, columns = half_indices(size)
+    rows, columns = half_indices(zeta.size)
     memory[layout.factor] = np.asarray(factor(covariance))[rows, columns]
     return Seeker(
         inputs=settings.inputs,
@@ -257,7 +262,7 @@ def seeker(
         update=update_function(settings, layout),
         step=step_function(settings, layout),
         layout=layout,
-        start=first,
+        start=settings.start,
         _initial=memory,
     )
 
