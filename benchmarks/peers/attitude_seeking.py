@@ -132,9 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start = time.process_time()
     antenna_pointing.simulate("constrained", runs=128)
     flown = time.process_time() - start
-    print(
-        f"128 flights of 200 s: {flown:.1f} s of processor time, target {FLIGHTS:g} s {'met' if flown <= FLIGHTS else 'MISSED'}"
-    )
+    verdict = "met" if flown <= FLIGHTS else "MISSED"
+    print(f"128 flights of 200 s: {flown:.1f} s of processor time, target {FLIGHTS:g} s {verdict}")
     print(
         f"commit {git('rev-parse', '--short=12', 'HEAD') or 'unknown'}, Python {platform.python_version()}, "
         f"{', '.join(version(package) for package in ('casadi', 'numpy', 'clarabel'))}, {processor()}, load {load:.1f}"

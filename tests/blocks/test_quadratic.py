@@ -95,3 +95,27 @@ def test_transport_of_expressions_and_its_noise():
 def test_wrong_arguments_are_named(call, argument):
     with pytest.raises(ProblemError, match=argument):
         call()
+
+
+def test_ramp_and_excitation():
+    """After a period the command has moved by the increment; numbers and expressions alike, wrong shapes named."""
+    command = np.array([1.0, -2.0])
+    for _ in range(10):
+        command = peak_seeking.ramp(command, [0.5, 1.0], period=2.0, step=0.2)
+    np.testing.assert_allclose(command, [1.5, -1.0], atol=1e-14)
+    symbol = ca.SX.sym("command", 2)
+    moved = ca.Function("moved", [symbol], [peak_seeking.ramp(symbol, ca.DM([1.0, 2.0]), period=4.0, step=1.0)])
+    np.testing.assert_allclose(moved([0.0, 0.0]).full().ravel(), [0.25, 0.5])
+    with pytest.raises(ProblemError, match="'increment'"):
+        peak_seeking.ramp([0.0, 0.0], [1.0, 1.0, 1.0], period=1.0, step=0.1)
+    t = ca.SX.sym("t")
+    wave = peak_seeking.sine(t, 2.0, 8.0, start=1.0, end=9.0)
+    circle = peak_seeking.circle(t, 0.7, 120.0, end=60.0)
+    both = ca.Function("both", [t], [wave, circle])
+    for time, expected in ((0.5, 0.0), (3.0, 2.0), (7.0, -2.0), (9.5, 0.0)):
+        assert peak_seeking.sine(time, 2.0, 8.0, start=1.0, end=9.0) == pytest.approx(expected, abs=1e-14)
+        assert float(both(time)[0]) == pytest.approx(expected, abs=1e-14)
+    np.testing.assert_allclose(
+        peak_seeking.circle([0.0, 30.0, 61.0], 0.7, 120.0, end=60.0), [[0, 0.7], [0.7, 0], [0, 0]], atol=1e-15
+    )
+    np.testing.assert_allclose(both(30.0)[1].full().ravel(), [0.7, 0.0], atol=1e-15)

@@ -23,11 +23,16 @@ def ramp(command: Expr, increment: Expr, *, period: float, step: float) -> Any:
         step: of the plant [s].
 
     Returns:
-        The command at the end of the step, in the units of the command; section 1.5.
+        The command at the end of the step, in the units of the command.
 
     Raises:
-        ProblemError: period or step that are not positive.
+        ProblemError: period or step that are not positive, a command and an increment that do not fit.
     """
+    if not is_symbolic(command, increment):
+        given, moved = array("command", command), array("increment", increment)
+        if given.ndim and given.shape != moved.shape:
+            raise wrong_argument("increment", f"shape {given.shape}, that of the command", f"shape {moved.shape}")
+        return given + moved * (step / period) if given.ndim or moved.ndim else float(given + moved * (step / period))
     return command + increment * (step / period)
 
 

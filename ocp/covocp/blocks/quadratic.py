@@ -1,6 +1,7 @@
 """A quadratic model of a function around a point: its parameters, its regressor, and how it moves with the point.
 
-f(x + d) - f(x) = b'd + d'M d / 2, linear in zeta = (M_11, ..., M_nn, M_12, M_13, ..., b_1, ..., b_n), section 1.2.
+f(x + d) - f(x) = b'd + d'M d / 2, linear in zeta = (M_11, ..., M_nn, M_12, M_13, ..., b_1, ..., b_n). Equations are
+numbered as in docs/blocks/peak_seeking.md.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Parameters:
 
 @checked(n=whole(1, 100))
 def parameters(n: int) -> Parameters:
-    """The layout of the parameters of section 1.2.
+    """The layout of the parameters, (2).
 
     Args:
         n: number of inputs.
@@ -119,7 +120,7 @@ def _numbers(zeta: Expr) -> Array:
 
 
 def regressor(step: Expr) -> Any:
-    """h of section 1.2: f(x + step) - f(x) = h'zeta for a quadratic f.
+    """h of (2): f(x + step) - f(x) = h'zeta for a quadratic f.
 
     Args:
         step: from the point of expansion to another point, shape (n,) or (n, 1), or a number.
@@ -143,7 +144,7 @@ def regressor_row(d: Expr) -> Any:
 
 
 def transport(estimate: Expr, covariance: Expr, step: Expr, *, noise: Expr = 0) -> tuple[Any, Any]:
-    """The exact change of the point of expansion of section 1.4: M stays, b becomes b + M step; P becomes F P F'.
+    """The exact change of the point of expansion, (4): M stays, b becomes b + M step; P becomes F P F'.
 
     Args:
         estimate: zeta at the old point, shape (p,) or (p, 1).
@@ -173,7 +174,7 @@ def transport(estimate: Expr, covariance: Expr, step: Expr, *, noise: Expr = 0) 
 
 
 def transition(d: Expr) -> Any:
-    """F of section 1.4, unit lower triangular, for a step d, (n, 1)."""
+    """F of (4), unit lower triangular, for a step d, (n, 1)."""
     layout = parameters(d.shape[0])
     F: Any = np.eye(layout.size, dtype=d.dtype) if isinstance(d, np.ndarray) else ca.SX.eye(layout.size)
     for i, row in enumerate(layout.gradient.tolist()):
