@@ -24,6 +24,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
+from covocp.problem.attitude import Attitude, with_attitude
 from covocp.problem.boundary_values import check_free, end_value
 from covocp.problem.checks import (
     as_expression,
@@ -189,6 +190,44 @@ class Problem:
             variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
         )
         return self._add("states", entry).symbol
+
+    def attitude(
+        self,
+        name: str,
+        *,
+        initial: Given,
+        final: Given = None,
+        rate: Given,
+        guess: Guess = None,
+        variance: Given = None,
+        noise: Given = None,
+    ) -> Attitude:
+        """Declare an attitude with its rate: a rotation C from inertial to body axes, dC/dt = -omega^x C.
+
+        It is a unit quaternion to solvers, stepped by rotations, so that its length stays one; its error, in
+        covariances, gains and noises, is a rotation vector in body axes of three entries [rad].
+
+        Args:
+            name: unique name.
+            initial: rotation (3, 3) or unit quaternion (4,), numbers or expressions in parameters; None: free.
+            final: attitude to reach, likewise; after how many turns is free. None: free.
+            rate: angular velocity omega in body axes, shape (3, 1), any expression [rad/s].
+            guess: attitudes over the nodes, or a function of s = t/T; None: the shortest way to the final attitude,
+                without one simulated from the controls.
+            variance: of the error of the initial estimate: scalar, vector (diagonal) or matrix (3, 3) [rad^2].
+            noise: power spectral density of noise added to the rate: scalar, vector or matrix (3, 3) [rad^2/s].
+
+        Returns:
+            The attitude: `.matrix`, `.quaternion`, `.vector`, `.cosine(...)` for pointing zones, `.error(...)`.
+
+        Raises:
+            ProblemError: name used twice, no rotation, shapes that do not fit, variance or density negative.
+        """
+        self._declare(name, 1)
+        given = {"initial": initial, "final": final, "rate": rate, "guess": guess, "variance": variance, "noise": noise}
+        declarations, attitude = with_attitude(self._declarations, name, where=caller(), **given)
+        self._change(declarations)
+        return attitude
 
     @checked(unit=text)
     def unknown(self, name: str, mean: Given, variance: Given, *, unit: str = "") -> ca.MX:

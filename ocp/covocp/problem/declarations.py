@@ -12,6 +12,7 @@ import numpy as np
 from covocp.base.arguments import check_argument, truth
 from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
 from covocp.base.expressions import Given
+from covocp.base.geometry import Chart
 from covocp.base.matrices import Array, half_length, unpack_symbolic
 from covocp.base.short_repr import short_repr
 
@@ -49,7 +50,9 @@ class Free:
 class State:
     """A vector state of the nominal; data are columns of numbers or of expressions in the parameters.
 
-    estimated: whether it is part of the augmented state; constants to be chosen are not, and come last.
+    estimated: whether it is part of the augmented state; constants to be chosen are not, and come last. chart: how it
+    moves where it is no vector; its variance and its noise are those of its tangent, and what it has to reach is its
+    target, which a constraint poses, not its final value.
     """
 
     name: str
@@ -65,8 +68,15 @@ class State:
     scale: Array | None
     variance: ca.MX
     estimated: bool = True
+    chart: Chart | None = None
+    target: ca.MX | None = None
 
     __repr__ = short_repr
+
+    @property
+    def tangent(self) -> int:
+        """Entries of its tangent where it is no vector, else 0."""
+        return 0 if self.chart is None else self.chart.tangent
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,8 @@ from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
-from covocp.statement.statement import entry_names
+from covocp.problem.tangents import tangent_slope
+from covocp.statement.statement import error_names, error_size
 
 AugmentedEntry = State | Unknown
 
@@ -29,7 +30,7 @@ def with_estimation(declarations: Declarations, initial: Given = None) -> Declar
         ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
     """
     entries = declarations.augmented
-    labels = entry_names(entries)
+    labels = error_names(entries)
     if not labels:
         raise ProblemError(
             "There is nothing to estimate.",
@@ -93,13 +94,13 @@ class EstimationCovariance:
             return slice(row, row + 1)
         offset, jacobians = 0, []
         for entry in self._entries:
-            span = slice(offset, offset + entry.size)
+            span = slice(offset, offset + error_size(entry))
             if key is entry.symbol or (isinstance(key, str) and key == entry.name):
                 return span
             if is_symbolic(key):
                 if key.is_symbolic() and ca.is_equal(key, entry.symbol):
                     return span
-                jacobians.append(ca.jacobian(key, entry.symbol))
+                jacobians.append(tangent_slope(key, entry))
             offset = span.stop
         jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
         if jacobian.nnz() == 0:

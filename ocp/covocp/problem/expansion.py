@@ -14,27 +14,29 @@ from covocp.base.expressions import Expr
 from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Declarations, Expansion, Expected
 from covocp.problem.rates import process_noise
-from covocp.statement.statement import entry_names
+from covocp.problem.tangents import Moved, drift, moved, tangent_rate
+from covocp.statement.statement import entry_names, error_size
 
 
 def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
     check_dynamics(problem.states, problem.rates)
-    augmented = [entry.symbol for entry in problem.augmented]
+    at = moved(problem.augmented)
     controls = [entry.symbol for entry in problem.controls]
     count = sum(entry.size for entry in problem.unknowns)
-    rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
-    by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
-    at_end = _slope(expected.terminal, augmented).T
+    rates = ca.vertcat(*(tangent_rate(problem, state) for state in problem.states), ca.MX(count, 1))
+    running, terminal = at.write(expected.running), at.write(expected.terminal)
+    by_state = _slope(running, at.by).T
+    at_end = _slope(terminal, at.by).T
     weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
-    end = _slope(at_end, augmented) + (0 if weight is None else weight)
+    end = at.at_rest(_slope(at_end, at.by)) + (0 if weight is None else weight)
     _check_terminal_weights(problem, end)
     return Expansion(
-        F=_slope(rates, augmented),
+        F=_drift(problem, at, rates),
         G=_slope(rates, controls),
-        A=_slope(by_state, augmented),
-        B=_control_weights(problem, expected, _slope(by_control, controls)),
-        N=_slope(by_state, controls),
+        A=at.at_rest(_slope(by_state, at.by)),
+        B=_control_weights(problem, expected, _slope(_slope(expected.running, controls).T, controls)),
+        N=at.at_rest(_slope(by_state, controls)),
         Q=process_noise(problem),
         end=end,
         running=expected.running,
@@ -43,13 +45,19 @@ def expand(problem: Declarations, expected: Expected) -> Expansion:
     )
 
 
+def _drift(problem: Declarations, at: Moved, rates: Expr) -> Any:
+    """F: slope of the rates, and what two states differ by that move along each other."""
+    slope = at.at_rest(_slope(at.write(rates), at.by))
+    return slope + drift(problem) if at.states else slope
+
+
 def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
     """M and U of all measurements."""
-    augmented = [entry.symbol for entry in problem.augmented]
     if not problem.measurements:
         return ca.MX(0, size), ca.MX(0, 0)
     value = ca.vertcat(*(m.expression for m in problem.measurements))
-    return _slope(value, augmented), ca.diagcat(*(m.noise for m in problem.measurements))
+    at = moved(problem.augmented)
+    return at.at_rest(_slope(at.write(value), at.by)), ca.diagcat(*(m.noise for m in problem.measurements))
 
 
 def _slope(expression: Expr, symbols: list[Any]) -> Any:
@@ -75,8 +83,8 @@ def _weight_matrix(weights: Expr, entries: Sequence[Any], what: str) -> Any:
     if weights is None:
         return None
     if isinstance(weights, Mapping):
-        return ca.diagcat(*(weights.get(e.name, ca.MX(e.size, e.size)) for e in entries))
-    return density_matrix("minimize_expected", what, weights, sum(e.size for e in entries))
+        return ca.diagcat(*(weights.get(e.name, ca.MX(error_size(e), error_size(e))) for e in entries))
+    return density_matrix("minimize_expected", what, weights, sum(error_size(e) for e in entries))
 
 
 def _control_weights(problem: Declarations, expected: Expected, curvature: Expr) -> Any:
@@ -121,10 +129,10 @@ def _check_terminal_weights(problem: Declarations, end: Expr) -> None:
     """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
     offset = 0
     for state in problem.states:
-        free = [True] * state.size
-        if state.final.is_constant():
+        free = [state.target is None] * error_size(state)
+        if state.chart is None and state.final.is_constant():
             free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()
-        for i in range(state.size):
+        for i in range(error_size(state)):
             if not free[i] and not end.sparsity().has_nz(offset + i, offset + i):
                 raise ProblemError(
                     f"The final value of '{state.name}' is prescribed, but nothing says what missing it costs.",
@@ -134,4 +142,4 @@ def _check_terminal_weights(problem: Declarations, end: Expr) -> None:
                     remedy=f"give terminal_weight={{{state.name}: ...}} to minimize_expected(); 0 if it is free "
                     "to scatter",
                 )
-        offset += state.size
+        offset += error_size(state)

@@ -53,7 +53,7 @@ from covocp.problem.expansion import expand, measurement_slope
 from covocp.problem.freeze import freeze
 from covocp.problem.measurement_information import inverse_density
 from covocp.statement.names import name_of, split_entry
-from covocp.statement.statement import Statement, entry_names
+from covocp.statement.statement import Statement, error_names, error_size
 
 # Names of what the derived problem adds to the user's symbols.
 FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
@@ -100,7 +100,7 @@ def _by_name(what: str, weights: Expr, entries: Sequence[Any]) -> Any:
         return weights
     result: dict[str, Any] = {}
     word = what.replace("_", " ")
-    symbols, sizes = {e.name: e.symbol for e in entries}, {e.name: e.size for e in entries}
+    symbols, sizes = {e.name: e.symbol for e in entries}, {e.name: error_size(e) for e in entries}
     for key, value in weights.items():
         name = name_of(key, symbols, tuple(sizes), missing_ok=True, sizes=sizes)
         entry = split_entry(name)
@@ -282,7 +282,7 @@ def _inverse(density: Expr) -> Any:
 
 def _with_feedback(problem: Declarations, expansion: Expansion) -> tuple[Declarations, Any, Expansion]:
     """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
-    labels = entry_names(problem.augmented)
+    labels = error_names(problem.augmented)
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
     weight = _inverse(expansion.B)
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
@@ -296,7 +296,7 @@ def _with_free_gain(
     problem: Declarations, expansion: Expansion, gain: Gain, information: Expr
 ) -> tuple[Declarations, Any, Expansion]:
     """Add Xhat with its rate (A-32) and the entries of the gain, controls or constants that are optimised."""
-    labels = entry_names(problem.augmented)
+    labels = error_names(problem.augmented)
     size, rows = len(labels), sum(control.size for control in problem.controls)
     pattern, low, high, guess = _gain_entries(gain, (rows, size))
     where = np.flatnonzero(pattern.ravel(order="F"))

@@ -13,6 +13,7 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.base.short_repr import short_repr
@@ -20,15 +21,18 @@ from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.problem.rates import process_noise
-from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement, entry_names
+from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement, error_names, error_size
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stacked:
-    """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them."""
+    """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them.
+
+    geometry: of the states that are estimated, the first of all; unknowns: entries of these.
+    """
 
     inputs: tuple[Any, ...]
-    estimated: int
+    geometry: Geometry
     unknowns: int
     substitute: Callable[..., list[Any]]
     symbolic: type
@@ -87,9 +91,10 @@ def freeze(problem: Declarations) -> Statement:
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
         guesses={q.name: q.guess for q in _all(problem.states, problem.controls, problem.matrices)},
         scales={q.name: q.scale for q in _all(problem.states, problem.controls) if q.scale is not None},
-        augmented=entry_names(problem.augmented),
+        augmented=error_names(problem.augmented),
         coupled=coupled,
         symbolic=stacked.symbolic,
+        geometry=Geometry.of(problem.states),
         autonomous=not ca.depends_on(everything, t),
         noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
@@ -127,7 +132,7 @@ def _check_complete(problem: Declarations) -> None:
                 received="none of them",
                 remedy="declare a control by control()",
             )
-    entry_augmented = sum(entry.size for entry in problem.augmented)
+    entry_augmented = sum(error_size(entry) for entry in problem.augmented)
     covariance = next((m for m in problem.matrices if m.estimation), None)
     if covariance is not None and covariance.size != entry_augmented:
         raise ProblemError(
@@ -226,7 +231,7 @@ def _stack(problem: Declarations) -> Stacked:
 
     return Stacked(
         inputs=(x, u, e, t, duration, p),
-        estimated=sum(entry.size for entry in problem.states if entry.estimated),
+        geometry=Geometry.of(entry for entry in problem.states if entry.estimated),
         unknowns=sum(entry.size for entry in problem.unknowns),
         substitute=substitute,
         symbolic=symbolic,
@@ -268,7 +273,8 @@ def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple
 def _augmented_jacobian(stacked: Stacked, expression: Expr) -> Any:
     """Jacobian with respect to the augmented state (states, then unknowns)."""
     x, p = stacked.inputs[0], stacked.inputs[5]
-    by_state = ca.jacobian(expression, x)[:, : stacked.estimated]
+    rows = stacked.geometry.size
+    by_state = stacked.geometry.tangent_slope(x[:rows], ca.jacobian(expression, x)[:, :rows])
     return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
 
 
@@ -284,8 +290,11 @@ def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any
 
 def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measurement: Expr) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
-    constants = ca.DM.zeros(stacked.unknowns, 1)
-    drift = _augmented_jacobian(stacked, ca.vertcat(rates[: stacked.estimated], constants))
+    geometry, rows = stacked.geometry, stacked.geometry.size
+    velocity = geometry.velocity(stacked.inputs[0][:rows], rates[:rows])
+    drift = _augmented_jacobian(stacked, ca.vertcat(velocity, ca.DM.zeros(stacked.unknowns, 1)))
+    if not geometry.plain:
+        drift += ca.diagcat(geometry.drift(velocity), ca.DM(stacked.unknowns, stacked.unknowns))
     (noise,) = stacked.substitute(process_noise(problem))
     if measurement is None:
         return drift, noise, stacked.symbolic(*drift.shape)
@@ -337,6 +346,7 @@ def _blocks(problem: Declarations) -> tuple[Block, ...]:
                     estimation=isinstance(entry, Matrix) and entry.estimation,
                     backward=isinstance(entry, Matrix) and entry.backward is not None,
                     unit=entry.unit,
+                    tangent=getattr(entry, "tangent", 0),
                 )
             )
             offset += blocks[-1].length

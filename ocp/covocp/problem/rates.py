@@ -12,6 +12,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
 from covocp.problem.checks import as_expression, find_name
 from covocp.problem.declarations import Declarations, Dynamics
+from covocp.statement.statement import error_size
 
 
 def with_rate(own: Declarations, symbol: Given, rate: Given, noise: Given) -> Declarations:
@@ -51,5 +52,6 @@ def process_noise(own: Declarations) -> Any:
     blocks: list[Any] = []
     for entry in own.augmented:
         given = own.rates.get(entry.name)
-        blocks.append(ca.MX(entry.size, entry.size) if given is None or given.noise is None else given.noise)
+        size = error_size(entry)
+        blocks.append(ca.MX(size, size) if given is None or given.noise is None else given.noise)
     return ca.diagcat(*blocks)

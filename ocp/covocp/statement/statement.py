@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_indices, half_length
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
@@ -30,7 +31,10 @@ INPUTS = ("state", "control", "matrices", "time", "duration", "parameters")
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Where one of the user's symbols lies in its stacked vector."""
+    """Where one of the user's symbols lies in its stacked vector.
+
+    tangent: entries of its error where it is no vector (of an attitude: 3), else 0.
+    """
 
     name: str
     kind: Kind
@@ -41,6 +45,7 @@ class Block:
     estimation: bool = False
     backward: bool = False
     unit: str = ""
+    tangent: int = 0
 
     @property
     def length(self) -> int:
@@ -176,6 +181,7 @@ class Statement:
         measurements: where each of them lies among the measured values.
         information: (state, control, time, duration, parameters) -> the inverse densities that were stated as
             information, which may be zero but not negative; None where none was.
+        geometry: how the state moves where some of it is no vector.
         expression: a user's expression -> function of the six inputs.
     """
 
@@ -207,6 +213,7 @@ class Statement:
     autonomous: bool
     noise_varies: bool
     running_uses_matrices: bool
+    geometry: Geometry
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
 
@@ -315,8 +322,30 @@ class Statement:
 
 
 def entry_names(blocks: Iterable[Any]) -> tuple[str, ...]:
-    """Names of the entries of some stacked vectors."""
-    return tuple(block.name if block.size == 1 else f"{block.name}[{i}]" for block in blocks for i in range(block.size))
+    """Names of the entries of some stacked vectors; those of a quaternion are told from the rows of its error."""
+    return tuple(
+        name
+        for block in blocks
+        for name in (
+            [f"{block.name} q{i}" for i in range(block.size)]
+            if getattr(block, "tangent", 0)
+            else _numbered(block.name, block.size)
+        )
+    )
+
+
+def error_names(blocks: Iterable[Any]) -> tuple[str, ...]:
+    """Names of the rows of a covariance of some states: the entries of a vector, of others those of the tangent."""
+    return tuple(name for block in blocks for name in _numbered(block.name, error_size(block)))
+
+
+def error_size(block: Any) -> int:
+    """Rows of a covariance that a declaration or a block has."""
+    return int(getattr(block, "tangent", 0) or block.size)
+
+
+def _numbered(name: str, size: int) -> list[str]:
+    return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
 
 
 def half_names(name: str, labels: tuple[str, ...]) -> list[str]:

@@ -84,7 +84,7 @@ def implicit_step(statement: Statement, fractions: tuple[float, ...]) -> ca.Func
         right = at(point, node, one_sided(node) - node, *interval) + by_time * in_time
         right += sum((a * move for a, move in zip(coupling, moves, strict=True)), kind.zeros(nx)) / h
         moves.append(solve(right))
-    end = point + moves[-1]
+    end = statement.geometry.like(point + moves[-1], x)
     second, third = (sum(a * move for a, move in zip(row, moves[:5], strict=True)) for row in DENSE)
     inside = [(1 - c) * x + c * (end + (1 - c) * (second + c * third)) for c in fractions]
     return ca.Function("implicit_step", [x, *interval], [end, ca.horzcat(kind(nx, 0), *inside)])

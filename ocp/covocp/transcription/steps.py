@@ -31,7 +31,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, classical_step, gauss_matrix, hermite, riccati_step, simpson_weight
+from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, riccati_step, simpson_weight
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.rosenbrock import between, implicit_interval
@@ -69,7 +69,7 @@ def nominal_interval(statement: Statement, substeps: int, step: StepKind) -> ca.
     def rate(part: Interval, value: Expr, c: float) -> Expr:
         return ca.vertcat(*nominal(*part.at(c, value[:-1])))
 
-    states, cost = _classical_steps(rate, ca.vertcat(x, 0), interval, substeps)
+    states, cost = _classical_steps(statement, rate, ca.vertcat(x, 0), interval, substeps)
     return ca.Function("nominal_interval", [x, *interval], [states[:, -1], states, cost], _slopes(statement, 1))
 
 
@@ -93,7 +93,7 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
             cost = ca.if_else(first, _by_parts(statement)(*point)[0], cost)
         return ca.vertcat(moved, grown, cost)
 
-    stacked, cost = _classical_steps(rate, ca.vertcat(z, 0), interval, substeps)
+    stacked, cost = _classical_steps(statement, rate, ca.vertcat(z, 0), interval, substeps)
     if statement.behind:
         ends = ((0.0, z), (1.0, stacked[:, -1]))
         before, after = (_by_parts(statement)(*interval.at(c, v[:nx], v[nx:]))[1] for c, v in ends)
@@ -102,13 +102,17 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
 
 
 def _classical_steps(
-    rate: Callable[[Interval, Expr, float], Expr], start: Expr, interval: Interval, substeps: int
+    statement: Statement,
+    rate: Callable[[Interval, Expr, float], Expr],
+    start: Expr,
+    interval: Interval,
+    substeps: int,
 ) -> tuple[Expr, Expr]:
     """Classical Runge-Kutta over the parts of an interval: values at their ends, and the last entry, the cost."""
     values = [start]
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
-        values.append(classical_step(partial(rate, part), values[-1], interval.h / substeps))
+        values.append(statement.geometry.step(partial(rate, part), values[-1], interval.h / substeps))
     stacked: Expr = ca.horzcat(*values[1:])
     return stacked[:-1, :], stacked[-1, -1]
 
@@ -166,7 +170,7 @@ def _strang_parts(statement: Statement, index: int) -> ca.Function:
         moved, drift = _slope(statement, *interval.at(c, x)), form(*interval.at(c, x))[0]
         return ca.vertcat(moved, ca.vec(drift @ transition))
 
-    after = classical_step(rate, ca.vertcat(xa, ca.vec(ca.DM.eye(size))), interval.h)
+    after = statement.geometry.step(rate, ca.vertcat(xa, ca.vec(ca.DM.eye(size))), interval.h)
     ends = [form(*interval.at(c, x))[1:] for c, x in ((0.0, xa), (1.0, xb))]
     halves = [interval.h / 2 * entry for end in ends for entry in end]
     dense = [ca.densify(entry) for entry in (ca.reshape(after[statement.nx :], size, size), *halves)]

@@ -1,0 +1,57 @@
+"""The chart of attitudes: unit quaternions, whose tangent is a rotation vector in body axes.
+
+q = (w, v) stands for C(q) as in `blocks.so3`, of any length: q and every multiple of it are the same attitude. A
+tangent d moves it to the quaternion of e^{-d^x} C, its rate is that of dC/dt = -omega^x C, and two attitudes that move
+alike differ by d with dd/dt = -omega x d + domega (their error in body axes).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+
+from covocp.base.expressions import Expr
+from covocp.blocks import so3
+from covocp.base.geometry import Chart
+
+# Rows of the tangent of an attitude.
+AXES = 3
+
+
+@lru_cache(maxsize=1)
+def rotation_chart() -> Chart:
+    """The chart of attitudes; one object, so that two problems have the same."""
+    z, base, rate = (ca.SX.sym(name, 4) for name in ("z", "base", "rate"))
+    d, v = ca.SX.sym("d", AXES), ca.SX.sym("v", AXES)
+    moved = so3.quaternion_step(z, d)
+    velocity = 2 * so3.quaternion_product(conjugate(z), rate)[1:] / ca.sumsqr(z)
+    # with 1/12 for the coefficient of the last term a step errs by O(h^5), as its method [section 2, equation 6]
+    course = v + ca.cross(d, v) / 2 + ca.cross(d, ca.cross(d, v)) / 12
+    functions = {
+        "move": ([z, d], moved),
+        "difference": ([z, base], so3.log(rotation(z) @ rotation(base).T)),
+        "basis": ([z], ca.substitute(ca.jacobian(moved, d), d, ca.DM.zeros(AXES))),
+        "velocity": ([z, rate], velocity),
+        "course": ([d, v], course),
+        "drift": ([v], -so3.cross(v)),
+        "like": ([z, base], z * ca.sqrt(ca.sumsqr(base) / ca.sumsqr(z))),
+    }
+    made = {name: ca.Function(name, inputs, [ca.densify(output)]) for name, (inputs, output) in functions.items()}
+    return Chart(kind="attitude", size=4, tangent=AXES, origin=(1.0, 0.0, 0.0, 0.0), **made)
+
+
+def rotation(quaternion: Expr) -> Any:
+    """C of a quaternion of any length, (3, 3)."""
+    return so3.from_quaternion(quaternion) / ca.sumsqr(quaternion)
+
+
+def conjugate(quaternion: Expr) -> Any:
+    """The quaternion of the attitude turned back."""
+    return ca.vertcat(quaternion[0], -quaternion[1:])
+
+
+def turning(quaternion: Expr, rate: Expr) -> Any:
+    """dq/dt = q (x) (0, omega) / 2 of a body with angular velocity omega in body axes."""
+    return so3.quaternion_product(quaternion, ca.vertcat(0, rate)) / 2
