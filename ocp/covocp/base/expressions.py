@@ -9,3 +9,8 @@ from typing import Any, TypeAlias
 Expr: TypeAlias = Any
 # What a user gave: of any type until it is checked, and then refused or read.
 Given: TypeAlias = Any
+
+
+def symbol_of(key: Given) -> Any:
+    """The symbol of what stands for a state that is no vector, such as an attitude; anything else as it is."""
+    return getattr(key, "quaternion", key)

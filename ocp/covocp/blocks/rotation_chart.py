@@ -11,10 +11,12 @@ from functools import lru_cache
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.blocks import so3
 from covocp.base.geometry import Chart
+from covocp.base.matrices import Array
 
 # Rows of the tangent of an attitude.
 AXES = 3
@@ -40,6 +42,18 @@ def rotation_chart() -> Chart:
     }
     made = {name: ca.Function(name, inputs, [ca.densify(output)]) for name, (inputs, output) in functions.items()}
     return Chart(kind="attitude", size=4, tangent=AXES, origin=(1.0, 0.0, 0.0, 0.0), **made)
+
+
+def rotation_vectors(quaternions: Array) -> Array:
+    """Rotation vectors of a course of quaternions without jumps of sign, (K, 4): (K, 3) [rad].
+
+    They run on through half a turn, up to a whole one, unlike those of `so3.log`.
+    """
+    q = np.atleast_2d(quaternions)
+    q = -q if q.shape[0] and q[0, 0] < 0.0 else q
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(sine, q[:, 0])
+    return np.asarray(q[:, 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)[:, None])
 
 
 def rotation(quaternion: Expr) -> Any:

@@ -15,7 +15,7 @@ from covocp.base.threads import cached
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
-from covocp.statement.statement import Block
+from covocp.statement.statement import Block, error_size
 
 # Curves are sampled at the nodes, on coarser meshes at least this often.
 SAMPLES = 200
@@ -178,17 +178,18 @@ class Drawn:
         count, width = solution.t.size, sum(b.size for b in controls)
         if isinstance(key, str):
             block = solution.block(key)
-            by_state, by_control = np.zeros((block.size, len(augmented))), np.zeros((block.size, width))
+            rows = error_size(block)
+            by_state, by_control = np.zeros((rows, len(augmented))), np.zeros((rows, width))
             if block.kind == "control":
                 by_control[:, block.span] = np.eye(block.size)
             else:
-                by_state[:, self.rows(key)] = np.eye(block.size)
+                by_state[:, self.rows(key)] = np.eye(rows)
             return tuple(np.tile(v, (count, 1, 1)) for v in (by_state, by_control))  # type: ignore[return-value]
-        symbols = solution.extremal.statement.symbols  # not known where the solution was read from a file alone
+        statement = solution.extremal.statement  # not known where the solution was read from a file alone
         states = dict.fromkeys(label.split("[")[0] for label in augmented)
         results = []
         for names, size in ((states, len(augmented)), ([b.name for b in controls], width)):
-            slope = ca.densify(ca.horzcat(*(ca.jacobian(key, symbols[name]) for name in names)))
+            slope = ca.densify(ca.horzcat(*(statement.slope(key, name) for name in names)))
             results.append(solution[slope].reshape(count, key.shape[0] * key.shape[1], size))
         return results[0], results[1]
 

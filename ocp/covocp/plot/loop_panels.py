@@ -10,7 +10,7 @@ from covocp.base.expressions import Given
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, ratio_unit, shortened, unit_of
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
-from covocp.statement.statement import Block, entry_names
+from covocp.statement.statement import Block, entry_names, error_names
 
 # What may be drawn beside the symbols of the problem: root mean squares, gains of feedback and filter, covariances.
 RMS, FILTER = "rms", "K"
@@ -38,7 +38,7 @@ def rms(drawn: Sequence[Drawn], key: Given, blocks: Mapping[str, Block], units: 
     name = key if isinstance(key, str) else shortened(key)
     block = block_of(key, blocks.values()) if isinstance(key, str) else None
     kind = block.kind if block is not None else "state"
-    entries = entry_names((_as_block(name, key) if block is None else block,))
+    entries = error_names((_as_block(name, key) if block is None else block,))
     closed = any(d.solution.loop is not None for d in drawn)
     shown: tuple[int, ...] = (0,)
     if closed and kind == "unknown":

@@ -13,6 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
+from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
@@ -287,8 +288,22 @@ def _expression(drawn: list[Drawn], key: Given) -> list[Panel]:
     return [Panel(label=shortened(key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
 
 
+def _attitude(drawn: list[Drawn], block: Block) -> list[Panel]:
+    """The rotation vector of an attitude and its length, the angle."""
+    curves = []
+    for d in drawn:
+        if d.knows(block.name):
+            vectors = np.rad2deg(rotation_vectors(d.sample[block.name]))
+            values = np.column_stack([vectors, np.linalg.norm(vectors, axis=1)])
+            curves += [Curve(t=d.t, y=column, order=d.order, entry=i) for i, column in enumerate(values.T)]
+    entries = (*(f"about {axis}" for axis in "xyz"), "angle")
+    return [Panel(label=f"{block.name} [°]", entries=entries, curves=tuple(curves))]
+
+
 def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[Panel]:
     """A state with its band and target, a control, an unknown or a parameter with its band."""
+    if block.tangent:
+        return _attitude(drawn, block)
     curves = []
     for d in drawn:
         if not d.knows(block.name):

@@ -98,7 +98,7 @@ def with_attitude(
         symbol=symbol,
         size=chart.size,
         where=where,
-        unit="",
+        unit="rad",
         initial=first,
         final=free,
         lower=np.full(chart.size, -np.inf),

@@ -12,7 +12,7 @@ from covocp.base.arguments import is_number
 from covocp.base.arguments import is_whole as is_whole
 from covocp.base.checks import bound_columns, column, is_symbolic, shape_error
 from covocp.base.errors import ProblemError, kind_and_name, shown, spelling
-from covocp.base.expressions import Given
+from covocp.base.expressions import Given, symbol_of
 from covocp.base.matrices import Array, real_numbers
 
 # Components of a symbol that still make a matrix that fits into a memory.
@@ -83,6 +83,7 @@ def check_dynamics(entries: Iterable[Any], rates: Mapping[str, Any]) -> None:
 
 def find_name(symbol: Given, what: str, declared: list[Any], allowed: tuple[Any, ...]) -> str:
     """Name of what was declared, from its symbol or name."""
+    symbol = symbol_of(symbol)
     for entry in declared:
         own = getattr(entry, "symbol", None)
         if own is None:

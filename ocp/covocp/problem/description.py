@@ -88,7 +88,7 @@ def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
     """All expressions of a problem by kind and name."""
     for state in problem.states:
         yield ("initial", state.name), state.initial
-        yield ("final", state.name), state.final
+        yield ("final", state.name), state.final if state.target is None else state.target
         yield ("variance", state.name), state.variance
     for unknown in problem.unknowns:
         yield ("variance", unknown.name), unknown.variance
@@ -168,9 +168,16 @@ def _states(problem: Problem, written: _Written) -> Section:
     rows = []
     for q in problem.states:
         initial, final = _free(written("initial", q.name)), _free(written("final", q.name))
-        columns = (entry_names((q,)), [q.unit] * q.size, initial, final, _ranges(q.lower, q.upper))
-        rows += _shortened([list(row) for row in zip(*columns, written.diagonal("variance", q.name), strict=True)])
+        units = [q.unit if q.chart is None else ""] * q.size
+        columns = (entry_names((q,)), units, initial, final, _ranges(q.lower, q.upper))
+        variance = _filled(written.diagonal("variance", q.name), q.size)
+        rows += _shortened([list(row) for row in zip(*columns, variance, strict=True)])
     return _table(["state", "unit", "at 0", "at T", "bounds", "variance at 0"], rows)
+
+
+def _filled(cells: list[str], size: int) -> list[str]:
+    """Cells of the errors of a state, which has more entries than errors where it is no vector."""
+    return [*cells, *[""] * (size - len(cells))]
 
 
 def _unknowns(problem: Problem, written: _Written) -> Section:
@@ -216,7 +223,11 @@ def _rates(problem: Problem, written: _Written) -> Section:
         given = problem.rates.get(state.name)
         rates = ["(not given yet)"] * state.size if given is None else written("rate", state.name)
         noise = [""] * state.size if given is None or given.noise is None else written.diagonal("noise", state.name)
-        columns = ([f"d {name}/dt" for name in entry_names((state,))], [f"= {rate}" for rate in rates], noise)
+        columns = (
+            [f"d {name}/dt" for name in entry_names((state,))],
+            [f"= {rate}" for rate in rates],
+            _filled(noise, state.size),
+        )
         rows += _shortened([list(row) for row in zip(*columns, strict=True)])
     for matrix in problem.matrices:
         if matrix.estimation:

@@ -9,7 +9,7 @@ import casadi as ca
 
 from covocp.base.checks import caller, is_symbolic
 from covocp.base.errors import ProblemError
-from covocp.base.expressions import Given
+from covocp.base.expressions import Given, symbol_of
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
 from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
@@ -92,6 +92,7 @@ class EstimationCovariance:
         if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
             row = self.labels.index(key)
             return slice(row, row + 1)
+        key = symbol_of(key)
         offset, jacobians = 0, []
         for entry in self._entries:
             span = slice(offset, offset + error_size(entry))

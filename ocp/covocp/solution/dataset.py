@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
+from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.solution.solution import Solution
 
 
@@ -14,7 +17,8 @@ def to_xarray(solution: Solution) -> Any:
 
     States, controls, matrices and constants under their names; their costates as "costate_<name>", standard deviations
     of the estimates as "deviation_<name>". The entries of vectors run along "<name>_entry", the rows and columns of
-    matrices, labelled by what they belong to, along "<name>_row" and "<name>_column".
+    matrices, labelled by what they belong to, along "<name>_row" and "<name>_column". An attitude also has its rotation
+    vector as "vector_<name>" and the length of that as "angle_<name>" [rad]; its deviation is that of its three errors.
 
     Args:
         solution: what to convert.
@@ -47,6 +51,11 @@ def to_xarray(solution: Solution) -> Any:
         variables[name] = (dimensions, values[0]) if constant else (("time", *dimensions), values)
         if block.kind in ("state", "matrix"):
             variables[f"costate_{name}"] = (("time", *dimensions), solution.costate(name))
+        if block.tangent:
+            vectors, dimensions = rotation_vectors(values), (f"{name}_axis",)
+            coordinates[f"{name}_axis"] = ["x", "y", "z"]
+            variables[f"vector_{name}"] = (("time", *dimensions), vectors)
+            variables[f"angle_{name}"] = (("time",), np.linalg.norm(vectors, axis=1))
         if estimated and block.kind in ("state", "unknown"):
             variables[f"deviation_{name}"] = (("time", *dimensions), solution.deviation(name))
     return xarray.Dataset(variables, coords=coordinates, attrs=_attributes(solution))

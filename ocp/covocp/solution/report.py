@@ -12,7 +12,8 @@ from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.origin import Classical
-from covocp.statement.statement import Block, entry_names
+from covocp.blocks.rotation_chart import rotation_vectors
+from covocp.statement.statement import Block, entry_names, error_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -153,7 +154,7 @@ def _left_out(solution: Solution) -> Section:
     if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
         return []
     share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
-    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in entry_names((b,))]
+    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in error_names((b,))]
     spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
@@ -190,20 +191,31 @@ def _states(solution: Solution) -> Section:
     target = solution.targets
     bound = ~np.isnan(target) if solution.optimised else np.zeros(target.size, dtype=bool)
     columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
-    rows = [
-        [name, number(x), number(goal), number(multiplier if fixed else None)]
-        for name, x, goal, multiplier, fixed in zip(
-            entry_names(blocks), solution.trajectory.x[-1], target, solution.multipliers.final, bound, strict=True
-        )
-    ]
-    if solution.loop is not None:  # a gain that is constant is a state, which has its own table
-        own = [b.name != GAIN for b in blocks for _ in range(b.size)]
-        rows = [row for row, kept in zip(rows, own, strict=True) if kept]
-    elif _estimated(solution):
+    deviations = solution.loop is None and _estimated(solution)
+    if deviations:
         columns.append("standard deviation")
-        deviations = np.concatenate([np.atleast_1d(solution.deviation(b.name)[-1]) for b in blocks])
-        rows = [[*row, number(value)] for row, value in zip(rows, deviations, strict=True)]
+    rows = []
+    for b in blocks:
+        if solution.loop is not None and b.name == GAIN:  # a gain that is constant is a state, which has its own table
+            continue
+        own = _attitude(solution, b) if b.tangent else []
+        for k in range(0 if b.tangent else b.size):
+            i = b.offset + k
+            multiplier = number(solution.multipliers.final[i] if bound[i] else None)
+            own.append([entry_names((b,))[k], number(solution.trajectory.x[-1, i]), number(target[i]), multiplier])
+        if deviations:
+            unit = np.rad2deg(1.0) if b.tangent else 1.0
+            spread = [number(v) for v in unit * np.atleast_1d(solution.deviation(b.name)[-1])]
+            own = [[*row, *cell] for row, cell in zip(own, [[v] for v in spread] + [["-"]], strict=False)]
+        rows += own
     return _table(columns, rows)
+
+
+def _attitude(solution: Solution, block: Block) -> list[list[str]]:
+    """An attitude at the end as rotation vector and angle; what it has to reach is among the constraints."""
+    vector = np.rad2deg(rotation_vectors(solution.values[block.name])[-1])
+    named = zip([*(f"about {axis}" for axis in "xyz"), "angle"], [*vector, np.linalg.norm(vector)], strict=True)
+    return [[f"{block.name}, {name} [deg]", number(float(value)), "-", "-"] for name, value in named]
 
 
 def _unknowns(solution: Solution) -> Section:

@@ -32,7 +32,7 @@ from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
-from covocp.statement.statement import Block, Statement, entry_names
+from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -264,6 +264,8 @@ class Solution:
                 result[b.name] = unpack(e[:, b.span], b.size)
                 continue
             values = sources[b.kind][:, b.span] if b.kind in sources else np.tile(self.parameters[b.span], (t.size, 1))
+            if b.tangent:  # of unit length, which interpolation keeps up to its error
+                values = values / np.linalg.norm(values, axis=1, keepdims=True)
             result[b.name] = values[:, 0] if b.size == 1 else values
         return result
 
@@ -419,10 +421,13 @@ class Solution:
 
     def _augmented_span(self, key: Given) -> slice:
         both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
-        candidates = tuple(q for q in both if entry_names((q,))[0] in self.augmented)  # constants of a gain have no row
-        offsets = accumulate((q.size for q in candidates), initial=0)
-        rows = [replace(q, kind="state", offset=offset) for q, offset in zip(candidates, offsets, strict=False)]
-        found = block_of(self._name(key, candidates), rows)
+        own = [q for q in both if error_names((q,))[0] in self.augmented]  # constants of a gain have no row
+        offsets = accumulate((error_size(q) for q in own), initial=0)
+        rows = tuple(
+            replace(q, kind="state", size=error_size(q), offset=offset, tangent=0)
+            for q, offset in zip(own, offsets, strict=False)
+        )
+        found = block_of(self._name(key, rows), rows)
         assert found is not None
         return found.span
 

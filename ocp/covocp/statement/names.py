@@ -12,7 +12,7 @@ import numpy as np
 
 from covocp.base.checks import bound_columns, column
 from covocp.base.errors import ProblemError, spelling
-from covocp.base.expressions import Given
+from covocp.base.expressions import Given, symbol_of
 from covocp.base.matrices import Array, half_length, unpack_indices
 from covocp.statement.statement import Block, Statement
 
@@ -42,6 +42,7 @@ def name_of(
     """
     if isinstance(key, str) and key in names:
         return key
+    key = symbol_of(key)
     if isinstance(key, ca.MX):
         for name, symbol in symbols.items():
             if key.is_symbolic() and ca.is_equal(key, symbol) and name in names and key.shape == symbol.shape:

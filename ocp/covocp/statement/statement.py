@@ -295,6 +295,13 @@ class Statement:
         lower, upper = self.state_bounds
         return [int(i) for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))]
 
+    def slope(self, expression: Expr, name: str) -> Any:
+        """Jacobian of an expression of the user's symbols by one of them, by the tangent of what is no vector."""
+        charts = {block.name: part.chart for block, part in zip(self.states, self.geometry.parts, strict=True)}
+        chart, symbol = charts.get(name), self.symbols[name]
+        by_symbol = ca.jacobian(expression, symbol)
+        return by_symbol if chart is None else by_symbol @ chart.basis(symbol)
+
     @property
     def np(self) -> int:
         """Entries of the parameters (known, then means of the unknowns)."""
