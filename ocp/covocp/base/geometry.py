@@ -82,6 +82,28 @@ class Geometry:
             row, error = row + entry.size, error + count
         return Geometry(tuple(parts))
 
+    @staticmethod
+    def stacked(*groups: Geometry | int) -> Geometry:
+        """Several, one below the other; a number stands for a vector of that many entries."""
+        parts: list[Part] = []
+        row = error = 0
+        for group in groups:
+            own = Geometry.vector(group) if isinstance(group, int) else group
+            for part in own.parts:
+                rows, tangent = (slice(s.start + k, s.stop + k) for s, k in ((part.rows, row), (part.tangent, error)))
+                parts.append(Part(rows, tangent, part.chart))
+            row, error = row + own.size, error + own.tangent
+        return Geometry(tuple(parts))
+
+    @staticmethod
+    def vector(size: int) -> Geometry:
+        """Of a vector."""
+        return Geometry((Part(slice(0, size), slice(0, size), None),) if size else ())
+
+    def first(self, entries: int) -> Geometry:
+        """Of the first entries of the state."""
+        return Geometry(tuple(part for part in self.parts if part.rows.stop <= entries))
+
     @property
     def plain(self) -> bool:
         """Whether the whole state is a vector."""

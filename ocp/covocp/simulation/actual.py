@@ -16,6 +16,7 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.problem.builder import Problem
@@ -42,11 +43,11 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class System:
-    """A system with its statistics. n: rows of the augmented state, of which `states` move; m: controls fed back.
+    """A system with its statistics. n: rows of the augmented state's error, of which `states` move; m: controls fed back.
 
-    start: mean of the augmented state at time zero, (n,).
+    start: mean of the augmented state at time zero; (n,) where all of it are vectors.
     variance: covariance of its deviation there, (n, n).
-    linear: (state, control, time, duration, parameters) -> rate of the augmented state (n,), F (n, n), G (n, m),
+    linear: (state, control, time, duration, parameters) -> velocity of the augmented state (n,), F (n, n), G (n, m),
         process noise Q (n, n), measured values h (r,), M (r, n), their slope by the control (r, m), noise U (r, r).
     """
 
@@ -67,7 +68,26 @@ class System:
     @property
     def size(self) -> int:
         """Rows of the augmented state."""
-        return self.start.size
+        return int(self.variance.shape[0])
+
+    @property
+    def entries(self) -> int:
+        """Entries of the part of the augmented state that moves; `states` where all of it are vectors."""
+        return self.start.size - self.unknowns
+
+    @property
+    def geometry(self) -> Geometry:
+        """How the augmented state moves by its error."""
+        return self.statement.augmented_geometry
+
+    @property
+    def motion(self) -> Geometry:
+        """The same of the part that moves."""
+        return self.geometry.first(self.entries)
+
+    def error(self, start: Array) -> Array:
+        """By how much an augmented state differs from the mean at time zero, (n,)."""
+        return self.geometry.differences(start[None], self.start[None])[0]
 
     @property
     def measured(self) -> int:
@@ -157,19 +177,17 @@ def _estimation(statement: Statement) -> Block | None:
 
 def _augmented(statement: Statement, state: Array, parameters: Array) -> Array:
     """Augmented state from the whole state and the parameters."""
-    unknowns = sum(b.size for b in statement.of_kind("unknown"))
-    states = len(statement.augmented) - unknowns
-    return np.concatenate([state[:states], parameters[parameters.size - unknowns :]])
+    entries = statement.augmented_geometry.size - statement.unknowns
+    return np.concatenate([state[:entries], parameters[parameters.size - statement.unknowns :]])
 
 
 def _system(statement: Statement, parameters: Array, *, start: Array, variance: Array, fed_back: int) -> System:
-    unknowns = sum(b.size for b in statement.of_kind("unknown"))
     return System(
         statement=statement,
         parameters=parameters,
         start=start,
         variance=variance,
-        states=start.size - unknowns,
+        states=len(statement.augmented) - statement.unknowns,
         fed_back=fed_back,
         linear=_linear(statement, fed_back),
     )
@@ -190,8 +208,11 @@ def _linear(statement: Statement, fed_back: int) -> ca.Function:
     sizes = (statement.nx, statement.nu, 1, 1, statement.np)
     a = [symbolic.sym(name, k) for name, k in zip(("x", "u", "t", "T", "p"), sizes, strict=True)]
     n = len(statement.augmented)
-    states = n - sum(b.size for b in statement.of_kind("unknown"))
-    rate = ca.vertcat(*ca.vertsplit(statement.nominal(*a)[0])[:states], symbolic.zeros(n - states, 1))
+    geometry = statement.augmented_geometry
+    entries = geometry.size - statement.unknowns
+    state, moved = (ca.vertsplit(v, [0, entries, statement.nx])[0] for v in (a[0], statement.nominal(*a)[0]))
+    still = symbolic.zeros(statement.unknowns)
+    rate = geometry.velocity(ca.vertcat(state, still), ca.vertcat(moved, still))
     F, Q, _ = form(*a)
     measured: tuple[Any, ...] = (symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0))
     if statement.measurement is not None:
@@ -250,7 +271,7 @@ def _statement_of(truth: Declarations) -> Statement:
 def _check_symbols(design: System, truth: Statement) -> None:
     """Filter and feedback of the design must fit the truth."""
     # Gains that were optimised are states or controls of the design, after those of the actual system.
-    rows = {"state": design.states, "control": design.fed_back or design.statement.nu}
+    rows = {"state": design.entries, "control": design.fed_back or design.statement.nu}
     for kind, what in (("state", "states"), ("unknown", "unknowns"), ("control", "controls")):
         blocks = [b for b in design.statement.blocks if b.kind == kind]
         own = [(b.name, b.size) for b in blocks if b.offset < rows.get(kind, b.offset + 1)]

@@ -104,7 +104,7 @@ class _Simulation:
             np.random.Generator(np.random.PCG64(np.random.SeedSequence(plan.seed, spawn_key=(i, *kind))))
             for i in range(first, last)
         ]
-        n, states = plan.size, plan.states
+        n, states, entries = plan.size, plan.states, plan.motion.size
         drawn = np.zeros((n, width))
         for i, stream in enumerate(self.streams):
             drawn[:, i] = stream.standard_normal(n)
@@ -115,7 +115,7 @@ class _Simulation:
                     start[i] += plan.spread[i, j] * drawn[j]
         z = self.step.inputs[0]
         z[:] = plan.start[:, None]
-        z[:states] += start[:states]
+        z[:entries] = plan.motion.moved(z[:entries].T, start[:states].T).T
         self.own = plan.unknowns[:, None] + start[states:]
         self.step.inputs[2][:] = self.own
         self.observe.inputs[1][:] = self.own

@@ -66,7 +66,7 @@ class Rows:
 
 def counted_rows(design: System) -> Rows:
     """The inequalities of a design's problem that its runs can violate."""
-    return _counted(design.statement, design.states, design.fed_back)
+    return _counted(design.statement, design.entries, design.fed_back)
 
 
 @lru_cache(maxsize=8)
@@ -130,7 +130,7 @@ def violations(run: Run, z: Given, fed: Given, c: dict[str, Any]) -> Any:
     chosen = counted_rows(design)
     if not chosen.rows:
         return run.symbolic(0, 1)
-    state = ca.vertcat(z[run.spans["x"]], part(c["x"], design.states))
+    state = ca.vertcat(z[run.spans["x"]], part(c["x"], design.entries))
     u = ca.vertcat(fed, part(c["u"], design.fed_back))
     known = ca.DM(solution.parameters[: solution.parameters.size - design.unknowns])
     matrices = c["e"] if c["e"].shape[0] else run.symbolic.zeros(design.statement.ne)  # no constraint uses them
@@ -187,7 +187,9 @@ def _linearised(st: Statement, design: System) -> ca.Function:
     values = counted_rows(design).function(*a)
     unknowns = [k for b in st.of_kind("unknown") for k in range(b.span.start, b.span.stop)]
     of_state, of_control, of_parameters = (ca.jacobian(values, a[i]) for i in (0, 1, 5))
-    slopes = ca.horzcat(of_state[:, : design.states], of_parameters[:, unknowns])
+    whole = ca.vertcat(a[0][: design.entries], symbolic.zeros(design.unknowns))
+    slopes = ca.horzcat(of_state[:, : design.entries], of_parameters[:, unknowns])
+    slopes = design.geometry.tangent_slope(whole, slopes)
     fed = symbolic(values.shape[0], design.size)
     if st.loop is not None:
         fed = -of_control[:, : design.fed_back] @ st.loop.gain(*a)

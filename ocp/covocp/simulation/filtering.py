@@ -51,7 +51,9 @@ def corrected(run: Run, z: Given, c: dict[str, Any], noise: Given, h: Given, *, 
     own = system_at(run, design, estimate_of(run, z), u, c)
     covariance = unpack_symbolic(z[run.spans["E"]], design.size)
     law = updating("sequential", "raise")
-    estimate, spread = apply(law, y, covariance, reading - own.h + own.M @ y, own.M, 2 / h * own.U)
+    none = run.symbolic.zeros(design.size)
+    change, spread = apply(law, none, covariance, reading - own.h, own.M, 2 / h * own.U)
+    estimate = design.geometry.move(y, change)
     return replaced(replaced(z, run.spans["estimate"], estimate), run.spans["E"], pack_symbolic(spread))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.simulation.constraints import Place, counted_rows
@@ -27,11 +28,11 @@ class Plan:
     finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
     steps: coefficients, a row for each step; times: at which they start [s].
     stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
-    start: state of a run that starts at its mean; unknowns: their mean.
+    start: state of a run that starts at its mean; unknowns: their mean; motion: how x moves.
     spread: factor of the covariance of the start, (n, n).
     domain: largest deviations and estimates that count as inside, (2n,).
     spans: where the parts of a run's state lie.
-    noises: normal numbers that a step takes; states: rows of x; fed_back: controls m.
+    noises: normal numbers that a step takes; states: rows of its error; fed_back: controls m.
     seed: of all runs; pilot: whether these runs are for choosing the step, with random numbers of their own.
     pairing: of which two noises of its halves each noise of a step is the sum, (noises, 2); None: it is none.
     paths: number of runs whose histories are kept.
@@ -48,6 +49,7 @@ class Plan:
     stored_coefficients: Array
     start: Array
     unknowns: Array
+    motion: Geometry
     spread: Array
     domain: Array
     spans: Mapping[str, slice]
@@ -111,7 +113,8 @@ def make_plan(
         stored=np.searchsorted(grid.t, stored),
         stored_coefficients=np.vstack([before, after[-1:]])[np.searchsorted(grid.t, stored)],
         start=start_of(run),
-        unknowns=setting.actual.start[design.states :],
+        unknowns=setting.actual.start[design.entries :],
+        motion=design.motion,
         spread=np.asarray(factor(ca.DM(setting.actual.variance)).full()),
         # An unknown is what it is: only its estimate can run away.
         domain=np.concatenate([setting.domain[: design.states], np.full(design.unknowns, np.inf), setting.domain]),

@@ -97,7 +97,7 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     fine = grid.divided(np.minimum(grid.parts(STEP_PER_RATE / np.maximum(rates, 1e-300)), MOST_PARTS))
     kept = set(np.flatnonzero(np.isin(fine.t, grid.t)).tolist())
     sides = [_evaluate(solution, joint, fine.t[:-1] + c * fine.h, fine.interval, actual, n) for c in (0.0, 0.5, 1.0)]
-    mean = np.concatenate([actual.start - design.start, np.zeros(n)])
+    mean = np.concatenate([design.error(actual.start), np.zeros(n)])
     covariance = np.zeros((2 * n, 2 * n))
     covariance[:n, :n] = actual.variance
     means, covariances = [mean], [covariance]
@@ -134,7 +134,7 @@ def _joint(design: System, actual: System) -> ca.Function:
     own = c["F"] - K @ c["M"] - (c["G"] - K @ c["Hu"]) @ C
     drift = ca.blockcat([[F, -G @ C], [K @ M, own - K @ Hu @ C]])
     noise = ca.diagcat(Q, K @ U @ K.T)
-    known = ca.DM(np.concatenate([np.zeros(design.states), (actual.start - design.start)[design.states :]]))
+    known = ca.DM(np.concatenate([np.zeros(design.states), design.error(actual.start)[design.states :]]))
     offset = ca.vertcat(f - rate - F @ known, K @ (h - c["h"] - M @ known))
     return ca.Function("joint", a, [ca.densify(value) for value in (drift, noise, offset)])
 

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Given
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_length
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import Linearised, System
@@ -107,6 +108,14 @@ class Run:
         """The part of the state that has a rate."""
         return slice(0, self.spans["cost"].stop)
 
+    @property
+    def geometry(self) -> Geometry:
+        """How that part moves."""
+        design = self.setting.design
+        estimate: Geometry | int = design.geometry if self.setting.filter == "extended" else design.size
+        rest = self.moving.stop - self.spans["estimate"].stop
+        return Geometry.stacked(design.motion, estimate, rest)
+
 
 def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) -> Run:
     """Symbols of a run; watched: number of inequalities along its path."""
@@ -115,8 +124,8 @@ def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) 
     symbolic: Any = ca.SX if scalar else ca.MX
     noise = actual.linear.sparsity_out("Q")
     sizes = {
-        "x": design.states,
-        "estimate": design.size,
+        "x": design.entries,
+        "estimate": design.start.size if setting.filter == "extended" else design.size,
         "E": half_length(design.size) if setting.filter == "extended" else 0,
         "measured": design.measured if setting.flown else 0,
         "cost": int(setting.costs),
@@ -155,7 +164,7 @@ def system_at(
     """What `System.model` gives for a state and unknowns; rows that no run has are those of the nominal."""
     x, unknowns = augmented
     design, parameters = run.setting.design, system.parameters
-    state = part(ca.vertcat(x, part(c["x"], design.states)), 0, system.statement.nx)
+    state = part(ca.vertcat(x, part(c["x"], design.entries)), 0, system.statement.nx)
     known = ca.DM(parameters[: parameters.size - system.unknowns])
     time = c["t"] if t is None else t
     duration = run.setting.solution.duration
@@ -176,19 +185,22 @@ def replaced(column: Given, rows: slice, values: Given) -> Any:
 def estimated_deviation(run: Run, z: Given, c: dict[str, Any]) -> Any:
     """The estimate of the deviation from the nominal, (n,)."""
     estimate = z[run.spans["estimate"]]
-    return estimate - nominal_column(run, c) if run.setting.filter == "extended" else estimate
+    if run.setting.filter != "extended":
+        return estimate
+    return run.setting.design.geometry.difference(estimate, nominal_column(run, c))
 
 
 def nominal_column(run: Run, c: dict[str, Any]) -> Any:
-    """The augmented state of the nominal, (n,)."""
+    """The augmented state of the nominal."""
     design = run.setting.design
-    return ca.vertcat(part(c["x"], 0, design.states), ca.DM(design.start[design.states :]))
+    return ca.vertcat(part(c["x"], 0, design.entries), ca.DM(design.start[design.entries :]))
 
 
 def deviations(run: Run, z: Given, c: dict[str, Any]) -> Any:
     """Deviation from the nominal and the filter's estimate of it, (2n,)."""
     actual = ca.vertcat(z[run.spans["x"]], run.own)
-    return ca.densify(ca.vertcat(actual - nominal_column(run, c), estimated_deviation(run, z, c)))
+    moved = run.setting.design.geometry.difference(actual, nominal_column(run, c))
+    return ca.densify(ca.vertcat(moved, estimated_deviation(run, z, c)))
 
 
 def control_of(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
@@ -206,5 +218,5 @@ def control_of(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
 
 def estimate_of(run: Run, z: Given) -> tuple[Any, Any]:
     """State and unknowns as the extended filter has them."""
-    y, states = z[run.spans["estimate"]], run.setting.design.states
-    return part(y, 0, states), part(y, states)
+    y, entries = z[run.spans["estimate"]], run.setting.design.entries
+    return part(y, 0, entries), part(y, entries)

@@ -38,7 +38,7 @@ def start_of(run: Run) -> Array:
     """State of a run that starts at its mean, its filter at the mean of the design."""
     design, solution = run.setting.design, run.setting.solution
     z = np.zeros(run.z.shape[0])
-    z[run.spans["x"]] = run.setting.actual.start[: design.states]
+    z[run.spans["x"]] = run.setting.actual.start[: design.entries]
     if run.setting.flown:
         z[run.spans["held"]] = solution.controls[0, : design.fed_back]
     if run.setting.filter == "extended":
@@ -72,12 +72,13 @@ def step_function(run: Run, constant: Array, varying: Given) -> ca.Function:
         sides.append(run.coefficients.split(column))
     moving, end = run.moving, run.spans["held"].start
     z = corrected(run, run.z, sides[0], early, h, late=False)
+    move = run.geometry.move
     first, applied = _drift(run, z, sides[0])
-    g = _noise(run, z[moving] + h / 2 * first, applied, sides, h) @ (ca.sqrt(h) * motion)
+    g = _noise(run, move(z[moving], h / 2 * first), applied, sides, h) @ (ca.sqrt(h) * motion)
     g = ca.vertcat(g, run.symbolic.zeros(first.shape[0] - g.shape[0]))
-    ahead = ca.vertcat(z[moving] + h * first + g, part(z, moving.stop))
+    ahead = ca.vertcat(move(z[moving], h * first + g), part(z, moving.stop))
     second, _ = _drift(run, ahead, sides[1])
-    after = ca.vertcat(z[moving] + h / 2 * (first + second) + g, part(z, moving.stop))
+    after = ca.vertcat(move(z[moving], h / 2 * (first + second) + g), part(z, moving.stop))
     if run.setting.filter == "extended":
         after = replaced(after, run.spans["E"], moved_covariance(run, z, ahead, sides, h))
     after = corrected(run, after, sides[1], late, h, late=True)
@@ -109,16 +110,17 @@ def finish_function(run: Run) -> ca.Function | None:
     known = solution.parameters[: solution.parameters.size - design.unknowns]
 
     def terminal(augmented: Given) -> Any:
-        state = ca.vertcat(part(augmented, 0, design.states), ca.DM(end[design.states :]))
-        return loop.terminal(state, solution.duration, ca.vertcat(ca.DM(known), part(augmented, design.states)))
+        state = ca.vertcat(part(augmented, 0, design.entries), ca.DM(end[design.entries :]))
+        return loop.terminal(state, solution.duration, ca.vertcat(ca.DM(known), part(augmented, design.entries)))
 
     symbolic: Any = design.statement.symbolic
-    v = symbolic.sym("v", design.size)
-    k, weight = terminal(v)
-    nominal = np.concatenate([end[: design.states], design.start[design.states :]])
-    extra = ca.Function("extra", [v], [weight - ca.hessian(k, v)[0]])(nominal)
+    d = symbolic.sym("d", design.size)
+    nominal = ca.DM(np.concatenate([end[: design.entries], design.start[design.entries :]]))
+    k, weight = terminal(design.geometry.move(nominal, d))
+    extra = ca.Function("extra", [d], [weight - ca.hessian(k, d)[0]])(np.zeros(design.size))
     actual = ca.vertcat(run.z[run.spans["x"]], run.own)
-    cost = terminal(actual)[0] + ca.dot(actual - nominal, extra @ (actual - nominal)) / 2
+    moved = design.geometry.difference(actual, nominal)
+    cost = terminal(actual)[0] + ca.dot(moved, extra @ moved) / 2
     return ca.Function("finish", [run.z, run.own], [ca.densify(cost)])
 
 
@@ -139,7 +141,7 @@ def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
         parts += [expected, run.symbolic.zeros(half_length(design.size))]
     if design.statement.loop is not None:
         known = ca.DM(setting.solution.parameters[: setting.solution.parameters.size - design.unknowns])
-        state, p = ca.vertcat(x, part(c["x"], design.states)), ca.vertcat(known, run.own)
+        state, p = ca.vertcat(x, part(c["x"], design.entries)), ca.vertcat(known, run.own)
         cost = design.statement.loop.running(state, u, c["t"], setting.solution.duration, p)
         parts.append(cost + ca.dot(moved, c["extra"] @ moved) / 2)
     return ca.vertcat(*parts), u

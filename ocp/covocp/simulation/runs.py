@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError, SolveError, warn_user
 from covocp.base.expressions import Given
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, read_only
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
@@ -262,7 +263,8 @@ def _result(
 ) -> MonteCarlo:
     """The batches put together."""
     design, solution, (expected, true) = setting.design, setting.solution, predictions
-    unknowns = np.tile(design.start[design.states :], (nominal.t.size, 1))
+    unknowns = np.tile(design.start[design.entries :], (nominal.t.size, 1))
+    states = _values(design.motion, nominal.x)
     limits, m = setting.limits, design.fed_back
     costs = _predicted_costs(solution, truth) if setting.costs else (np.nan, np.nan)
 
@@ -279,7 +281,7 @@ def _result(
         level=float(request.level),
         step=chosen,
         t=nominal.t,
-        nominal=np.hstack([nominal.x[:, : design.states], unknowns]),
+        nominal=np.hstack([*states, unknowns]),
         nominal_control=nominal.u[:, :m],
         predicted=true.deviation,
         predicted_error=true.error,
@@ -301,6 +303,11 @@ def _result(
         augmented=design.statement.augmented,
         symbols=design.statement.symbols,
     )
+
+
+def _values(motion: Geometry, x: Array) -> list[Array]:
+    """The nominal that deviations are added to: zero where the state is no vector."""
+    return [x[:, p.rows] if p.chart is None else np.zeros((x.shape[0], p.chart.tangent)) for p in motion.parts]
 
 
 def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:

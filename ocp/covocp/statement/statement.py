@@ -279,6 +279,20 @@ class Statement:
         return next(block for block in self.matrices if block.estimation)
 
     @cached
+    def unknowns(self) -> int:
+        """Entries of the unknowns, the last rows of the augmented state and the last parameters."""
+        return sum(block.length for block in self.of_kind("unknown"))
+
+    @cached
+    def augmented_geometry(self) -> Geometry:
+        """Of the augmented state: the states that are estimated, which are the first ones, then the unknowns."""
+        rows = len(self.augmented) - self.unknowns
+        estimated = self.geometry.first(
+            max((part.rows.stop for part in self.geometry.parts if part.tangent.stop <= rows), default=0)
+        )
+        return Geometry.stacked(estimated, self.unknowns)
+
+    @cached
     def integrals(self) -> bool:
         """Whether the matrices are integrals along the nominal: their rates depend on none of them."""
         if self.estimated or self.behind or not self.matrices:
