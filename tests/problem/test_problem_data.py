@@ -215,7 +215,15 @@ def test_matrix_below_its_bound():
 @wrong("bounds of 'limit' cross", "lower = 1, upper = 0")
 def test_constraint_bounds_crossed():
     ocp, x, *_ = lag()
-    ocp.subject_to(x, lower=1.0, name="limit")
+    ocp.subject_to(x, lower=1.0, upper=0.0, name="limit")
+
+
+def test_a_bound_that_is_given_alone_is_the_only_one():
+    ocp, x, *_ = lag()
+    for lower, upper, expected in ((None, None, (-np.inf, 0.0)), (1.0, None, (1.0, np.inf)), (None, 2.0, (-np.inf, 2.0))):
+        ocp.subject_to(x, lower=lower, upper=upper)
+        limit = ocp.declarations.constraints[-1]
+        assert (limit.lower.item(), limit.upper.item()) == expected
 
 
 @wrong("'limit' has no bound")

@@ -44,6 +44,9 @@ def _kind(statement: Statement) -> str:
     """What the problem must consist of."""
     if not any(block.estimation for block in statement.matrices):
         return "the problem has no estimation covariance"
+    for block in statement.states:
+        if block.tangent:
+            return f"the state '{block.name}' is an attitude, no vector"
     if not statement.of_kind("unknown"):
         return "the problem has no unknown parameters"
     if len(statement.matrices) > 1:

@@ -29,7 +29,6 @@ class Chart:
         kind: what it is, for descriptions and files.
         size: entries of z.
         tangent: entries of d.
-        origin: a z to begin with, where nothing else is known.
         move: (z, d) -> z moved by d, which `difference` undoes.
         difference: (z, base) -> the d that moves the base to z.
         basis: z -> slope of `move` by d at d = 0, (size, tangent).
@@ -42,7 +41,6 @@ class Chart:
     kind: str
     size: int
     tangent: int
-    origin: tuple[float, ...]
     move: ca.Function
     difference: ca.Function
     basis: ca.Function
@@ -164,6 +162,20 @@ class Geometry:
         """A slope by the state as one by the tangent."""
         return slope if self.plain else slope @ self.basis(x)
 
+    def slope(self, x: Expr, rate: Expr) -> Any:
+        """F of dd/dt = F d, for the error d of a state that moves by a rate, an expression in x; (tangent, tangent)."""
+        if self.plain:
+            return ca.jacobian(rate, x)
+        velocity = self.velocity(x, rate)
+        return ca.jacobian(velocity, x) @ self.basis(x) + self.drift(velocity)
+
+    def carried(self, start: Expr, end: Expr, slope: Expr) -> Any:
+        """The slope of a state after a step by that before it, as one from tangent to tangent."""
+        if self.plain:
+            return slope
+        moved = slope @ self.basis(start)
+        return ca.horzcat(*(self.velocity(end, moved[:, j]) for j in range(self.tangent)))
+
     def step(self, rate: Callable[[Expr, float], Expr], value: Expr, h: Expr) -> Any:
         """A classical Runge-Kutta step of a state, and of what is stacked below it, in the tangent at its start.
 
@@ -192,16 +204,6 @@ class Geometry:
     def differences(self, x: Array, base: Array) -> Array:
         """`difference` of numbers: states (K, size), bases (K, size)."""
         return x - base if self.plain else self._mapped(self.difference, x, base)
-
-    def kept(self, x: Array) -> Array:
-        """States (K, size) with the invariants of their charts, which interpolation loses."""
-        if self.plain:
-            return x
-        origin = np.zeros(self.size)
-        for part in self.parts:
-            if part.chart is not None:
-                origin[part.rows] = part.chart.origin
-        return self._mapped(self.like, x, np.broadcast_to(origin, x.shape))
 
     def _mapped(self, function: Callable[[Expr, Expr], Expr], x: Array, other: Array) -> Array:
         symbols = [ca.SX.sym(name, values.shape[1]) for name, values in (("x", x), ("other", other))]

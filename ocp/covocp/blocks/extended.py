@@ -13,7 +13,7 @@ import casadi as ca
 from covocp.base.arguments import checked, whole
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
-from covocp.base.quadrature import classical_step
+from covocp.base.geometry import Geometry
 from covocp.blocks import bucy
 from covocp.blocks.arithmetic import apply, definite_solve, symmetric
 from covocp.blocks.updates import Form, Missing, updating
@@ -89,7 +89,14 @@ def extended_rate(f: ca.Function, h: ca.Function, noise: Expr, R: Expr) -> ca.Fu
     return ca.Function("rate", [x, P, y, u][: model.arguments + 2], slopes, model.names("x", "P", "y"), ["dx", "dP"])
 
 
-def bucy_slopes(x: Expr, P: Expr, y: Expr, process: tuple[Any, Any], measurement: tuple[Any, Any]) -> list[Any]:
+def bucy_slopes(
+    x: Expr,
+    P: Expr,
+    y: Expr,
+    process: tuple[Any, Any],
+    measurement: tuple[Any, Any],
+    geometry: Geometry | None = None,
+) -> list[Any]:
     """Rates f + K (y - h) and F P + P F' + Q - K U K', K = P H' U^-1, of the continuous filter.
 
     Args:
@@ -98,22 +105,26 @@ def bucy_slopes(x: Expr, P: Expr, y: Expr, process: tuple[Any, Any], measurement
         y: measured values; there may be none.
         process: f and Q at x.
         measurement: h and U at x.
+        geometry: of x, whose tangent the covariance is of; None: a vector.
 
     Returns:
         dx/dt and dP/dt.
     """
     f, noise = process
     h, density = measurement
-    F, H = ca.jacobian(f, x), ca.jacobian(h, x)
+    geometry = Geometry.vector(x.shape[0]) if geometry is None else geometry
+    F, H = geometry.slope(x, f), geometry.tangent_slope(x, ca.jacobian(h, x))
     if not y.shape[0]:
         return [ca.densify(f), *apply(lambda P, F, Q: (F @ P + P @ F.T + Q,), P, F, noise)]
     solve = partial(definite_solve, what="measurement noise")
     (gain,) = apply(lambda P, H, U: (kalman_gain(P, H, U, solve),), P, H, density)
-    return [ca.densify(f + gain @ (y - h)), bucy.rate(P, F, H, noise, density)]
+    corrected = gain @ (y - h)
+    moved = corrected if geometry.plain else geometry.basis(x) @ corrected
+    return [ca.densify(f + moved), bucy.rate(P, F, H, noise, density)]
 
 
 class Estimated(NamedTuple):
-    """Estimate x and covariance P at a time t, and the control u."""
+    """Estimate x and covariance P, of its tangent, at a time t, and the control u."""
 
     x: Expr
     P: Expr
@@ -121,7 +132,14 @@ class Estimated(NamedTuple):
     u: Expr
 
 
-def propagated(rate: ca.Function, density: ca.Function, start: Estimated, step: Expr, substeps: int) -> list[Any]:
+def propagated(
+    rate: ca.Function,
+    density: ca.Function,
+    start: Estimated,
+    step: Expr,
+    substeps: int,
+    geometry: Geometry | None = None,
+) -> list[Any]:
     """Estimate and covariance after a step of a continuous model, positive semidefinite at any length of it.
 
     Each substep of length h is two Runge-Kutta steps with tangents Phi1, Phi2; the noise is added by Simpson's rule,
@@ -133,12 +151,13 @@ def propagated(rate: ca.Function, density: ca.Function, start: Estimated, step: 
         start: estimate, covariance, time and control at the start; the control is held.
         step: [s], a number or an expression.
         substeps: number of them.
+        geometry: of x; None: a vector.
 
     Returns:
         Estimate and covariance.
     """
     x, P, t, u = start
-    half, h = _half_step(rate), step / substeps
+    half, h = _half_step(rate, Geometry.vector(x.shape[0]) if geometry is None else geometry), step / substeps
     for _ in range(substeps):
         middle, first = half(x, t, u, h / 2)
         end, second = half(middle, t + h / 2, u, h / 2)
@@ -148,8 +167,16 @@ def propagated(rate: ca.Function, density: ca.Function, start: Estimated, step: 
     return [ca.densify(x), P]
 
 
-def corrected_by(x: Expr, P: Expr, y: Expr, measurement: tuple[Any, Any], form: Form, missing: Missing) -> list[Any]:
-    """Estimate and covariance after a reading: the linear update of y - h + H x.
+def corrected_by(
+    x: Expr,
+    P: Expr,
+    y: Expr,
+    measurement: tuple[Any, Any],
+    form: Form,
+    missing: Missing,
+    geometry: Geometry | None = None,
+) -> list[Any]:
+    """Estimate and covariance after a reading: the linear update by y - h.
 
     Args:
         x: symbol of the estimate.
@@ -158,13 +185,16 @@ def corrected_by(x: Expr, P: Expr, y: Expr, measurement: tuple[Any, Any], form: 
         measurement: h and the covariance of its noise at x.
         form: of the update.
         missing: what a row that is NaN means.
+        geometry: of x, whose tangent the covariance is of; None: a vector.
 
     Returns:
         Estimate and covariance.
     """
     h, noise = measurement
-    H = ca.jacobian(h, x)
-    return apply(updating(form, missing), x, P, y - h + H @ x, H, noise)
+    geometry = Geometry.vector(x.shape[0]) if geometry is None else geometry
+    H = geometry.tangent_slope(x, ca.jacobian(h, x))
+    change, after = apply(updating(form, missing), type(x).zeros(geometry.tangent), P, y - h, H, noise)
+    return [ca.densify(geometry.move(x, change)), after]
 
 
 def expands(function: ca.Function) -> bool:
@@ -186,13 +216,13 @@ def _simpson(P: Expr, first: Expr, second: Expr, start: Expr, middle: Expr, end:
     return (symmetric(second @ between @ second.T + h / 6 * end),)
 
 
-def _half_step(rate: ca.Function) -> ca.Function:
-    """(x, t, u, h) -> x after a Runge-Kutta step of length h, and the slope of that by x."""
+def _half_step(rate: ca.Function, geometry: Geometry) -> ca.Function:
+    """(x, t, u, h) -> x after a Runge-Kutta step of length h, and the slope of that by x, from tangent to tangent."""
     kind: Any = ca.SX if expands(rate) else ca.MX
     x, t, u = kind.sym("x", rate.size1_in(0)), kind.sym("t"), kind.sym("u", rate.size1_in(2))
     h = kind.sym("h")
-    end = classical_step(lambda value, c: rate(value, t + c * h, u), x, h)
-    return ca.Function("half_step", [x, t, u, h], [end, ca.jacobian(end, x)])
+    end = geometry.step(lambda value, c: rate(value, t + c * h, u), x, h)
+    return ca.Function("half_step", [x, t, u, h], [end, geometry.carried(x, end, ca.jacobian(end, x))])
 
 
 class _Model:

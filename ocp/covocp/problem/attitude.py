@@ -151,20 +151,19 @@ def as_quaternion(name: str, value: Given, what: str = "attitude") -> ca.MX:
     """
     symbolic = is_symbolic(value)
     try:
+        value = value.full() if isinstance(value, ca.DM) else value
         shape = tuple(value.shape) if symbolic else np.shape(value)
         if shape == (3, 3):
             return ca.MX(ca.densify(ca.MX(_column(so3.to_quaternion(value)))))
         if shape in ((4,), (4, 1)):
             if symbolic:
                 return ca.MX(value) / ca.norm_2(value)
-            numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).ravel()
+            numbers = np.asarray(value, dtype=float).ravel()
             so3.from_quaternion(numbers)
             return ca.MX(ca.DM(numbers / np.linalg.norm(numbers)))
         received = f"shape {shape}"
-    except (TypeError, ValueError):
-        received = shown(value)
-    except ProblemError as error:
-        received = error.received
+    except (TypeError, ValueError) as error:  # a ProblemError among them
+        received = error.received if isinstance(error, ProblemError) else shown(value)
     raise ProblemError(
         f"The {what} of '{name}' is no attitude.",
         expected="a rotation, shape (3, 3), or a unit quaternion (w, v), shape (4,); of an initial or a final attitude "

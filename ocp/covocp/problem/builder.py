@@ -455,8 +455,8 @@ class Problem:
         self,
         expression: Given,
         *,
-        lower: Given = -np.inf,
-        upper: Given = 0.0,
+        lower: Given = None,
+        upper: Given = None,
         at: Place = "path",
         name: str | None = None,
     ) -> None:
@@ -469,8 +469,8 @@ class Problem:
 
         Args:
             expression: of states, controls, matrix states, time; a column or a scalar.
-            lower: numbers, shape of the expression.
-            upper: numbers, shape of the expression; 0 by default.
+            lower: numbers, shape of the expression; None: no lower bound.
+            upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
             at: "path", "initial" or "final".
             name: appears in every diagnostic; "constraint k" by default.
 

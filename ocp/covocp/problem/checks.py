@@ -169,15 +169,9 @@ def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None
 
 
 def limit_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Array, Array]:
-    """Bounds of a constraint, which must not cross, and one of them must bind."""
-    low = column(name, "lower bound", lower, size, inf=True)
-    if (low > 0).any() and is_number(upper) and upper == 0:
-        raise ProblemError(
-            f"The bounds of '{name}' cross.",
-            expected="lower <= upper",
-            received=f"lower = {low.max():g}, upper = 0 (which it is unless given)",
-            remedy="give the upper bound too; upper=numpy.inf where there is none",
-        )
+    """Bounds of a constraint, which must not cross, and one of them must bind; None: see `Problem.subject_to`."""
+    upper = (0.0 if lower is None else np.inf) if upper is None else upper
+    lower = -np.inf if lower is None else lower
     low, high = bound_columns(name, lower, upper, size)
     for i in np.flatnonzero(np.isneginf(low) & np.isposinf(high)):
         entry = f"component {i} of '{name}'" if size > 1 else f"'{name}'"

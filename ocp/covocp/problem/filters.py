@@ -41,6 +41,8 @@ def extended_filter(
 ) -> ca.Function | tuple[ca.Function, ca.Function]:
     """Extended Kalman filter of the actual system of a problem; its rows are those of the estimation covariance.
 
+    The estimate of an attitude is its quaternion, which is corrected by rotations (the multiplicative filter).
+
     Continuous: the Kalman-Bucy filter with slopes at the estimate [Schmidt 2.5-3]. Discrete: the same model sampled
     (item 8); a reading is the mean of the measurement over a step, so its noise has the covariance density / step.
 
@@ -66,11 +68,13 @@ def extended_filter(
     value, density = (type(x)(0, 1), type(x)(0, 0)) if system.measurement is None else system.measurement(x, t, u)
     names = ["estimate", "covariance"]
     if step is None:
-        slopes = bucy_slopes(x, P, y, (system.rate(x, t, u), system.noise(x, t, u)), (value, density))
+        process = (system.rate(x, t, u), system.noise(x, t, u))
+        slopes = bucy_slopes(x, P, y, process, (value, density), system.geometry)
         return ca.Function("rate", [x, P, u, y, t], slopes, ["x", "P", "u", "y", "t"], ["dx", "dP"])
     length = time_step(step)
-    ahead = propagated(system.rate, system.noise, Estimated(x, P, t, u), length, substeps)
-    after = corrected_by(x, P, y, (value, density / length), form, missing) if readings else [x, P]
+    ahead = propagated(system.rate, system.noise, Estimated(x, P, t, u), length, substeps, system.geometry)
+    reading = (value, density / length)
+    after = corrected_by(x, P, y, reading, form, missing, system.geometry) if readings else [x, P]
     return (
         ca.Function("predict", [x, P, u, t], ahead, ["x", "P", "u", "t"], names),
         ca.Function("update", [x, P, y, u, t], after, ["x", "P", "y", "u", "t"], names),
@@ -84,7 +88,7 @@ def initial_estimate(problem: Problem) -> tuple[Array, Array]:
         problem: with the variances as declared, or with an initial estimation covariance.
 
     Returns:
-        Estimate (n,), NaN where an initial state is free, and covariance (n, n).
+        Estimate, (n,) where all states are vectors, NaN where an initial state is free, and covariance (n, n).
 
     Raises:
         ProblemError: no `Problem` or an incomplete one.
@@ -92,7 +96,7 @@ def initial_estimate(problem: Problem) -> tuple[Array, Array]:
     statement = _statement(problem)
     means = _parameters(statement)[1]
     starts = statement.boundary_values(statement.values)
-    estimate = np.concatenate([starts[0][: len(statement.augmented) - means.size], means])
+    estimate = np.concatenate([starts[0][: statement.augmented_geometry.size - means.size], means])
     for block in statement.matrices:
         if block.estimation:
             return estimate, unpack(starts[2][block.span], block.size)
@@ -117,9 +121,10 @@ class _System:
             )
         kind: Any = statement.symbolic
         known, means = _parameters(statement)
+        self.geometry = statement.augmented_geometry
         size, controls = len(statement.augmented), sum(entry.size for entry in problem.declarations.controls)
-        estimated = size - means.size
-        x, t, u = kind.sym("x", size), kind.sym("t"), kind.sym("u", controls)
+        estimated = self.geometry.size - means.size
+        x, t, u = kind.sym("x", self.geometry.size), kind.sym("t"), kind.sym("u", controls)
         self.symbols = x, kind.sym("P", size, size), u, t
         # what a derived problem adds to states and controls (gains, for instance) moves nothing in the actual system
         state = ca.vertcat(x[:estimated], kind.zeros(statement.nx - estimated))

@@ -10,9 +10,9 @@ from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
+from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.origin import Classical
-from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.statement.statement import Block, entry_names, error_names
 
 if TYPE_CHECKING:

@@ -230,13 +230,21 @@ def bend_size(run: Run, flat: Array, bend: Array) -> float:
         if np.isfinite(full).all() and np.isfinite(half).all():
             moved, bow = full - base, full - 2.0 * half + base
             largest = np.abs(moved).max(axis=0)
-            scale = np.where(run.scale > 0, run.scale, np.where(largest > 0, largest, 1.0))
+            scale = np.where(run.scale > 0, run.scale, _of_vectors(run.statement, largest))
             if 2.0 * np.linalg.norm(bow / scale) <= CURVED * np.linalg.norm(moved / scale):
                 return size
             if (largest / scale).max() <= FAINT:
                 return size
         size, full = 0.5 * size, half
     return size
+
+
+def _of_vectors(statement: Statement, sizes: Array) -> Array:
+    """Sizes of the states as one for each vector, 1 where it is zero: what rounding moves is no size of its own."""
+    result = sizes.copy()
+    for block in statement.states:
+        result[block.span] = sizes[block.span].max()
+    return np.where(result > 0, result, 1.0)
 
 
 def _units(run: Run, flat: Array) -> Array:

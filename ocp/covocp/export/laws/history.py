@@ -64,6 +64,7 @@ class History:
         last: slopes at their ends.
         u: controls, (K, nu) where they are linear, (K - 1, nu) where they are constant.
         states: nx.
+        units: rows of x that are of unit length together: the quaternions of attitudes.
         margin: relative, within which a time counts as inside.
     """
 
@@ -74,6 +75,7 @@ class History:
     last: Array
     u: Array
     states: int
+    units: tuple[slice, ...]
     margin: float
 
     __repr__ = short_repr
@@ -112,6 +114,8 @@ class History:
         if self.u.shape[0] == self.nodes.size:
             u = _linear(self.u.shape[1])(u, _column(self.u, k + 1), start, end, time)
         x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
+        for own in self.units:  # interpolation keeps their length up to its error
+            x[own] = x[own] / ca.norm_2(x[own])
         return Nominal(x=x, u=u, e=e)
 
     def rows(self, t: Array) -> tuple[Array, Array, Array]:
@@ -150,6 +154,7 @@ def history(solution: Solution, precision: str) -> History:
         last=last,
         u=trajectory.u,
         states=trajectory.x.shape[1],
+        units=tuple(block.span for block in solution.blocks if block.tangent),
         margin=MARGINS[precision],
     )
 
