@@ -97,6 +97,7 @@ def tied_values(problem: Declarations) -> Tied | None:
         states=states,
         matrices=matrices,
         function=ca.Function("tied", [x, p], values, ["state", "parameters"], ["initial_state", "initial_matrices"]),
+        slopes=ca.Function("tied_slopes", [x, p], [ca.densify(ca.jacobian(ca.vertcat(*values), x))]),
     )
 
 

@@ -41,6 +41,7 @@ RESIDUALS = {
     "costate_difference": "costates: multipliers against backward integration (relative)",
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
     "transversality": "condition of the free duration, k_T + H(T) (relative)",
+    "decisions": "condition of the decisions, int H_d dt + end terms (relative)",
     "mesh_error": "cost: change by halving the integration steps (relative)",
     "node_error": "nodes: change by halving the integration steps (of the range)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
@@ -65,6 +66,7 @@ WORRIES: dict[str, tuple[float, str]] = {
         "large: the controls or costates change within an interval; worry if it stays on twice the intervals",
     ),
     "transversality": (1e-2, "LARGE: the duration is not the best one, or the mesh too coarse: more intervals"),
+    "decisions": (1e-4, "LARGE: the decisions are not the best ones yet; a smaller tolerance=, or start from here"),
     "control_slope": (
         0.1,
         "large: the controls change within an interval; what that costs is the effect of their piecewise form below",

@@ -73,11 +73,13 @@ class Tied:
 
     states, matrices: entries of x(0) and of the half-vectors at the start.
     function: (state, parameters) -> their values, x(0)[states] and e(0)[matrices].
+    slopes: (state, parameters) -> slopes of both, one below the other, by the state.
     """
 
     states: tuple[int, ...]
     matrices: tuple[int, ...]
     function: ca.Function
+    slopes: ca.Function
 
     __repr__ = short_repr
 

@@ -120,8 +120,9 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
             e0[block.span] = matrix_guess(block, statement.guesses[block.name])
     known = statement.boundary_values(parameters)[2]
     e0 = np.where(np.isnan(known), e0, known)
+    x0, e0 = statement.started(np.where(np.isnan(x0), default, x0), parameters, e0)
     _check_covariances(statement, e0)
-    return np.where(np.isnan(x0), default, x0), e0
+    return x0, e0
 
 
 def matrix_guess(block: Block, guess: Given) -> Array:

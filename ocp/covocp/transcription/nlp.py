@@ -98,11 +98,13 @@ class NLP:
         x0, xf, e0, ef = st.boundary_values(parameters)
         count = len(self.mesh.starts)
         xl, xu = np.tile(st.state_bounds[0], (count, 1)), np.tile(st.state_bounds[1], (count, 1))
+        xl[1:, st.decisions], xu[1:, st.decisions] = -np.inf, np.inf  # one bound for one number
         _fix(xl[0], xu[0], x0)
         _fix(xl[-1], xu[-1], xf)
         lows, highs = [xl / self.scales.x], [xu / self.scales.x]
         if not self.mesh.eliminated:
             el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
+            e0[list(st.tied.matrices) if st.tied is not None else []] = 0.0  # inserted: these variables stand for nothing
             _fix(el[0], eu[0], e0)
             _fix(el[-1], eu[-1], ef)
             lows.append(el / self.scales.e)
