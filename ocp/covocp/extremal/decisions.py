@@ -136,4 +136,3 @@ def _terms(statement: Statement) -> ca.Function:
             parts.append(ca.repmat(costate, 1, statement.nx) * slope)
     total = ca.sum1(ca.vertcat(*(ca.fabs(part) for part in parts)))
     return ca.Function("terms", [*symbols, costate_x, costate_e], [ca.densify(total.T)])
-

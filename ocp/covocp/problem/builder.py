@@ -18,7 +18,6 @@ from covocp.base.checks import (
     column,
     density_matrix,
 )
-from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time

@@ -65,8 +65,8 @@ def check_decisions(problem: Declarations) -> None:
         if not _uses(costs, entry.symbol):
             raise ProblemError(
                 f"Nothing depends on the decision '{entry.name}' (declared at {entry.where}).",
-                expected="its symbol in dynamics, noise, measurements, initial values or variances that count, costs or "
-                "constraints",
+                expected="its symbol in dynamics, noise, measurements, initial values or variances that count, "
+                "costs or constraints",
                 received="none of them contains it",
                 remedy=f"use '{entry.name}' where it acts, or remove it (a variance counts where "
                 "estimation_covariance() or minimize_expected() makes it do so)",

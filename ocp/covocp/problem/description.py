@@ -10,7 +10,9 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices
 from covocp.base.pages import Part, Section, Sentence, Table, number
+from covocp.problem.decisions import decisions_of
 from covocp.problem.formulas import formulas
+from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entry_names, half_names
 
 if TYPE_CHECKING:
@@ -37,11 +39,13 @@ def sections(problem: Problem) -> list[Section]:
     parts: list[Section] = [
         _head(problem),
         _states(problem, written),
+        _decisions(problem),
         _unknowns(problem, written),
         _values("parameter", [(q, [number(v) for v in q.value]) for q in problem.parameters], "value"),
         _values("control", [(q, _ranges(q.lower, q.upper)) for q in problem.controls], "bounds"),
         _matrices(problem, written),
         _rates(problem, written),
+        _integrals(problem, written),
         _measurements(problem, written),
         _cost(problem, written),
         _constraints(problem, written),
@@ -166,11 +170,24 @@ def _ranges_of(free: Any) -> str:
 
 def _states(problem: Problem, written: _Written) -> Section:
     rows = []
-    for q in problem.states:
+    for q in (state for state in problem.states if state.role == "moving"):
         initial, final = _free(written("initial", q.name)), _free(written("final", q.name))
         columns = (entry_names((q,)), [q.unit] * q.size, initial, final, _ranges(q.lower, q.upper))
         rows += _shortened([list(row) for row in zip(*columns, written.diagonal("variance", q.name), strict=True)])
     return _table(["state", "unit", "at 0", "at T", "bounds", "variance at 0"], rows)
+
+
+def _decisions(problem: Problem) -> Section:
+    rows = []
+    for q in decisions_of(problem.declarations):
+        columns = (entry_names((q,)), [q.unit] * q.size, _ranges(q.lower, q.upper), [number(v) for v in q.guess])
+        rows += _shortened([list(row) for row in zip(*columns, strict=True)])
+    return _table(["decision", "unit", "bounds", "guess"], rows)
+
+
+def _integrals(problem: Problem, written: _Written) -> Section:
+    rows = [[q.name, q.unit, *written("rate", q.name)] for q in integrals_of(problem.declarations)]
+    return _table(["integral", "unit", "of"], rows)
 
 
 def _unknowns(problem: Problem, written: _Written) -> Section:
@@ -192,7 +209,8 @@ def _values(kind: str, entries: Sequence[tuple[Any, list[str]]], what: str) -> S
 def _matrices(problem: Problem, written: _Written) -> Section:
     """Symmetric matrices: their entries; of large ones, and where the others are zero, those of the diagonal."""
     rows = []
-    for q in problem.matrices:
+    matrices = [matrix for matrix in problem.matrices if matrix.role == "moving"]
+    for q in matrices:
         names = half_names(q.name, q.labels)
         ends = [
             _free(written(kind, q.name)) if value is not None else [FREE if kind == "initial" else ""] * len(names)
@@ -205,20 +223,20 @@ def _matrices(problem: Problem, written: _Written) -> Section:
         if len(own) > MOST_ENTRIES or beside <= {("0", "", ""), ("0", "0", ""), ("free", "", "")}:
             own = [row for row, on in zip(own, diagonal, strict=True) if on]
         rows += _shortened(own)
-    kinds = dict.fromkeys("covariance" if q.covariance else "matrix" for q in problem.matrices)
+    kinds = dict.fromkeys("covariance" if q.covariance else "matrix" for q in matrices)
     return _table([" or ".join(kinds), "unit", "at 0", "at T", "lower bound"], rows)
 
 
 def _rates(problem: Problem, written: _Written) -> Section:
     """Rates with the densities of their noise, and what the letters of the filter's mean."""
     rows, notes = [], list[Part]()
-    for state in problem.states:
+    for state in (q for q in problem.states if q.role == "moving"):
         given = problem.rates.get(state.name)
         rates = ["(not given yet)"] * state.size if given is None else written("rate", state.name)
         noise = [""] * state.size if given is None or given.noise is None else written.diagonal("noise", state.name)
         columns = ([f"d {name}/dt" for name in entry_names((state,))], [f"= {rate}" for rate in rates], noise)
         rows += _shortened([list(row) for row in zip(*columns, strict=True)])
-    for matrix in problem.matrices:
+    for matrix in (q for q in problem.matrices if q.role == "moving"):
         if matrix.estimation:
             measured = bool(problem.measurements)
             rows.append([f"d {matrix.name}/dt", f"= {FILTER}{UPDATE if measured else ''}", ""])

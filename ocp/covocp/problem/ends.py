@@ -136,4 +136,3 @@ def _split(name: str, symbols: list[Any]) -> tuple[Any, list[Any]]:
     offsets: list[int] = np.cumsum([0, *(symbol.shape[0] for symbol in symbols)]).tolist()
     column = ca.MX.sym(name, offsets[-1])
     return column, [column[i:j] for i, j in pairwise(offsets)]
-

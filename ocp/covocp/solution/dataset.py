@@ -38,16 +38,16 @@ def to_xarray(solution: Solution) -> Any:
     coordinates: dict[str, Any] = {"time": ("time", solution.t, {"units": "s"})}
     estimated = any(block.estimation for block in solution.blocks)
     for block in solution.blocks:
-        name, constant = block.name, block.kind in ("unknown", "parameter")
+        name, constant = block.name, block.kind in ("unknown", "parameter") or block.role == "decision"
         dimensions: tuple[str, ...] = () if block.size == 1 else (f"{name}_entry",)
         if block.kind == "matrix":
             dimensions = (f"{name}_row", f"{name}_column")
             coordinates |= {dimension: list(block.labels) for dimension in dimensions}
         values = solution.values[name]
         variables[name] = (dimensions, values[0]) if constant else (("time", *dimensions), values)
-        if block.kind in ("state", "matrix"):
+        if block.kind in ("state", "matrix") and not constant:
             variables[f"costate_{name}"] = (("time", *dimensions), solution.costate(name))
-        if estimated and block.kind in ("state", "unknown"):
+        if estimated and block.kind in ("state", "unknown") and block.role == "moving":
             variables[f"deviation_{name}"] = (("time", *dimensions), solution.deviation(name))
     return xarray.Dataset(variables, coords=coordinates, attrs=_attributes(solution))
 

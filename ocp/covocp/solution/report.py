@@ -12,7 +12,7 @@ from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.origin import Classical
-from covocp.statement.statement import Block, entry_names
+from covocp.statement.statement import Block, Role, entry_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -101,13 +101,15 @@ def sections(solution: Solution) -> list[Section]:
     closed = solution.loop is not None
 
     def shown(block: Block) -> bool:  # the covariances of a closed loop are in its tables
-        return not closed or not (block.estimation or block.backward)
+        return block.role == "moving" and not (closed and (block.estimation or block.backward))
 
     return [
         _head(solution),
         _violations(solution.violations),
         _costs(solution),
+        _numbers(solution, "decision"),
         _states(solution),
+        _numbers(solution, "integral"),
         _unknowns(solution),
         _deviations(solution),
         _feedback(solution),
@@ -155,7 +157,7 @@ def _left_out(solution: Solution) -> Section:
     if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
         return []
     share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
-    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in entry_names((b,))]
+    names = [name for b in solution.blocks if b.kind == "state" and b.role == "moving" for name in entry_names((b,))]
     spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
@@ -186,26 +188,33 @@ def _gained(solution: Solution) -> Section:
 
 def _states(solution: Solution) -> Section:
     """Terminal values with targets, multipliers and, where nothing is fed back, standard deviations."""
-    blocks = tuple(b for b in solution.blocks if b.kind == "state")
+    blocks = tuple(b for b in solution.blocks if b.kind == "state" and b.role == "moving")
     if not blocks:
         return []
-    target = solution.targets
+    own = [k for b in blocks for k in range(b.span.start, b.span.stop)]
+    target, final = solution.targets[own], solution.multipliers.final[own]
     bound = ~np.isnan(target) if solution.optimised else np.zeros(target.size, dtype=bool)
     columns = [f"state at T = {solution.duration:.8g} s", "value", "target", "multiplier"]
+    values = zip(entry_names(blocks), solution.trajectory.x[-1, own], target, final, bound, strict=True)
     rows = [
         [name, number(x), number(goal), number(multiplier if fixed else None)]
-        for name, x, goal, multiplier, fixed in zip(
-            entry_names(blocks), solution.trajectory.x[-1], target, solution.multipliers.final, bound, strict=True
-        )
+        for name, x, goal, multiplier, fixed in values
     ]
-    if solution.loop is not None:  # a gain that is constant is a state, which has its own table
-        own = [b.name != GAIN for b in blocks for _ in range(b.size)]
-        rows = [row for row, kept in zip(rows, own, strict=True) if kept]
-    elif _estimated(solution):
+    if solution.loop is None and _estimated(solution):
         columns.append("standard deviation")
         deviations = np.concatenate([np.atleast_1d(solution.deviation(b.name)[-1]) for b in blocks])
         rows = [[*row, number(value)] for row, value in zip(rows, deviations, strict=True)]
     return _table(columns, rows)
+
+
+def _numbers(solution: Solution, role: Role) -> Section:
+    """Decisions, or integrals, with their units; a constant gain has its own table."""
+    rows = []
+    for b in solution.blocks:
+        if b.role == role and not (solution.loop is not None and b.name == GAIN):
+            values = np.atleast_1d(solution[b.name])
+            rows += [[name, number(v), b.unit] for name, v in zip(entry_names((b,)), values, strict=True)]
+    return _table([role, "value", "unit"], rows)
 
 
 def _unknowns(solution: Solution) -> Section:

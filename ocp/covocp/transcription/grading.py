@@ -83,8 +83,10 @@ def _needed(statement: Statement) -> bool:
         form is not None and (block.estimation or block.backward)
         for block, form in zip(statement.matrices, statement.riccati, strict=True)
     )
-    return known and not statement.coupled and (
-        statement.loop is not None or statement.running_uses_matrices or bool(statement.summed)
+    return (
+        known
+        and not statement.coupled
+        and (statement.loop is not None or statement.running_uses_matrices or bool(statement.summed))
     )
 
 
