@@ -104,9 +104,8 @@ class NLP:
         lows, highs = [xl / self.scales.x], [xu / self.scales.x]
         if not self.mesh.eliminated:
             el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
-            e0[list(st.tied.matrices) if st.tied is not None else []] = (
-                0.0  # inserted: these variables stand for nothing
-            )
+            if st.tied is not None:
+                e0[list(st.tied.matrices)] = 0.0  # inserted: these variables stand for nothing
             _fix(el[0], eu[0], e0)
             _fix(el[-1], eu[-1], ef)
             lows.append(el / self.scales.e)
