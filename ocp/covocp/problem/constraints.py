@@ -11,7 +11,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
 from covocp.problem.decisions import decisions_of
-from covocp.problem.declarations import Constraint, Declarations, Place
+from covocp.problem.declarations import Constraint, Declarations
 from covocp.problem.integrals import integrals_of
 
 PLACES = ("path", "initial", "final")
@@ -30,7 +30,8 @@ def with_constraint(
             remedy="choose one of the three",
         )
     value = column_expression(label, "constraint", expression)
-    constants: list[Any] = [*(q.symbol for q in (*own.parameters, *own.unknowns)), own.time]
+    fixed: list[Any] = [*own.parameters, *own.unknowns]
+    constants = [*(q.symbol for q in fixed), own.time]
     check_constrains(label, value, constants)
     place = _place(own, label, value, at)
     check_name(label, list(own.named))
@@ -39,7 +40,7 @@ def with_constraint(
     return own.adding(constraints=entry)
 
 
-def _place(own: Declarations, label: str, value: ca.MX, at: Place | None) -> Place:
+def _place(own: Declarations, label: str, value: ca.MX, at: Any) -> Any:
     """Where a constraint holds: integrals have their value at the end, decisions need one row."""
     symbols = {symbol.__hash__() for symbol in ca.symvar(value)}
     inside = [entry.name for entry in integrals_of(own) if entry.symbol.__hash__() in symbols]
@@ -50,7 +51,8 @@ def _place(own: Declarations, label: str, value: ca.MX, at: Place | None) -> Pla
             received=f"at='{at}'",
             remedy="for what has been gathered so far declare a state with this rate: state(..., initial=0)",
         )
-    constant = {q.symbol.__hash__() for q in (*decisions_of(own), *own.parameters, *own.unknowns)}
+    fixed: list[Any] = [*decisions_of(own), *own.parameters, *own.unknowns]
+    constant = {q.symbol.__hash__() for q in fixed}
     if inside or (at in (None, "path") and symbols <= constant):
         return "final"
-    return at or "path"
+    return "path" if at is None else at

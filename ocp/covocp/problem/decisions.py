@@ -79,7 +79,8 @@ def _everything_but_costs(problem: Declarations) -> list[Any]:
     used: list[Any] = [value for rate in problem.rates.values() for value in (rate.rate, rate.noise)]
     used += [value for m in problem.measurements for value in (m.expression, m.noise, m.information)]
     used += [c.expression for c in problem.constraints]
-    used += [value for entry in (*problem.states, *problem.matrices) for value in (entry.initial, entry.final)]
+    started: list[Any] = [*problem.states, *problem.matrices]
+    used += [value for entry in started for value in (entry.initial, entry.final)]
     used += [value for m in problem.matrices if m.backward is not None for value in (m.backward.end, *m.backward.form)]
     return [value for value in used if isinstance(value, ca.MX)]
 

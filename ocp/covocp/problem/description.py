@@ -180,7 +180,8 @@ def _states(problem: Problem, written: _Written) -> Section:
 def _decisions(problem: Problem) -> Section:
     rows = []
     for q in decisions_of(problem.declarations):
-        columns = (entry_names((q,)), [q.unit] * q.size, _ranges(q.lower, q.upper), [number(v) for v in q.guess])
+        guess: Any = q.guess
+        columns = (entry_names((q,)), [q.unit] * q.size, _ranges(q.lower, q.upper), [number(v) for v in guess])
         rows += _shortened([list(row) for row in zip(*columns, strict=True)])
     return _table(["decision", "unit", "bounds", "guess"], rows)
 

@@ -60,7 +60,7 @@ def boundary(problem: Declarations) -> ca.Function:
     """Initial and final values of states and matrices as functions of the parameters; NaN: free, or a decision's."""
     outputs, symbols = _outputs(problem), _decision_symbols(problem)
     chosen = {symbol.__hash__() for symbol in ca.symvar(symbols)}
-    own = [*(q.symbol for q in problem.parameters), *(q.symbol for q in problem.unknowns)]
+    own = [q.symbol for q in _fixed(problem)]
     known = {symbol.__hash__() for symbol in own}
     for symbol in ca.symvar(ca.veccat(*outputs)):
         if symbol.__hash__() not in known | chosen:
@@ -87,7 +87,7 @@ def tied_values(problem: Declarations) -> Tied | None:
     states, matrices = (_dependent(outputs[i], symbols) for i in (0, 2))
     if not states and not matrices:
         return None
-    groups = [[*(q.symbol for q in problem.states)], [*(q.symbol for q in (*problem.parameters, *problem.unknowns))]]
+    groups = [[q.symbol for q in problem.states], [q.symbol for q in _fixed(problem)]]
     x, of_state = _split("state", groups[0])
     p, of_parameters = _split("parameters", groups[1])
     chosen = [outputs[0][list(states)], outputs[2][list(matrices)]]
@@ -112,6 +112,11 @@ def _outputs(problem: Declarations) -> list[Any]:
         [nan if m.final is None else m.final for m, nan in pairs],
     )
     return [ca.vertcat(ca.MX(0, 1), *group) for group in groups]
+
+
+def _fixed(problem: Declarations) -> list[Any]:
+    """What the parameters of a statement stack."""
+    return [*problem.parameters, *problem.unknowns]
 
 
 def _decision_symbols(problem: Declarations) -> Any:

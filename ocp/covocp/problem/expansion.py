@@ -20,10 +20,11 @@ from covocp.statement.statement import entry_names
 def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
     check_dynamics(problem.states, problem.rates)
+    moving = [state for state in problem.states if state.role == "moving"]
     augmented = [entry.symbol for entry in problem.augmented]
     controls = [entry.symbol for entry in problem.controls]
     count = sum(entry.size for entry in problem.unknowns)
-    rates = ca.vertcat(*(problem.rates[state.name].rate for state in problem.states), ca.MX(count, 1))
+    rates = ca.vertcat(*(problem.rates[state.name].rate for state in moving), ca.MX(count, 1))
     by_state, by_control = (_slope(expected.running, symbols).T for symbols in (augmented, controls))
     at_end = _slope(expected.terminal, augmented).T
     weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
@@ -120,7 +121,7 @@ def _control_weights(problem: Declarations, expected: Expected, curvature: Expr)
 def _check_terminal_weights(problem: Declarations, end: Expr) -> None:
     """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
     offset = 0
-    for state in problem.states:
+    for state in (entry for entry in problem.states if entry.role == "moving"):
         free = [True] * state.size
         if state.final.is_constant():
             free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()

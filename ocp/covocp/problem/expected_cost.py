@@ -191,7 +191,11 @@ def deterministic(problem: Declarations) -> Declarations:
             remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
         )
     used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
-    matrices = tuple(m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation)
+    kept = [m for m in problem.matrices if m.symbol.__hash__() in used or (not m.estimation and m.role == "moving")]
+    needed = {s.__hash__() for m in kept if m.role == "integral" for s in ca.symvar(problem.rates[m.name].rate)}
+    matrices = tuple(m for m in problem.matrices if m in kept or m.symbol.__hash__() in needed)
+    dropped = {m.name for m in problem.matrices if m.role == "integral"} - {m.name for m in matrices}
+    problem = replace(problem, rates={name: rate for name, rate in problem.rates.items() if name not in dropped})
     cost = (expected.running, expected.terminal)
     entries: list[Any] = [*problem.states, *problem.controls, *matrices]
     chosen = {entry.symbol.__hash__() for entry in entries}

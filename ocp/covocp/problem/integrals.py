@@ -16,7 +16,8 @@ from covocp.problem.declarations import Declarations, Dynamics, Matrix, State, d
 
 def integrals_of(problem: Declarations) -> list[State | Matrix]:
     """The integrals that were declared."""
-    return [entry for entry in (*problem.states, *problem.matrices) if entry.role == "integral"]
+    every: list[State | Matrix] = [*problem.states, *problem.matrices]
+    return [entry for entry in every if entry.role == "integral"]
 
 
 def with_integral(own: Declarations, name: str, expression: Given, unit: str) -> Declarations:
@@ -37,7 +38,8 @@ def with_integral(own: Declarations, name: str, expression: Given, unit: str) ->
             remedy=f"an integral is one number: use '{inner[0]}' in a cost or a constraint; for what has been gathered "
             "so far declare a state with that rate",
         )
-    constants = {entry.symbol.__hash__() for entry in (*own.parameters, *own.unknowns)}
+    fixed: list[Any] = [*own.parameters, *own.unknowns]
+    constants = {entry.symbol.__hash__() for entry in fixed}
     constants |= {state.symbol.__hash__() for state in own.states if state.role == "decision"}
     if isinstance(own.duration, ca.MX):
         constants.add(own.duration.__hash__())

@@ -12,7 +12,7 @@ from covocp.solution.solution import Solution
 def to_xarray(solution: Solution) -> Any:
     """The solution as an xarray.Dataset over the time of the nodes.
 
-    States, controls, matrices and constants under their names; their costates as "costate_<name>", standard deviations
+    States, controls, matrices, constants and decisions, and integrals up to each node, under their names; their costates as "costate_<name>", standard deviations
     of the estimates as "deviation_<name>". The entries of vectors run along "<name>_entry", the rows and columns of
     matrices, labelled by what they belong to, along "<name>_row" and "<name>_column".
 
@@ -40,12 +40,14 @@ def to_xarray(solution: Solution) -> Any:
     for block in solution.blocks:
         name, constant = block.name, block.kind in ("unknown", "parameter") or block.role == "decision"
         dimensions: tuple[str, ...] = () if block.size == 1 else (f"{name}_entry",)
-        if block.kind == "matrix":
+        if block.kind == "matrix" and block.role == "moving":
             dimensions = (f"{name}_row", f"{name}_column")
             coordinates |= {dimension: list(block.labels) for dimension in dimensions}
         values = solution.values[name]
+        if block.role == "integral":
+            values = values.reshape(solution.t.size)
         variables[name] = (dimensions, values[0]) if constant else (("time", *dimensions), values)
-        if block.kind in ("state", "matrix") and not constant:
+        if block.kind in ("state", "matrix") and block.role == "moving":
             variables[f"costate_{name}"] = (("time", *dimensions), solution.costate(name))
         if estimated and block.kind in ("state", "unknown") and block.role == "moving":
             variables[f"deviation_{name}"] = (("time", *dimensions), solution.deviation(name))

@@ -210,21 +210,21 @@ def _gathered(
     """The same for integrals of what depends on the matrices that run forward: sums of what each substep adds."""
     n, m = mesh.intervals, mesh.substeps
     starts, after = ahead[1], ahead[2]
-    before = starts
+    before: Any = starts
     if m > 1:
         inside: Expr = ca.reshape(after, after.shape[0] * m, n)
         before = ca.vertcat(starts, inside[: after.shape[0] * (m - 1), :])
         before = ca.reshape(before, after.shape[0], n * m)
     step = gathering_step(statement, mesh.step, mesh.linear_solver).map(n * m)
     later: Any = ca.cumsum(step(before, after, *columns), 1)
-    begin = ca.repmat(first, 1, n)
+    begin: Any = ca.repmat(first, 1, n)
     if kicks is not None:
-        passed = ca.cumsum(kicks, 1)
+        passed: Any = ca.cumsum(kicks, 1)
         begin = begin + passed[:, :n]
         first = first + kicks[:, 0]
-    spread = ca.kron(begin, ca.DM.ones(1, m))
+    spread: Any = ca.kron(begin, ca.DM.ones(1, m))
     arrived = later + spread
-    nodes = arrived[:, m - 1 :: m]
+    nodes: Any = arrived[:, m - 1 :: m]
     if kicks is not None:
         nodes = nodes + kicks[:, 1:]
     nodes = ca.horzcat(first, nodes)

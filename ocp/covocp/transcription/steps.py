@@ -355,7 +355,8 @@ def gathering_step(statement: Statement, step: StepKind, solver: str = LINEAR_SO
         fa, fb = (interval.h * _slope(statement, *interval.at(c, x)) for c, x in ((0.0, xa), (1.0, xb)))
         middle = hermite(xa, xb, fa, fb, 0.5)
     half = matrices_step(statement, statement.ahead, step, solver)(ea, xa, middle, *interval.part(0.0, 0.5))
-    rows, total = statement.entries(statement.summed), 0
+    rows: list[int] = statement.entries(statement.summed)
+    total: Any = 0
     for c, x, own, weight in ((0.0, xa, ea, 1.0), (0.5, middle, half, 4.0), (1.0, xb, eb, 1.0)):
         e = ca.MX.zeros(statement.ne)
         e[statement.entries(statement.ahead)] = own
