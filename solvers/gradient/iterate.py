@@ -353,9 +353,12 @@ class Space:
                 end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
             else:
                 bounds[1:, limited(st)] = values
+        held = -np.where(measures.active, measures.residual, 0.0)
+        chosen = np.isin(self.free, st.decisions)
+        bounds[0, self.free[chosen]] = held[self.controls + int(st.duration.free) :][chosen]
         final += bounds[-1]
         bounds[-1] = 0.0
-        controls = -np.where(measures.active, measures.residual, 0.0)[: self.controls].reshape(zero.controls.shape)
+        controls = held[: self.controls].reshape(zero.controls.shape)
         return Multipliers(
             final=final[: st.nx],
             final_matrices=final[st.nx :],

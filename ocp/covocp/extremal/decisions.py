@@ -1,4 +1,4 @@
-"""The necessary condition of decisions: int H_d dt + slopes of the end terms = 0, or of the sign that a bound holds."""
+"""The necessary condition of decisions: int H_d dt + slopes of the end terms + multipliers of bounds = 0."""
 
 from __future__ import annotations
 
@@ -18,30 +18,25 @@ from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
 
-# A decision is at its bound within this share of its size or range.
-AT_BOUND = 1e-6
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DecisionSlopes:
     """Slopes of the Lagrangian by the decisions, an entry for each.
 
     Attributes:
-        total: int H_d dt and all end terms.
-        left: what of it no active bound holds.
+        total: int H_d dt and all end terms, with the multipliers of the bounds.
         size: sum of the absolute terms.
     """
 
     total: Array
-    left: Array
     size: Array
 
     __repr__ = short_repr
 
     @property
     def relative(self) -> float:
-        """The largest of what is left, relative to its terms."""
-        share = np.abs(self.left) / np.maximum(self.size, np.finfo(float).tiny)
+        """The largest relative to its terms."""
+        share = np.abs(self.total) / np.maximum(self.size, np.finfo(float).tiny)
         return float(share.max(initial=0.0))
 
 
@@ -55,15 +50,10 @@ def decision_slopes(extremal: Extremal, costates: Costates) -> DecisionSlopes:
     if extremal.mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
         costates = discrete_costates(extremal)[0]
-    st, t, rows = extremal.statement, extremal.trajectory, extremal.statement.decisions
+    rows = extremal.statement.decisions
     at_start = start_slopes(extremal, costates)[rows]
     total = at_start + _mismatches(extremal, costates)[rows]
-    x = t.x[0, rows]
-    lower, upper = (bound[rows] for bound in st.state_bounds)
-    width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-    near = AT_BOUND * np.maximum(np.abs(x), width)
-    held = ((x <= lower + near) & (total > 0)) | ((x >= upper - near) & (total < 0))
-    return DecisionSlopes(total=total, left=np.where(held, 0.0, total), size=_sizes(extremal, costates))
+    return DecisionSlopes(total=total, size=_sizes(extremal, costates))
 
 
 def start_slopes(extremal: Extremal, costates: Costates) -> Array:

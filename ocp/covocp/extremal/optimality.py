@@ -59,8 +59,8 @@ class Optimality:
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
             had. Negative: the solution is a saddle.
-        decisions: largest slope of the Lagrangian by a decision, int H_d dt and the slopes of all end terms, where no
-            bound holds it; relative to the sum of its absolute terms; None without decisions.
+        decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
+            multipliers of its bounds; relative to the sum of the absolute terms; None without decisions.
         cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
             cost (E-1) from the covariances of the loop; None without a closed loop.
         cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None

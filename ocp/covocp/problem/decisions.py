@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.checks import bound_columns, check_inside, column
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.base.matrices import Array
 from covocp.problem.declarations import Declarations, Dynamics, Matrix, State
 
 
@@ -38,12 +39,18 @@ def with_constant(own: Declarations, symbol: dict[str, Any], lower: Given, upper
         lower=low,
         upper=high,
         guess=start,
-        scale=None,
+        scale=_magnitude(start, low, high),
         variance=ca.MX(size, size),
         role="decision",
     )
     still = Dynamics(rate=ca.MX.zeros(size, 1), noise=None, where=symbol["where"])
     return own.adding(states=entry, rates={name: still})
+
+
+def _magnitude(guess: Array, lower: Array, upper: Array) -> Array:
+    """That of the guess; where it is zero the range of the bounds, else 1."""
+    range_of = np.where(np.isfinite(lower) & np.isfinite(upper) & (upper > lower), upper - lower, 1.0)
+    return np.where(guess != 0.0, np.abs(guess), range_of)
 
 
 def decisions_of(problem: Declarations) -> list[State]:

@@ -12,9 +12,10 @@ from covocp.solution.solution import Solution
 def to_xarray(solution: Solution) -> Any:
     """The solution as an xarray.Dataset over the time of the nodes.
 
-    States, controls, matrices, constants and decisions, and integrals up to each node, under their names; their costates as "costate_<name>", standard deviations
-    of the estimates as "deviation_<name>". The entries of vectors run along "<name>_entry", the rows and columns of
-    matrices, labelled by what they belong to, along "<name>_row" and "<name>_column".
+    States, controls, matrices, constants, decisions, and integrals up to each node, under their names; their costates
+    as "costate_<name>", standard deviations of the estimates as "deviation_<name>". The entries of vectors run along
+    "<name>_entry", the rows and columns of matrices, labelled by what they belong to, along "<name>_row" and
+    "<name>_column".
 
     Args:
         solution: what to convert.

@@ -161,6 +161,7 @@ class NLP:
         states, matrices = zero.states.copy(), zero.matrices.copy()
         starts = list(mesh.starts)
         states[starts[1:-1]] = (parts["x"] / self.scales.x)[1:-1]
+        states[0, st.decisions] = (parts["x"] / self.scales.x)[0, st.decisions]
         if "state_bounds" in by_kind:
             bounded = st.bounded_states
             inside = sorted(set(range(mesh.intervals + 1)) - set(starts))
