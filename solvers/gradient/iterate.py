@@ -54,6 +54,8 @@ SMALLEST_EXTRA = 1e-3
 SHORTEN, LENGTHEN = 0.3, 0.5
 # Controls below this share of their scale at the start are zero.
 ZERO = 1e-12
+# Terms of H_u that change the cost by less than this share where a control moves by its scale are roundoff.
+FAINT = 1e-8
 CHORD_STEPS = 60
 CHORD_TOLERANCE = 1e-13
 
@@ -204,8 +206,9 @@ class Space:
         sizes = np.maximum(sizes, (weights * nodal[: weights.size]).ravel())
         norm = np.sqrt(np.sum(inverse[:count] * left[:count] ** 2))
         size = np.sqrt(np.sum(inverse[:count] * sizes**2))
-        slope = float(norm / size) if size > 0 else 0.0
         total = max(self.cost_size(iterate), np.finfo(float).tiny)
+        size = max(size, FAINT * total / np.sqrt(iterate.run.duration))  # where the best control is none
+        slope = float(norm / size) if size > 0 else 0.0
         extra = np.abs(left[count:] * self.unit[count:]).max(initial=0.0) / total
         return Measures(
             ell=ell,
