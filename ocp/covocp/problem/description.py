@@ -13,7 +13,7 @@ from covocp.base.pages import Part, Section, Sentence, Table, number
 from covocp.problem.decisions import decisions_of
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
-from covocp.statement.statement import entry_names, half_names
+from covocp.statement.statement import entries_of, entry_names, half_names
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
@@ -67,7 +67,7 @@ class _Written:
         expressions = dict(_expressions(problem))
         vectors: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
         symbols = [entry.symbol for entry in vectors] + [matrix.symbol for matrix in problem.matrices]
-        names = [entry_names((q,)) for q in vectors] + [half_names(q.name, q.labels) for q in problem.matrices]
+        names = [entry_names((q,)) for q in vectors] + [entries_of(q) for q in problem.matrices]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]

@@ -70,13 +70,15 @@ def boundary(problem: Declarations) -> ca.Function:
                 received=f"'{symbol.name()}'",
                 remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
             )
-    left = []
-    for value in outputs:
-        rows = set(_dependent(value, symbols))
-        parts = [ca.MX(ca.DM.nan(1)) if k in rows else value[k] for k in range(value.shape[0])]
-        left.append(ca.vertcat(ca.MX(0, 1), *parts) if rows else value)
+    decisions = decisions_of(problem)
+    function = ca.Function("boundary", [*own, *(entry.symbol for entry in decisions)], outputs)
     p, arguments = _split("parameters", own)
-    values = ca.Function("boundary", own, left).call(arguments, True, False)
+    values = function.call([*arguments, *(ca.DM(entry.guess) for entry in decisions)], True, False)
+    for i, value in enumerate(outputs):
+        rows = list(_dependent(value, symbols))
+        if rows:
+            kept = [ca.MX(ca.DM.nan(1)) if k in rows else values[i][k] for k in range(value.shape[0])]
+            values[i] = ca.vertcat(*kept)
     return ca.Function("boundary", [p], values, ["parameters"], list(OUTPUTS))
 
 

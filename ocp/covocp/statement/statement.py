@@ -362,11 +362,7 @@ class Statement:
     @cached
     def matrix_names(self) -> tuple[str, ...]:
         """Names of the entries of the stacked half-vectors, such as 'E[x, b]'."""
-        return tuple(
-            name
-            for block in self.matrices
-            for name in ([block.name] if block.role == "integral" else half_names(block.name, block.labels))
-        )
+        return tuple(name for block in self.matrices for name in entries_of(block))
 
     @cached
     def state_names(self) -> tuple[str, ...]:
@@ -396,6 +392,11 @@ def _replaced(column: Expr, entries: tuple[int, ...], values: Expr) -> Any:
 def entry_names(blocks: Iterable[Any]) -> tuple[str, ...]:
     """Names of the entries of some stacked vectors."""
     return tuple(block.name if block.size == 1 else f"{block.name}[{i}]" for block in blocks for i in range(block.size))
+
+
+def entries_of(matrix: Any) -> list[str]:
+    """Names of the entries of the half-vector of a declared matrix or its block; an integral is one number."""
+    return [matrix.name] if matrix.role == "integral" else half_names(matrix.name, matrix.labels)
 
 
 def half_names(name: str, labels: tuple[str, ...]) -> list[str]:
