@@ -128,19 +128,19 @@ def by_scipy(prior, density, duration, controls):
 def test_integral_of_variances_against_scipy(options, expected):
     """Of the order of the steps, with constants like those of the running cost."""
     exact, covariance = by_scipy(PRIOR, DENSITY, DURATION, lambda t: np.interp(t, [0.0, DURATION], [0.5, -0.5]))
-    counts, errors = np.array([20, 40, 80]), []
+    counts, errors = np.array([40, 80, 160]), []
     for n in counts:
         nominal = {"u": np.linspace(0.5, -0.5, n + 1)}
         known = {"grid": np.linspace(0.0, 1.0, n + 1), "substeps": 2, **options}
         solution = co.evaluate(watched(), nominal=nominal, **known)
         errors.append(float(solution["spread"]) - exact)
-        running = co.evaluate(watched(stated="running"), nominal=nominal, **known)
-        plain = co.evaluate(watched(budget=9.0), nominal=nominal, **known).cost
-        assert abs(errors[-1]) < 4.0 * abs((running.cost - plain) / 2.0 - exact) + 1e-12
-        np.testing.assert_array_equal(solution["E"], running["E"])  # the filter is as it was
-        assert solution.augmented == ("x", "b")
-    np.testing.assert_allclose(solution["E"][-1], covariance, rtol=1e-5 if expected == 4.0 else 2e-3)
-    assert order(counts, errors) == pytest.approx(expected, abs=0.45)
+    assert order(counts, errors) > expected - 0.6
+    running = co.evaluate(watched(stated="running"), nominal=nominal, **known)
+    plain = co.evaluate(watched(budget=9.0), nominal=nominal, **known).cost
+    assert abs(errors[-1]) < 1.5 * abs((running.cost - plain) / 2.0 - exact) + 1e-10
+    np.testing.assert_array_equal(solution["E"], running["E"])  # the filter is as it was
+    assert solution.augmented == ("x", "b")
+    np.testing.assert_allclose(solution["E"][-1], covariance, rtol=1e-6 if expected == 4.0 else 2e-3)
 
 
 def test_steep_start_is_graded():

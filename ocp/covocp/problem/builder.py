@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -47,7 +47,7 @@ from covocp.problem.declarations import (
 from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
-from covocp.problem.integrals import integrals_of, with_integral
+from covocp.problem.integrals import with_integral
 from covocp.problem.measurement_information import stated_noise
 from covocp.problem.rates import with_rate
 from covocp.statement.statement import Statement
@@ -219,10 +219,7 @@ class Problem:
             ProblemError: name used twice, NaN or inf.
         """
         size = self._declare(name, int(np.size(as_number(name, "value", value))))
-        entry = Parameter(
-            **_symbol(name, size, unit),
-            value=column(name, "value", value, size),
-        )
+        entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
         return self._add("parameters", entry).symbol
 
     @checked(unit=text)
@@ -238,8 +235,6 @@ class Problem:
     ) -> ca.MX:
         """Declare a constant that the optimiser chooses, for use wherever a number or an expression is taken.
 
-        Dynamics, noise, measurements, costs, constraints, initial and final values, variances of the first estimate.
-
         Args:
             name: unique name.
             shape: number of components.
@@ -253,18 +248,15 @@ class Problem:
 
         Raises:
             ProblemError: name used twice, bounds crossed, a guess outside of them, NaN or inf; when the problem is
-                built, where nothing depends on it, or the cost falls with it without end.
+                built: nothing depends on it, the cost falls with it without end.
         """
-        size = self._declare(name, shape)
-        own = with_constant(self._declarations, _symbol(name, size, unit), lower, upper, guess)
-        self._change(own)
-        return next(state.symbol for state in own.states if state.name == name)
+        own = _symbol(name, self._declare(name, shape), unit)
+        self._change(with_constant(self._declarations, own, lower, upper, guess))
+        return cast(ca.MX, own["symbol"])
 
     @checked(unit=text)
     def integral(self, expression: Given, *, name: str | None = None, unit: str = "") -> ca.MX:
         """The integral of an expression over [0, T], for terminal costs and for constraints at the end.
-
-        It is integrated with the steps of the running cost, is no part of the augmented state, and changes no filter.
 
         Args:
             expression: scalar, of states, controls, matrix states and covariances, decisions, time; per second.
@@ -277,11 +269,9 @@ class Problem:
         Raises:
             ProblemError: not scalar, nothing in it that moves, another integral in it, name used twice.
         """
-        own = self._declarations
-        label = name if name is not None else f"integral {1 + len(integrals_of(own))}"
-        self._declare(label, 1)
-        self._change(with_integral(own, label, expression, unit))
-        return next(entry.symbol for entry in integrals_of(self._declarations) if entry.name == label)
+        declarations, symbol = with_integral(self._declarations, name, expression, unit)
+        self._change(declarations)
+        return symbol
 
     @checked(unit=text)
     def control(

@@ -73,7 +73,8 @@ def boundary(problem: Declarations) -> ca.Function:
     decisions = decisions_of(problem)
     function = ca.Function("boundary", [*own, *(entry.symbol for entry in decisions)], outputs)
     p, arguments = _split("parameters", own)
-    values = function.call([*arguments, *(ca.DM(entry.guess) for entry in decisions)], True, False)
+    guesses: list[Any] = [entry.guess for entry in decisions]
+    values: list[Any] = list(function.call([*arguments, *(ca.DM(guess) for guess in guesses)], True, False))
     for i, value in enumerate(outputs):
         rows = list(_dependent(value, symbols))
         if rows:

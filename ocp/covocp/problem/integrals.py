@@ -10,7 +10,7 @@ import numpy as np
 from covocp.base.checks import caller, shape_error
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.problem.checks import column_expression
+from covocp.problem.checks import check_name, column_expression
 from covocp.problem.declarations import Declarations, Dynamics, Matrix, State, declare_matrix
 
 
@@ -20,11 +20,13 @@ def integrals_of(problem: Declarations) -> list[State | Matrix]:
     return [entry for entry in every if entry.role == "integral"]
 
 
-def with_integral(own: Declarations, name: str, expression: Given, unit: str) -> Declarations:
-    """The declarations with one more integral; arguments and errors as of `Problem.integral`.
+def with_integral(own: Declarations, given: str | None, expression: Given, unit: str) -> tuple[Declarations, ca.MX]:
+    """The declarations with one more integral, and its symbol; arguments and errors as of `Problem.integral`.
 
     Of a covariance it is a matrix of one row that follows from the others, else a state; nothing depends on it.
     """
+    name = f"integral {1 + len(integrals_of(own))}" if given is None else given
+    check_name(name, list(own.named))
     value = column_expression(name, "integrand of", expression)
     if value.shape != (1, 1):
         raise shape_error(name, "integrand", "a scalar", f"shape {value.shape}")
@@ -54,7 +56,7 @@ def with_integral(own: Declarations, name: str, expression: Given, unit: str) ->
     if any(ca.depends_on(value, matrix.symbol) for matrix in own.matrices):
         zero = np.zeros((1, 1))
         matrix = declare_matrix(name, labels=("0",), where=caller(), unit=unit, initial=zero, role="integral")
-        return own.adding(matrices=matrix, rates={name: still})
+        return own.adding(matrices=matrix, rates={name: still}), matrix.symbol
     infinite = np.full(1, np.inf)
     state = State(
         name=name,
@@ -71,7 +73,7 @@ def with_integral(own: Declarations, name: str, expression: Given, unit: str) ->
         variance=ca.MX(1, 1),
         role="integral",
     )
-    return own.adding(states=state, rates={name: still})
+    return own.adding(states=state, rates={name: still}), state.symbol
 
 
 def check_integrals(problem: Declarations) -> None:
