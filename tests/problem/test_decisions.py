@@ -164,11 +164,41 @@ def test_closed_loop_is_the_best_of_all_numbers():
         costs.append(solution.cost)
         assert solution.optimality.decisions < 1e-5
     np.testing.assert_allclose(costs, costs[0], rtol=1e-6)
-    best = minimize_scalar(
-        lambda r: solve(loop(r), intervals=40).cost, bracket=(0.3, 0.45, 0.6), options={"xtol": 1e-4}, tol=1e-4
-    )
-    assert costs[0] == pytest.approx(best.fun, rel=1e-7)
-    assert float(solution["r"]) == pytest.approx(best.x, rel=5e-3)
+    number = float(solution["r"])
+    around = [solve(loop(number * (1 + d)), intervals=40).cost for d in (-0.05, 0.0, 0.05)]
+    assert around[1] == pytest.approx(costs[0], rel=1e-7)
+    lowest = 0.025 * (around[0] - around[2]) / (around[0] - 2 * around[1] + around[2])  # of the parabola through them
+    assert abs(lowest) < 2e-3
+
+
+def with_prior(v=None):
+    """A closed loop whose first estimate is bought; a number in its place makes the same without a decision."""
+    ocp = co.Problem(DURATION, "prior of a loop")
+    chosen = ocp.decision("v", guess=0.2, lower=0.05, upper=5.0) if v is None else ocp.parameter("v", v)
+    x, u = ocp.state("x", initial=chosen, final=0.0, variance=chosen), ocp.control("u")
+    ocp.dynamics(x, -0.3 * x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.3)
+    ocp.minimize_expected(running=0.5 * u**2, terminal=0.05 / chosen, terminal_weight={x: 4.0})
+    return ocp
+
+
+def test_prior_of_a_closed_loop(way):
+    """The covariances start where the decision says, in costs, loops, evaluations and the classical design."""
+    solution = solve(with_prior(), intervals=30, **way)
+    number = float(solution["v"])
+    np.testing.assert_allclose(solution.loop.E[0], [[number]], rtol=1e-9)
+    assert solution.optimality.cost_identity < 1e-5
+    assert solution.optimality.decisions < 1e-5
+    assert solution.cost == pytest.approx(solve(with_prior(number), intervals=30).cost, rel=1e-6)
+    if "method" not in way:
+        costs = [solve(with_prior(number * (1 + d)), intervals=30).cost for d in (-1e-2, 1e-2)]
+        assert min(costs) > solution.cost
+        assert costs[1] - costs[0] == pytest.approx(0.0, abs=1e-3 * (sum(costs) - 2 * solution.cost) + 1e-4 * costs[0])
+    classical = co.solve(with_prior(), intervals=30, nominal="deterministic", progress=False)
+    again = solve(with_prior(float(classical["v"])), intervals=30)
+    assert classical.cost >= again.cost * (1 - 1e-9) >= solution.cost * (1 - 1e-6)
+    truth = co.evaluate(solution, truth=with_prior())
+    assert truth.cost == pytest.approx(solution.cost, rel=1e-5)
 
 
 def test_simulation_and_evaluation_use_the_chosen_number(tmp_path):

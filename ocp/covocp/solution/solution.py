@@ -268,9 +268,7 @@ class Solution:
         return result
 
     def __getitem__(self, key: Given) -> Array:
-        """Values at the nodes of a symbol, a name, an entry of one, or an expression of the problem's symbols.
-
-        A decision and an integral are one number, () or (n,); `values` has them at the nodes, the integral so far.
+        """Values at the nodes of a symbol, a name, an entry of one, or an expression; decisions, integrals: numbers.
 
         Raises:
             ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
@@ -278,9 +276,7 @@ class Solution:
         found = self._name(key, missing_ok=isinstance(key, ca.MX))
         if found:
             values, own = entry_values(self.values, found), block_of(found, self.blocks)
-            if own is None or own.role == "moving":
-                return values
-            return np.asarray(values[-1].reshape(()) if own.size == 1 else values[-1])
+            return values if own is None or own.role == "moving" else np.squeeze(values[-1])
         statement = self.extremal.statement
         try:
             function = statement.expression(key)

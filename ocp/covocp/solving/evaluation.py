@@ -17,7 +17,7 @@ from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.threads import one_at_a_time
-from covocp.extremal.closed_loop import Statistics, close_loop, densities
+from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import finer_steps
@@ -252,7 +252,7 @@ def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
             remedy="build it by the same function with other numbers",
         )
     statistics = Statistics(
-        initial=unpack(other.boundary_values(values)[2][block.span], block.size),
+        initial=unpack(start_covariance(other, extremal, values)[block.span], block.size),
         density=densities(other),
         parameters=values,
     )
