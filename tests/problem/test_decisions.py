@@ -323,6 +323,14 @@ def test_a_filter_of_a_problem_with_decisions_is_refused():
     refused(lambda: filters.extended_filter(sensor()), "'r' is a decision", "solution['r']")
 
 
+def test_something_must_move():
+    """Decisions and integrals alone are no control problem."""
+    ocp = co.Problem(1.0)
+    d, u = ocp.decision("d", guess=1.0), ocp.control("u")
+    ocp.minimize(running=u**2 + d**2, terminal=ocp.integral(u**2))
+    refused(ocp.statement, "no state", "d, integral 1")
+
+
 def test_bad_input():
     """Bounds crossed, guess outside, NaN, name taken: refused where they are given."""
     ocp = co.Problem(1.0)

@@ -112,9 +112,12 @@ def _check_complete(problem: Declarations) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
     moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
     check_dynamics(moving, problem.rates)
-    if not problem.states:
+    if not any(state.role == "moving" for state in problem.states):
         raise ProblemError(
-            "The problem has no state.", expected="at least one state", received="none", remedy="add one by state()"
+            "The problem has no state.",
+            expected="at least one state beside decisions and integrals",
+            received=", ".join(state.name for state in problem.states) or "none",
+            remedy="add one by state(); its rate may be 0",
         )
     if problem.cost is None:
         raise ProblemError(
