@@ -167,8 +167,7 @@ def passages(
     if statement.summed:
         first = e0[statement.entries(statement.summed)]
         groups.append(_gathered(statement, mesh, first, columns, groups[0], _of(kicks, statement, statement.summed)))
-    order = in_order(statement)
-    e, begins, halves = (ca.vertcat(*parts)[order, :] for parts in zip(*groups, strict=True))
+    e, begins, halves = (in_order(statement, *parts) for parts in zip(*groups, strict=True))
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
     return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))

@@ -315,7 +315,7 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
             gathered = gathered + gathering_step(statement, step, solver)(*ends, *part)
         own = after
         columns.append(ca.vertcat(own, gathered))
-    halves = ca.horzcat(*columns)[in_order(statement), :]
+    halves = in_order(statement, ca.horzcat(*columns))
     if statement.running_uses_matrices:
         arguments = (x, e, states, halves, *interval)
         cost = simpson_interval(statement, substeps)(*arguments)
@@ -330,10 +330,11 @@ def ahead_size(statement: Statement) -> int:
     return len(statement.entries(statement.ahead))
 
 
-def in_order(statement: Statement) -> list[int]:
-    """Positions that bring what runs forward, then backward, then is gathered, into the order of the statement."""
-    order = statement.entries(statement.ahead + statement.behind + statement.summed)
-    return [int(k) for k in np.argsort(order)]
+def in_order(statement: Statement, *parts: Expr) -> Any:
+    """Rows of what runs forward, then backward, then is gathered, in the order of the statement."""
+    order = np.argsort(statement.entries(statement.ahead + statement.behind + statement.summed)).tolist()
+    rows: Expr = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
+    return rows if order == sorted(order) else rows[order, :]
 
 
 @lru_cache(maxsize=KEPT)
@@ -394,7 +395,7 @@ def inside_interval(statement: Statement, count: int, step: StepKind, solver: st
     rows = [ca.horzcat(*first), ca.horzcat(*last[::-1])]
     if statement.summed:
         rows.append(ca.horzcat(*gathered))
-    e = ca.vertcat(*rows)[in_order(statement), :]
+    e = in_order(statement, *rows)
     return ca.Function("inside", [before, after, *interval], [ca.vertcat(x, e)])
 
 
