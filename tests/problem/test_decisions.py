@@ -323,6 +323,21 @@ def test_a_filter_of_a_problem_with_decisions_is_refused():
     refused(lambda: filters.extended_filter(sensor()), "'r' is a decision", "solution['r']")
 
 
+def test_what_knows_controls_only_says_so():
+    """What a combined design gains, and global minima, are not told of problems with decisions."""
+    refused(lambda: co.worth(loop()), "'r' is a decision", "nominal='deterministic'")
+    ocp = co.Problem(1.0)
+    d = ocp.decision("d", guess=1.0, lower=0.1, upper=2.0)
+    x, b, u = ocp.state("x", initial=0.0, variance=1.0), ocp.unknown("b", 1.0, 1.0), ocp.control("u")
+    ocp.dynamics(x, u - b)
+    ocp.measurement("m", x, noise=d)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[b, b] + 0.1 / d)
+    verdict = co.certify(solve(ocp, intervals=10), progress=False)
+    assert not verdict.certified
+    assert "decision d" in verdict.reason
+
+
 def test_something_must_move():
     """Decisions and integrals alone are no control problem."""
     ocp = co.Problem(1.0)
