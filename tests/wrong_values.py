@@ -108,6 +108,7 @@ def stated(**given: dict[str, Any]) -> co.Problem:
     x = ocp.state(**to("state", name="x", initial=1.0, final=0.5, variance=0.5))
     b = ocp.unknown(**to("unknown", name="b", mean=0.1, variance=0.2))
     u = ocp.control(**to("control", name="u"))
+    d = ocp.decision(**to("decision", name="d", guess=0.5, lower=0.1, upper=2.0)) if "decision" in given else 1.0
     if "symmetric" in given:
         ocp.symmetric(**to("symmetric", name="S", size=2, initial=np.eye(2)))
         ocp.dynamics("S", ca.MX.zeros(2, 2))
@@ -116,6 +117,7 @@ def stated(**given: dict[str, Any]) -> co.Problem:
         x, b, u = (group[0].symbol for group in (own.states, own.unknowns, own.controls))
     ocp.dynamics(**to("dynamics", symbol=x, rate=u - b * x, noise=0.1))
     ocp.measurement(**to("measurement", name="m", expression=x, noise=0.1))
+    total = ocp.integral(**to("integral", expression=u**2)) if "integral" in given else 0.0
     if "minimize_expected" in given or "Gain" in given:
         gain = co.Gain(**given["Gain"]) if "Gain" in given else None
         ocp.minimize_expected(**to("minimize_expected", running=u**2, terminal_weight={"x": 1.0}, gain=gain))
@@ -123,7 +125,7 @@ def stated(**given: dict[str, Any]) -> co.Problem:
         E = ocp.estimation_covariance(**to("estimation_covariance"))
         if "E" in given:
             E[given["E"]["key"]]
-        ocp.minimize(**to("minimize", running=u**2, terminal=E[x, x]))
+        ocp.minimize(**to("minimize", running=u**2 + d**2, terminal=E[x, x] + total))
     if "subject_to" in given:
         ocp.subject_to(**to("subject_to", expression=u, lower=-50.0, upper=50.0))
     return ocp
@@ -191,7 +193,8 @@ def called(function: Call, /, **valid: Any) -> Iterator[tuple[str, Call]]:
 def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
     """Of what states a problem."""
     given = functools.partial(in_statement, solved=solved)
-    for method in ("state", "unknown", "parameter", "control", "symmetric", "estimation_covariance", "dynamics"):
+    symbols = ("state", "unknown", "parameter", "control", "decision", "integral", "symmetric")
+    for method in (*symbols, "estimation_covariance", "dynamics"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
     for method in ("measurement", "minimize", "minimize_expected", "subject_to"):

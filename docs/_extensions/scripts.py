@@ -40,6 +40,7 @@ GALLERY = (
             "noisy_integrator",
             "unknown_gain",
             "designed_excitation",
+            "bought_sensor",
         ),
     ),
     (
@@ -88,6 +89,7 @@ GALLERY = (
 )
 HOWTO = (
     "covariance_constraint",
+    "decisions",
     "closed_loop",
     "other_truth",
     "custom_law",

@@ -54,6 +54,8 @@ SMALLEST_EXTRA = 1e-3
 SHORTEN, LENGTHEN = 0.3, 0.5
 # Controls below this share of their scale at the start are zero.
 ZERO = 1e-12
+# Terms of H_u that change the cost by less than this share where a control moves by its scale are roundoff.
+FAINT = 1e-8
 CHORD_STEPS = 60
 CHORD_TOLERANCE = 1e-13
 
@@ -120,7 +122,7 @@ class Space:
         duration = float(rest[0]) if st.duration.free else st.duration.guess
         start = self.start.copy()
         start[self.free] = rest[int(st.duration.free) :]
-        return u, duration, start
+        return u, duration, np.concatenate(st.started(start[: st.nx], self.parameters, start[st.nx :]))
 
     def first(self, guess: Guess) -> Iterate:
         """The iterate of a guess: its controls, terminal time and free initial values."""
@@ -133,21 +135,32 @@ class Space:
     def linearise(self, iterate: Iterate) -> Linear:
         """Backward sweep at an iterate."""
         slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps)
-        return self._linear(iterate.penalty, slopes)
+        return self._linear(iterate.penalty, slopes, iterate.run.z[0, : self.sweeps.statement.nx])
 
-    def _linear(self, penalty: Penalty, slopes: Slopes) -> Linear:
+    def _linear(self, penalty: Penalty, slopes: Slopes, start_state: Array) -> Linear:
         count, free = self.controls, self.sweeps.statement.duration.free
         by_time = slopes.duration.copy()
         by_time[0] += penalty.duration
         control = slopes.control.copy()
         control[0] += self._fold(penalty.control)
-        stacked = np.hstack(
-            [control.reshape(control.shape[0], count), by_time[:, None][:, : int(free)], slopes.start[:, self.free]]
-        )
+        start = slopes.start @ self._tied_slopes(start_state)
+        stacked = np.hstack([control.reshape(control.shape[0], count), by_time[:, None][:, : int(free)], start])
         cost = np.abs(slopes.cost).ravel()
         sizes = np.abs(stacked[0])
         sizes[:count] = cost + np.abs(control[0].ravel() - slopes.cost.ravel())
         return Linear(slope=stacked[0], rows=stacked[1:], sizes=sizes, slopes=slopes)
+
+    def _tied_slopes(self, state: Array) -> Array:
+        """Slopes of z(0) by its free entries: those that decisions give follow them."""
+        st, size = self.sweeps.statement, self.start.size
+        result = np.eye(size)[:, self.free]
+        if st.tied is None:
+            return result
+        rows = [*st.tied.states, *(st.nx + k for k in st.tied.matrices)]
+        by_state = np.zeros((len(rows), size))
+        by_state[:, : st.nx] = np.asarray(st.tied.slopes(state, self.parameters).full())
+        result[rows] = by_state[:, self.free]
+        return result
 
     def _fold(self, nodal: Array) -> Array:
         """Values at the N + 1 nodes as values of the controls: with constant controls the last node has the last."""
@@ -193,8 +206,9 @@ class Space:
         sizes = np.maximum(sizes, (weights * nodal[: weights.size]).ravel())
         norm = np.sqrt(np.sum(inverse[:count] * left[:count] ** 2))
         size = np.sqrt(np.sum(inverse[:count] * sizes**2))
-        slope = float(norm / size) if size > 0 else 0.0
         total = max(self.cost_size(iterate), np.finfo(float).tiny)
+        size = max(size, FAINT * total / np.sqrt(iterate.run.duration))  # where the best control is none
+        slope = float(norm / size) if size > 0 else 0.0
         extra = np.abs(left[count:] * self.unit[count:]).max(initial=0.0) / total
         return Measures(
             ell=ell,
@@ -318,7 +332,7 @@ class Space:
                 break
             u = (iterate.point + total)[: self.controls].reshape(u.shape)
             slopes = reweigh(self.sweeps, linear.slopes, u, iterate.run.duration, self.parameters)
-            present = self._linear(iterate.penalty, slopes)
+            present = self._linear(iterate.penalty, slopes, iterate.run.z[0, : self.sweeps.statement.nx])
         assert step is not None
         return replace(step, change=total)
 
@@ -336,14 +350,18 @@ class Space:
             if group.kind == "path":
                 path = values
             elif group.kind == "start":
-                start = values[0]
+                start = start.copy()
+                start[: values[0].size] = values[0]
             elif group.kind == "end":
                 end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
             else:
                 bounds[1:, limited(st)] = values
+        held = -np.where(measures.active, measures.residual, 0.0)
+        chosen = np.isin(self.free, st.decisions)
+        bounds[0, self.free[chosen]] = held[self.controls + int(st.duration.free) :][chosen]
         final += bounds[-1]
         bounds[-1] = 0.0
-        controls = -np.where(measures.active, measures.residual, 0.0)[: self.controls].reshape(zero.controls.shape)
+        controls = held[: self.controls].reshape(zero.controls.shape)
         return Multipliers(
             final=final[: st.nx],
             final_matrices=final[st.nx :],
@@ -394,9 +412,12 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
     x0, _, e0, _ = st.boundary_values(parameters)
     e0[st.entries(st.behind)] = 0.0  # what runs backward has no initial value of its own
     known = np.concatenate([x0, e0])
+    if st.tied is not None:  # they follow the decisions
+        known[[*st.tied.states, *(st.nx + k for k in st.tied.matrices)]] = 0.0
     free = np.flatnonzero(np.isnan(known))
     guessed = np.concatenate([guess.trajectory.x[0], guess.trajectory.e[0]])
     start = np.where(np.isnan(known), guessed, known)
+    start = np.concatenate(st.started(start[: st.nx], parameters, start[st.nx :]))
     u, duration = guess.trajectory.u, guess.trajectory.duration
     run = sweep_forward(sweeps, u, duration, start, parameters)
     finite = run.z if np.isfinite(run.z).all() else np.tile(start, (mesh.intervals + 1, 1))

@@ -38,6 +38,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
+from covocp.extremal.decisions import with_tied_multipliers
 from covocp.extremal.extremal import Extremal, Guess, Outcome
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
@@ -232,12 +233,14 @@ class GradientSolver:
         """The last iterate as data."""
         run = end.iterate.run
         return Outcome(
-            extremal=Extremal(
-                stated=self._statement,
-                mesh=self._mesh,
-                trajectory=self._trajectory(end.iterate),
-                parameters=space.parameters,
-                multipliers=space.multipliers(end.iterate, end.measures),
+            extremal=with_tied_multipliers(
+                Extremal(
+                    stated=self._statement,
+                    mesh=self._mesh,
+                    trajectory=self._trajectory(end.iterate),
+                    parameters=space.parameters,
+                    multipliers=space.multipliers(end.iterate, end.measures),
+                )
             ),
             cost_terms={"terminal": run.terminal, "running": run.running},
             converged=end.status is Status.SOLVED,

@@ -90,8 +90,9 @@ def limits(statement: Statement) -> tuple[Array, Array]:
 
 
 def limited(statement: Statement) -> Indices:
-    """Entries of z with a bound."""
-    return np.flatnonzero(np.isfinite(limits(statement)).any(axis=0))
+    """Entries of z with a bound along the path; a constant keeps its own from the start."""
+    bounded = np.flatnonzero(np.isfinite(limits(statement)).any(axis=0))
+    return np.setdiff1d(bounded, statement.decisions)
 
 
 def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:
@@ -110,9 +111,19 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
     names = (*statement.state_names, *statement.matrix_names)
     left = [i for i in range(statement.end.size) if i not in exact]
     path, end, start = statement.path, statement.end, statement.start
+    own = start.size - (0 if statement.tied is None else len(statement.tied.states))  # the others hold by themselves
     candidates = [
         _group(statement, "path", path.names, every, shares, path.function, path.lower, path.upper),
-        _group(statement, "start", start.names, every[:1], once, start.function, start.lower, start.upper),
+        _group(
+            statement,
+            "start",
+            start.names[:own],
+            every[:1],
+            once,
+            lambda *arguments: start.function(*arguments)[:own],
+            start.lower[:own],
+            start.upper[:own],
+        ),
         _group(
             statement,
             "end",

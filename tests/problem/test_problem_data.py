@@ -220,7 +220,8 @@ def test_constraint_bounds_crossed():
 
 def test_a_bound_that_is_given_alone_is_the_only_one():
     ocp, x, *_ = lag()
-    for lower, upper, expected in ((None, None, (-np.inf, 0.0)), (1.0, None, (1.0, np.inf)), (None, 2.0, (-np.inf, 2.0))):
+    cases = ((None, None, (-np.inf, 0.0)), (1.0, None, (1.0, np.inf)), (None, 2.0, (-np.inf, 2.0)))
+    for lower, upper, expected in cases:
         ocp.subject_to(x, lower=lower, upper=upper)
         limit = ocp.declarations.constraints[-1]
         assert (limit.lower.item(), limit.upper.item()) == expected

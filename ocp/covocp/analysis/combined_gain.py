@@ -104,7 +104,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
         The estimate; it costs one deterministic solution and a few evaluations.
 
     Raises:
-        ProblemError: no expected cost, constrained gains, or no deterministic cost and no `nominal`.
+        ProblemError: no expected cost, constrained gains, decisions, or no deterministic cost and no `nominal`.
         SolveError: the deterministic problem was not solved.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
@@ -115,6 +115,14 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
             expected="a problem with minimize_expected() and the best gain",
             received=f"'{problem.name}' with " + ("a constrained gain" if expected else "minimize()"),
             remedy="compare solutions by their costs instead",
+        )
+    chosen = [state.name for state in problem.states if state.role == "decision"]
+    if chosen:
+        raise ProblemError(
+            f"worth() looks along the controls only, and '{chosen[0]}' is a decision.",
+            expected="a problem in which controls are chosen",
+            received="decisions: " + ", ".join(chosen),
+            remedy="compare the costs of solve(problem) and solve(problem, nominal='deterministic')",
         )
     if nominal is None:
         classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)

@@ -52,6 +52,9 @@ def _kind(statement: Statement) -> str:
     if len(statement.matrices) > 1:
         names = ", ".join(block.name for block in statement.matrices if not block.estimation)
         return f"the problem has matrix states beside the estimation covariance: {names}"
+    if len(statement.moving) < statement.nx:
+        others = ", ".join(f"{block.role} {block.name}" for block in statement.states if block.role != "moving")
+        return f"the problem has decisions or integrals: {others}"
     if statement.coupled:
         return "the nominal depends on the estimation covariance"
     if statement.measurement is None:

@@ -215,4 +215,4 @@ class Geometry:
 
 
 def _count(part: Part) -> int:
-    return part.rows.stop - part.rows.start
+    return int(part.rows.stop - part.rows.start)

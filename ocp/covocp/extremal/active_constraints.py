@@ -81,6 +81,7 @@ def held_by(extremal: Extremal) -> Held:
     state_sides, state_strict = _sides(t.x, *st.state_bounds, states)
     state_sides[0] = 0.0  # where x(0) is free, its bound is treated by itself
     state_sides[-1, ~np.isnan(xf)] = 0.0
+    state_sides[:, st.decisions] = 0.0  # bounded once, at the start
     matrices = m.matrices.copy()
     matrices[-1] += np.where(np.isnan(ef), m.final_matrices, 0.0)
     matrix_sides, matrix_strict = _sides(t.e, st.matrix_lower, np.full(st.ne, np.inf), matrices)

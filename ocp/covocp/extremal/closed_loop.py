@@ -183,12 +183,18 @@ def loop_substeps(extremal: Extremal) -> int:
     return 2 * pairs
 
 
+def start_covariance(statement: Statement, extremal: Extremal, parameters: Array) -> Array:
+    """Half-vectors at the start as a statement has them for the decisions of an extremal."""
+    own = statement.boundary_values(parameters).initial_matrices
+    return np.asarray(statement.started(extremal.trajectory.x[0], parameters, own)[1])
+
+
 def design_statistics(extremal: Extremal) -> Statistics:
     """The statistics that the design assumes."""
     st = extremal.statement
     block = st.estimation
     return Statistics(
-        initial=unpack(st.boundary_values(extremal.parameters)[2][block.span], block.size),
+        initial=unpack(start_covariance(st, extremal, extremal.parameters)[block.span], block.size),
         density=densities(st),
         parameters=extremal.parameters,
     )

@@ -28,6 +28,7 @@ from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, second_order
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.trajectory import Trajectory
 
 LANCZOS_STEPS = 120
@@ -206,7 +207,10 @@ class _Reduced:
         product, jacobian = second_order(st, fine.mesh, held.entries)
         free = tangents.free.ravel()
         metric = mass_matrix(mesh, t.duration, st.nu)[np.ix_(free, free)]
-        weights = t.duration * (_scales(t.u).mean() / _scales(t.x)[list(tangents.start)]) ** 2
+        weights = np.zeros(0)
+        if tangents.start:  # in units that say something where the best control is none
+            controls = choose_scales(st, mesh, t, extremal.parameters).u.mean()
+            weights = t.duration * (controls / _scales(t.x)[list(tangents.start)]) ** 2
         root = cholesky(block_diag(metric, np.diag(weights)), lower=True)
         rows = _by_v(tangents, *between.backward(*_split(fine, np.asarray(jacobian(*given).full()))), root)
         if not np.isfinite(rows).all():

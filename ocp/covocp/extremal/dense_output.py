@@ -117,6 +117,8 @@ def _tracks(extremal: Extremal, coarse: Dense, matrices: bool) -> list[tuple[lis
             tracks.append((rows, _march(_Steps.of(extremal, coarse, rows, states))))
         elif rows:
             tracks.append((rows, _rows(coarse, rows)))
+    if gathered := [nx + k for k in st.entries(st.summed)]:  # what they are at the nodes is what counts
+        tracks.append((gathered, _rows(coarse, gathered)))
     return tracks
 
 

@@ -42,7 +42,7 @@ def evaluate_controls(
         start: state at the start; None: the statement's, free entries guessed.
     """
     x0, e0 = starts(statement, mesh, parameters)
-    x0 = x0 if start is None else start
+    x0, e0 = statement.started(x0 if start is None else start, parameters, e0)
     symbols = [
         ca.MX.sym("u", statement.nu, mesh.control_nodes),
         ca.MX.sym("x0", statement.nx),

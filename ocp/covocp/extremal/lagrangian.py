@@ -70,7 +70,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         ends, fine, cost = nominal_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
         e = ca.MX(0, n + 1)
         if st.matrices:
-            e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, e0)
+            e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1])
             cost += matrix_cost
     value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])
     value += ca.dot(final, x[:, -1]) + ca.dot(final_e, e[:, -1]) + ca.dot(states, x) + ca.dot(matrices, e)

@@ -15,6 +15,7 @@ from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
+from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
@@ -58,6 +59,8 @@ class Optimality:
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
             had. Negative: the solution is a saddle.
+        decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
+            multipliers of its bounds; relative to the sum of the absolute terms; None without decisions.
         cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
             cost (E-1) from the covariances of the loop; None without a closed loop.
         cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
@@ -77,6 +80,7 @@ class Optimality:
     smallest_eigenvalue: float
     curvature: float | None
     complementarity: float | None = None
+    decisions: float | None = None
     cost_identity: float | None = None
     cross_covariance: float | None = None
     conservation: float | None = None
@@ -141,6 +145,7 @@ def assess(
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=_curvature(extremal),
         complementarity=complementarity(extremal),
+        decisions=decision_slopes(extremal, costates).relative if st.decisions else None,
         cost_identity=cost_identity,
         **_loop_identities(loop),
     )

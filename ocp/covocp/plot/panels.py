@@ -94,10 +94,11 @@ def _explained_once(panels: list[Panel]) -> list[Panel]:
 def _usual(drawn: list[Drawn], blocks: Mapping[str, Block]) -> list[Any]:
     """What is drawn where nothing is asked for.
 
-    Of closed loops root mean squares stand in place of the covariances that they come from.
+    Of closed loops root mean squares stand in place of the covariances that they come from; decisions and integrals are
+    numbers, which print shows.
     """
     kinds = ("state", "control", "unknown", "matrix")
-    ordered = [b for kind in kinds for b in blocks.values() if b.kind == kind]
+    ordered = [b for kind in kinds for b in blocks.values() if b.kind == kind and b.role == "moving"]
     if all(d.solution.loop is None for d in drawn):
         return [b.name for b in ordered]
     plain = [b for b in ordered if b.name not in (GAIN, *COVARIANCES) and not (b.estimation or b.backward)]

@@ -39,12 +39,12 @@ class Attitude:
     @property
     def matrix(self) -> ca.MX:
         """The rotation C, shape (3, 3)."""
-        return rotation(self.quaternion)
+        return ca.MX(rotation(self.quaternion))
 
     @property
     def vector(self) -> ca.MX:
         """The rotation vector phi of C = e^{-phi^x}, |phi| <= pi, shape (3, 1) [rad]; it jumps at half a turn."""
-        return so3.log(self.matrix)
+        return ca.MX(so3.log(self.matrix))
 
     def error(self, reference: Given) -> ca.MX:
         """The rotation vector, in body axes, by which the attitude differs from another one, shape (3, 1) [rad].
@@ -72,7 +72,7 @@ class Attitude:
             ProblemError: a vector of another shape, of length zero, NaN.
         """
         axis, target = (_unit(self.name, *pair) for pair in (("body axis", body_axis), ("direction", direction)))
-        return ca.dot(axis, self.matrix @ target)
+        return ca.MX(ca.dot(axis, self.matrix @ target))
 
 
 def with_attitude(
@@ -269,4 +269,4 @@ def _quaternions(name: str, values: Given, start: Array) -> Array:
     reference = rows[0] if np.isnan(start).any() else start
     signs = np.where(np.concatenate([[rows[0] @ reference], np.sum(rows[1:] * rows[:-1], axis=1)]) < 0, -1.0, 1.0)
     rows = rows * np.cumprod(signs)[:, None]
-    return rows[0] if given.ndim == 1 else rows
+    return np.asarray(rows[0] if given.ndim == 1 else rows)

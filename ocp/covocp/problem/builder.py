@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -13,30 +13,26 @@ from covocp.base.checks import (
     as_number,
     bound_columns,
     caller,
-    check_inside,
     check_kind,
     check_positive,
     column,
     density_matrix,
-    is_symbolic,
 )
-from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.attitude import Attitude, with_attitude
-from covocp.problem.boundary_values import check_free, end_value
+from covocp.problem.boundary_values import end_value
 from covocp.problem.checks import (
     as_expression,
-    check_constrains,
     check_name,
     check_size,
     column_expression,
-    limit_columns,
     scale_column,
 )
+from covocp.problem.constraints import with_constraint
+from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
-    Constraint,
     Control,
     Declarations,
     Free,
@@ -47,11 +43,12 @@ from covocp.problem.declarations import (
     Place,
     State,
     Unknown,
-    declare_matrix,
+    plain_matrix,
 )
 from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
+from covocp.problem.integrals import with_integral
 from covocp.problem.measurement_information import stated_noise
 from covocp.problem.rates import with_rate
 from covocp.statement.statement import Statement
@@ -261,11 +258,59 @@ class Problem:
             ProblemError: name used twice, NaN or inf.
         """
         size = self._declare(name, int(np.size(as_number(name, "value", value))))
-        entry = Parameter(
-            **_symbol(name, size, unit),
-            value=column(name, "value", value, size),
-        )
+        entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
         return self._add("parameters", entry).symbol
+
+    @checked(unit=text)
+    def decision(
+        self,
+        name: str,
+        shape: int = 1,
+        *,
+        guess: Given,
+        lower: Given = -np.inf,
+        upper: Given = np.inf,
+        unit: str = "",
+    ) -> ca.MX:
+        """Declare a constant that the optimiser chooses, for use wherever a number or an expression is taken.
+
+        Args:
+            name: unique name.
+            shape: number of components.
+            guess: where it starts, shape () or (shape,), within the bounds; its magnitude scales it.
+            lower: lower bounds.
+            upper: upper bounds.
+            unit: for printouts and files.
+
+        Returns:
+            The symbol, shape (shape, 1).
+
+        Raises:
+            ProblemError: name used twice, bounds crossed, a guess outside of them, NaN or inf; when the problem is
+                built: nothing depends on it, the cost falls with it without end.
+        """
+        own = _symbol(name, self._declare(name, shape), unit)
+        self._change(with_constant(self._declarations, own, lower, upper, guess))
+        return cast(ca.MX, own["symbol"])
+
+    @checked(unit=text)
+    def integral(self, expression: Given, *, name: str | None = None, unit: str = "") -> ca.MX:
+        """The integral of an expression over [0, T], for terminal costs and for constraints at the end.
+
+        Args:
+            expression: scalar, of states, controls, matrix states and covariances, decisions, time; per second.
+            name: unique name; "integral k" by default. `solution[name]` is the integral up to each node.
+            unit: for printouts and files.
+
+        Returns:
+            The symbol, shape (1, 1).
+
+        Raises:
+            ProblemError: not scalar, nothing in it that moves, another integral in it, name used twice.
+        """
+        declarations, symbol = with_integral(self._declarations, name, expression, unit)
+        self._change(declarations)
+        return symbol
 
     @checked(unit=text)
     def control(
@@ -329,24 +374,7 @@ class Problem:
                 initial matrix that is not positive semidefinite.
         """
         size = self._declare(name, size)
-        for what, value in (("initial value", initial), ("final value", final)):
-            check_free(name, what, value)
-        lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
-        if lower is not None and initial is not None and not is_symbolic(initial):
-            diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
-            check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
-        entry = declare_matrix(
-            name,
-            labels=tuple(str(i) for i in range(size)),
-            where=caller(),
-            unit=unit,
-            initial=initial,
-            final=final,
-            lower=lower,
-            guess=guess,
-            covariance=lower is not None and lower >= 0,
-        )
-        return self._add("matrices", entry).matrix
+        return self._add("matrices", plain_matrix(name, size, unit, initial, final, lower, guess)).matrix
 
     def estimation_covariance(self, initial: Given = None) -> EstimationCovariance:
         """Add the Kalman-Bucy covariance E of the augmented state (states, then unknowns), [Schmidt 2.5-3].
@@ -364,7 +392,8 @@ class Problem:
             ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
         """
         self._change(with_estimation(self._declarations, initial))
-        return EstimationCovariance(self._declarations.augmented, self._declarations.matrices[-1])
+        E = next(matrix for matrix in self._declarations.matrices if matrix.estimation)
+        return EstimationCovariance(self._declarations.augmented, E)
 
     def dynamics(self, symbol: Given, rate: Given, noise: Given = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
@@ -457,7 +486,7 @@ class Problem:
         *,
         lower: Given = None,
         upper: Given = None,
-        at: Place = "path",
+        at: Place | None = None,
         name: str | None = None,
     ) -> None:
         """Require lower <= expression <= upper.
@@ -468,31 +497,17 @@ class Problem:
         control).
 
         Args:
-            expression: of states, controls, matrix states, time; a column or a scalar.
+            expression: of states, controls, matrix states, decisions, integrals, time; a column or a scalar.
             lower: numbers, shape of the expression; None: no lower bound.
             upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
-            at: "path", "initial" or "final".
+            at: "path", "initial" or "final"; None: "path", and "final" for integrals and for decisions alone.
             name: appears in every diagnostic; "constraint k" by default.
 
         Raises:
-            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place.
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an integral
+                elsewhere than at the end.
         """
-        label = name if name is not None else f"constraint {len(self._declarations.constraints) + 1}"
-        if not isinstance(at, str) or at not in ("path", "initial", "final"):
-            raise ProblemError(
-                f"'{label}' has an unknown place.",
-                expected="at='path', 'initial' or 'final'",
-                received=repr(at),
-                remedy="choose one of the three",
-            )
-        value = column_expression(label, "constraint", expression)
-        own = self._declarations
-        constants = [*(q.symbol for q in own.parameters), *(q.symbol for q in own.unknowns), own.time]
-        check_constrains(label, value, constants)
-        size = self._declare(label, value.shape[0])
-        low, high = limit_columns(label, lower, upper, size)
-        entry = Constraint(name=label, expression=value, lower=low, upper=high, at=at, where=caller())
-        self._add("constraints", entry)
+        self._change(with_constraint(self._declarations, expression, lower, upper, at, name))
 
     def statement(self) -> Statement:
         """The frozen problem that solvers read; built once and kept until something is added.

@@ -10,11 +10,23 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import check_argument, truth
-from covocp.base.checks import check_positive, check_times, one_number, symmetric_data
+from covocp.base.checks import (
+    as_number,
+    caller,
+    check_inside,
+    check_positive,
+    check_times,
+    column,
+    is_symbolic,
+    one_number,
+    symmetric_data,
+)
 from covocp.base.expressions import Given
 from covocp.base.geometry import Chart
 from covocp.base.matrices import Array, half_length, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.problem.boundary_values import check_free
+from covocp.statement.statement import ROLES, Role
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
@@ -50,9 +62,9 @@ class Free:
 class State:
     """A vector state of the nominal; data are columns of numbers or of expressions in the parameters.
 
-    estimated: whether it is part of the augmented state; constants to be chosen are not, and come last. chart: how it
-    moves where it is no vector; its variance and its noise are those of its tangent, and what it has to reach is its
-    target, which a constraint poses, not its final value.
+    role: constants that are chosen (decisions) and integrals are no part of the augmented state, and come last.
+    chart: how it moves where it is no vector; its variance and its noise are those of its tangent, and what it has to
+        reach is its target, which a constraint poses, not its final value.
     """
 
     name: str
@@ -67,7 +79,7 @@ class State:
     guess: Guess
     scale: Array | None
     variance: ca.MX
-    estimated: bool = True
+    role: Role = "moving"
     chart: Chart | None = None
     target: ca.MX | None = None
 
@@ -77,6 +89,11 @@ class State:
     def tangent(self) -> int:
         """Entries of its tangent where it is no vector, else 0."""
         return 0 if self.chart is None else self.chart.tangent
+
+    @property
+    def estimated(self) -> bool:
+        """Whether it is part of the augmented state."""
+        return self.role == "moving"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +144,10 @@ class Control:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Matrix:
-    """A symmetric matrix state; `symbol` is its half-vector, `matrix` the full matrix that the user sees."""
+    """A symmetric matrix state; `symbol` is its half-vector, `matrix` the full matrix that the user sees.
+
+    role: "integral" of one number that depends on matrices and on which nothing depends; these come last.
+    """
 
     name: str
     symbol: ca.MX
@@ -143,6 +163,7 @@ class Matrix:
     estimation: bool
     labels: tuple[str, ...]
     backward: Backward | None = None
+    role: Role = "moving"
 
     __repr__ = short_repr
 
@@ -174,6 +195,7 @@ def declare_matrix(
     covariance: bool = False,
     estimation: bool = False,
     backward: Backward | None = None,
+    role: Role = "moving",
 ) -> Matrix:
     """A symmetric matrix state with a symbol of its own, a row for each label.
 
@@ -201,6 +223,30 @@ def declare_matrix(
         estimation=estimation,
         labels=labels,
         backward=backward,
+        role=role,
+    )
+
+
+def plain_matrix(
+    name: str, size: int, unit: str, initial: Given, final: Given, lower: float | None, guess: Given
+) -> Matrix:
+    """A symmetric matrix state of the user's own; arguments and errors as of `Problem.symmetric`."""
+    for what, value in (("initial value", initial), ("final value", final)):
+        check_free(name, what, value)
+    lower = None if lower is None else float(column(name, "lower bound", lower, 1, inf=True)[0])
+    if lower is not None and initial is not None and not is_symbolic(initial):
+        diagonal = np.diagonal(np.atleast_2d(as_number(name, "initial value", initial)))
+        check_inside(name, "initial", diagonal, np.full(diagonal.size, lower), np.full(diagonal.size, np.inf))
+    return declare_matrix(
+        name,
+        labels=tuple(str(i) for i in range(size)),
+        where=caller(),
+        unit=unit,
+        initial=initial,
+        final=final,
+        lower=lower,
+        guess=guess,
+        covariance=lower is not None and lower >= 0,
     )
 
 
@@ -356,7 +402,12 @@ class Declarations:
         return [*(state for state in self.states if state.estimated), *self.unknowns]
 
     def adding(self, **more: Any) -> Declarations:
-        """These and one more each in some groups, by the names of the groups; rates by name."""
+        """These and one more each in some groups, by the names of the groups; rates by name.
+
+        Among states and matrices those that play another role than a state stay last.
+        """
         rates = {**self.rates, **more.pop("rates", {})}
         grown: dict[str, Any] = {group: (*getattr(self, group), entry) for group, entry in more.items()}
+        for group in grown.keys() & {"states", "matrices"}:
+            grown[group] = tuple(sorted(grown[group], key=lambda entry: ROLES.index(entry.role)))
         return replace(self, rates=rates, **grown)

@@ -10,8 +10,10 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices
 from covocp.base.pages import Part, Section, Sentence, Table, number
+from covocp.problem.decisions import decisions_of
 from covocp.problem.formulas import formulas
-from covocp.statement.statement import entry_names, half_names
+from covocp.problem.integrals import integrals_of
+from covocp.statement.statement import entries_of, entry_names, half_names
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
@@ -37,11 +39,13 @@ def sections(problem: Problem) -> list[Section]:
     parts: list[Section] = [
         _head(problem),
         _states(problem, written),
+        _decisions(problem),
         _unknowns(problem, written),
         _values("parameter", [(q, [number(v) for v in q.value]) for q in problem.parameters], "value"),
         _values("control", [(q, _ranges(q.lower, q.upper)) for q in problem.controls], "bounds"),
         _matrices(problem, written),
         _rates(problem, written),
+        _integrals(problem, written),
         _measurements(problem, written),
         _cost(problem, written),
         _constraints(problem, written),
@@ -63,7 +67,7 @@ class _Written:
         expressions = dict(_expressions(problem))
         vectors: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
         symbols = [entry.symbol for entry in vectors] + [matrix.symbol for matrix in problem.matrices]
-        names = [entry_names((q,)) for q in vectors] + [half_names(q.name, q.labels) for q in problem.matrices]
+        names = [entry_names((q,)) for q in vectors] + [entries_of(q) for q in problem.matrices]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
@@ -166,7 +170,7 @@ def _ranges_of(free: Any) -> str:
 
 def _states(problem: Problem, written: _Written) -> Section:
     rows = []
-    for q in problem.states:
+    for q in (state for state in problem.states if state.role == "moving"):
         initial, final = _free(written("initial", q.name)), _free(written("final", q.name))
         units = [q.unit if q.chart is None else ""] * q.size
         columns = (entry_names((q,)), units, initial, final, _ranges(q.lower, q.upper))
@@ -178,6 +182,20 @@ def _states(problem: Problem, written: _Written) -> Section:
 def _filled(cells: list[str], size: int) -> list[str]:
     """Cells of the errors of a state, which has more entries than errors where it is no vector."""
     return [*cells, *[""] * (size - len(cells))]
+
+
+def _decisions(problem: Problem) -> Section:
+    rows = []
+    for q in decisions_of(problem.declarations):
+        guess: Any = q.guess
+        columns = (entry_names((q,)), [q.unit] * q.size, _ranges(q.lower, q.upper), [number(v) for v in guess])
+        rows += _shortened([list(row) for row in zip(*columns, strict=True)])
+    return _table(["decision", "unit", "bounds", "guess"], rows)
+
+
+def _integrals(problem: Problem, written: _Written) -> Section:
+    rows = [[q.name, q.unit, *written("rate", q.name)] for q in integrals_of(problem.declarations)]
+    return _table(["integral", "unit", "of"], rows)
 
 
 def _unknowns(problem: Problem, written: _Written) -> Section:
@@ -199,7 +217,8 @@ def _values(kind: str, entries: Sequence[tuple[Any, list[str]]], what: str) -> S
 def _matrices(problem: Problem, written: _Written) -> Section:
     """Symmetric matrices: their entries; of large ones, and where the others are zero, those of the diagonal."""
     rows = []
-    for q in problem.matrices:
+    matrices = [matrix for matrix in problem.matrices if matrix.role == "moving"]
+    for q in matrices:
         names = half_names(q.name, q.labels)
         ends = [
             _free(written(kind, q.name)) if value is not None else [FREE if kind == "initial" else ""] * len(names)
@@ -212,14 +231,14 @@ def _matrices(problem: Problem, written: _Written) -> Section:
         if len(own) > MOST_ENTRIES or beside <= {("0", "", ""), ("0", "0", ""), ("free", "", "")}:
             own = [row for row, on in zip(own, diagonal, strict=True) if on]
         rows += _shortened(own)
-    kinds = dict.fromkeys("covariance" if q.covariance else "matrix" for q in problem.matrices)
+    kinds = dict.fromkeys("covariance" if q.covariance else "matrix" for q in matrices)
     return _table([" or ".join(kinds), "unit", "at 0", "at T", "lower bound"], rows)
 
 
 def _rates(problem: Problem, written: _Written) -> Section:
     """Rates with the densities of their noise, and what the letters of the filter's mean."""
     rows, notes = [], list[Part]()
-    for state in problem.states:
+    for state in (q for q in problem.states if q.role == "moving"):
         given = problem.rates.get(state.name)
         rates = ["(not given yet)"] * state.size if given is None else written("rate", state.name)
         noise = [""] * state.size if given is None or given.noise is None else written.diagonal("noise", state.name)
@@ -229,7 +248,7 @@ def _rates(problem: Problem, written: _Written) -> Section:
             _filled(noise, state.size),
         )
         rows += _shortened([list(row) for row in zip(*columns, strict=True)])
-    for matrix in problem.matrices:
+    for matrix in (q for q in problem.matrices if q.role == "moving"):
         if matrix.estimation:
             measured = bool(problem.measurements)
             rows.append([f"d {matrix.name}/dt", f"= {FILTER}{UPDATE if measured else ''}", ""])

@@ -20,7 +20,7 @@ AugmentedEntry = State | Unknown
 
 
 def with_estimation(declarations: Declarations, initial: Given = None) -> Declarations:
-    """The declarations with the Kalman-Bucy covariance E of the augmented state, the last of the matrices.
+    """The declarations with the Kalman-Bucy covariance E of the augmented state.
 
     Args:
         declarations: of a problem.

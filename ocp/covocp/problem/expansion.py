@@ -21,10 +21,11 @@ from covocp.statement.statement import entry_names, error_size
 def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
     check_dynamics(problem.states, problem.rates)
+    moving = [state for state in problem.states if state.role == "moving"]
     at = moved(problem.augmented)
     controls = [entry.symbol for entry in problem.controls]
     count = sum(entry.size for entry in problem.unknowns)
-    rates = ca.vertcat(*(tangent_rate(problem, state) for state in problem.states), ca.MX(count, 1))
+    rates = ca.vertcat(*(tangent_rate(problem, state) for state in moving), ca.MX(count, 1))
     running, terminal = at.write(expected.running), at.write(expected.terminal)
     by_state = _slope(running, at.by).T
     at_end = _slope(terminal, at.by).T
@@ -128,7 +129,7 @@ def _control_weights(problem: Declarations, expected: Expected, curvature: Expr)
 def _check_terminal_weights(problem: Declarations, end: Expr) -> None:
     """A prescribed final value needs a weight: the nominal meets it, the actual system will miss it (case 2)."""
     offset = 0
-    for state in problem.states:
+    for state in (entry for entry in problem.states if entry.role == "moving"):
         free = [state.target is None] * error_size(state)
         if state.chart is None and state.final.is_constant():
             free = np.isnan(ca.evalf(state.final).full()).ravel().tolist()

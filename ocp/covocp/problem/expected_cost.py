@@ -37,6 +37,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.problem.checks import as_expression, find_name
+from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
     Backward,
     Control,
@@ -45,12 +46,12 @@ from covocp.problem.declarations import (
     Expansion,
     Expected,
     Gain,
-    State,
     declare_matrix,
 )
 from covocp.problem.estimation_covariance import with_estimation
 from covocp.problem.expansion import expand, measurement_slope
 from covocp.problem.freeze import freeze
+from covocp.problem.integrals import check_expected
 from covocp.problem.measurement_information import inverse_density
 from covocp.statement.names import name_of, split_entry
 from covocp.statement.statement import Statement, error_names, error_size
@@ -137,6 +138,7 @@ def derive(problem: Declarations) -> Declarations:
     assert expected is not None
     _check_random(problem)
     _check_contents(problem, expected)
+    check_expected(problem, [expected.running, expected.terminal])
     derived = replace(problem, expected=None)
     if not any(matrix.estimation for matrix in derived.matrices):
         derived = with_estimation(derived)
@@ -189,7 +191,11 @@ def deterministic(problem: Declarations) -> Declarations:
             remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
         )
     used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
-    matrices = tuple(m for m in problem.matrices if m.symbol.__hash__() in used or not m.estimation)
+    kept = [m for m in problem.matrices if m.symbol.__hash__() in used or (not m.estimation and m.role == "moving")]
+    needed = {s.__hash__() for m in kept if m.role == "integral" for s in ca.symvar(problem.rates[m.name].rate)}
+    matrices = tuple(m for m in problem.matrices if m in kept or m.symbol.__hash__() in needed)
+    dropped = {m.name for m in problem.matrices if m.role == "integral"} - {m.name for m in matrices}
+    problem = replace(problem, rates={name: rate for name, rate in problem.rates.items() if name not in dropped})
     cost = (expected.running, expected.terminal)
     entries: list[Any] = [*problem.states, *problem.controls, *matrices]
     chosen = {entry.symbol.__hash__() for entry in entries}
@@ -305,25 +311,13 @@ def _with_free_gain(
     for k, index in enumerate(where.tolist()):
         position[index, k] = 1.0
     C = ca.reshape(ca.sparsify(position) @ symbol, rows, size)
-    common: dict[str, Any] = {
-        "name": GAIN,
-        "symbol": symbol,
-        "size": int(where.size),
-        "where": "minimize_expected()",
-        "unit": "",
-        "lower": low.ravel(order="F")[where],
-        "upper": high.ravel(order="F")[where],
-        "guess": guess.ravel(order="F")[where],
-        "scale": None,
-    }
+    place = "minimize_expected()"
+    own: dict[str, Any] = {"name": GAIN, "symbol": symbol, "size": int(where.size), "where": place, "unit": ""}
+    lower, upper, start = (values.ravel(order="F")[where] for values in (low, high, guess))
     if gain.constant:
-        free = ca.MX(ca.DM.nan(where.size, 1))
-        nothing = ca.MX(where.size, where.size)
-        constants = State(**common, initial=free, final=free, variance=nothing, estimated=False)
-        still = Dynamics(rate=ca.MX.zeros(where.size, 1), noise=None, where="minimize_expected()")
-        problem = problem.adding(states=constants, rates={GAIN: still})
+        problem = with_constant(problem, own, lower, upper, start)
     else:
-        problem = problem.adding(controls=Control(**common))
+        problem = problem.adding(controls=Control(**own, lower=lower, upper=upper, guess=start, scale=None))
     estimate = declare_matrix(
         ESTIMATE,
         labels=labels,

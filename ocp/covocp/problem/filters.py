@@ -14,6 +14,7 @@ from covocp.blocks.bucy import time_step
 from covocp.blocks.extended import Estimated, bucy_slopes, corrected_by, propagated
 from covocp.blocks.updates import Form, Missing
 from covocp.problem.builder import Problem
+from covocp.problem.decisions import decisions_of
 from covocp.problem.rates import process_noise
 from covocp.statement.statement import Statement
 
@@ -145,6 +146,13 @@ class _System:
 
 def _statement(problem: Problem) -> Statement:
     check_kind(problem, Problem, "give the problem itself, not its solution")
+    if chosen := decisions_of(problem.declarations):
+        raise ProblemError(
+            f"The filter of a problem needs numbers, and '{chosen[0].name}' is a decision.",
+            expected="a problem whose constants are numbers or parameters",
+            received="decisions: " + ", ".join(entry.name for entry in chosen),
+            remedy=f"build the problem with the chosen numbers in their place: solution['{chosen[0].name}']",
+        )
     return problem.statement()
 
 

@@ -18,7 +18,10 @@ from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.base.short_repr import short_repr
 from covocp.problem.checks import check_dynamics
+from covocp.problem.decisions import check_decisions
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
+from covocp.problem.ends import boundary, tied_values, with_end_conditions
+from covocp.problem.integrals import check_integrals
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.problem.rates import process_noise
 from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement, error_names, error_size
@@ -54,6 +57,7 @@ def freeze(problem: Declarations) -> Statement:
             measurement noise that is singular.
     """
     _check_complete(problem)
+    problem = with_end_conditions(problem)
     stacked = _stack(problem)
     x, u, e, t, _, p = stacked.inputs
     rates = _state_rates(problem, stacked)
@@ -76,7 +80,8 @@ def freeze(problem: Declarations) -> Statement:
         nominal=nominal,
         rates=stacked.function("rates", [rates, matrix_rates, running]),
         terminal=stacked.function("terminal", [terminal], without=("control", "time")),
-        boundary=_boundary(problem),
+        boundary=boundary(problem),
+        tied=tied_values(problem),
         matrix_end=_matrix_end(problem, stacked),
         loop=_loop(problem, stacked),
         riccati=riccati,
@@ -112,9 +117,12 @@ def _check_complete(problem: Declarations) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
     moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
     check_dynamics(moving, problem.rates)
-    if not problem.states:
+    if not any(state.role == "moving" for state in problem.states):
         raise ProblemError(
-            "The problem has no state.", expected="at least one state", received="none", remedy="add one by state()"
+            "The problem has no state.",
+            expected="at least one state beside decisions and integrals",
+            received=", ".join(state.name for state in problem.states) or "none",
+            remedy="add one by state(); its rate may be 0",
         )
     if problem.cost is None:
         raise ProblemError(
@@ -142,6 +150,8 @@ def _check_complete(problem: Declarations) -> None:
             remedy="move the call down",
         )
     _check_symbols(problem)
+    check_integrals(problem)
+    check_decisions(problem)
     check_readings(problem.measurements, problem.matrices)
 
 
@@ -261,7 +271,8 @@ def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple
             values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
         else:
             values += stacked.substitute(problem.rates[entry.name].rate)
-            form = recognise(values[-1], half, entry.size) if stacked.symbolic is ca.SX else None
+            plain = entry.role == "moving" and stacked.symbolic is ca.SX
+            form = recognise(values[-1], half, entry.size) if plain else None
         if form is not None and ca.depends_on(ca.veccat(*form), e):
             form = None
         forms.append(form and stacked.function(f"riccati_{len(forms)}", list(form), without=("matrices",)))
@@ -347,6 +358,7 @@ def _blocks(problem: Declarations) -> tuple[Block, ...]:
                     backward=isinstance(entry, Matrix) and entry.backward is not None,
                     unit=entry.unit,
                     tangent=getattr(entry, "tangent", 0),
+                    role=getattr(entry, "role", "moving"),
                 )
             )
             offset += blocks[-1].length
@@ -372,38 +384,6 @@ def _duration(problem: Declarations) -> Duration:
         number = float(problem.duration)
         return Duration(guess=number, lower=number, upper=number)
     return Duration(guess=free.guess, lower=free.lower, upper=free.upper)
-
-
-def _boundary(problem: Declarations) -> ca.Function:
-    """Initial and final values of states and matrices as functions of the parameters."""
-    own = [entry.symbol for entry in _all(problem.parameters, problem.unknowns)]
-    free = [ca.MX(ca.DM.nan(entry.symbol.shape)) for entry in problem.matrices]
-    outputs = [
-        ca.vertcat(ca.MX(0, 1), *(entry.initial for entry in problem.states)),
-        ca.vertcat(ca.MX(0, 1), *(entry.final for entry in problem.states)),
-        ca.vertcat(
-            ca.MX(0, 1),
-            *(m.initial if m.initial is not None else f for m, f in zip(problem.matrices, free, strict=True)),
-        ),
-        ca.vertcat(
-            ca.MX(0, 1), *(m.final if m.final is not None else f for m, f in zip(problem.matrices, free, strict=True))
-        ),
-    ]
-    p = ca.MX.sym("parameters", sum(symbol.shape[0] for symbol in own))
-    offsets = np.cumsum([0, *(symbol.shape[0] for symbol in own)]).tolist()
-    known = {symbol.__hash__() for symbol in own}
-    for symbol in ca.symvar(ca.veccat(*outputs)):
-        if symbol.__hash__() not in known:
-            raise ProblemError(
-                f"An initial or final value contains '{symbol.name()}'.",
-                expected="numbers, or expressions of parameters of this problem",
-                received=f"'{symbol.name()}'",
-                remedy="use subject_to(..., at='initial' or 'final') for conditions between variables",
-            )
-    arguments = [p[i:j] for i, j in pairwise(offsets)]
-    values = ca.Function("boundary", own, outputs).call(arguments, True, False)
-    names = ["initial_state", "final_state", "initial_matrices", "final_matrices"]
-    return ca.Function("boundary", [p], values, ["parameters"], names)
 
 
 def _matrix_end(problem: Declarations, stacked: Stacked) -> ca.Function | None:

@@ -43,12 +43,13 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class System:
-    """A system with its statistics. n: rows of the augmented state's error, of which `states` move; m: controls fed back.
+    """A system with its statistics. n: errors of the augmented state, of which `states` move; m: controls fed back.
 
     start: mean of the augmented state at time zero; (n,) where all of it are vectors.
     variance: covariance of its deviation there, (n, n).
     linear: (state, control, time, duration, parameters) -> velocity of the augmented state (n,), F (n, n), G (n, m),
         process noise Q (n, n), measured values h (r,), M (r, n), their slope by the control (r, m), noise U (r, r).
+    constants: what stands behind the states in x(0): decisions as they were chosen, integrals.
     """
 
     statement: Statement
@@ -58,6 +59,7 @@ class System:
     states: int
     fed_back: int
     linear: ca.Function
+    constants: Array
 
     __repr__ = short_repr
 
@@ -87,7 +89,7 @@ class System:
 
     def error(self, start: Array) -> Array:
         """By how much an augmented state differs from the mean at time zero, (n,)."""
-        return self.geometry.differences(start[None], self.start[None])[0]
+        return np.asarray(self.geometry.differences(start[None], self.start[None])[0])
 
     @property
     def measured(self) -> int:
@@ -135,6 +137,7 @@ def design_system(solution: Solution) -> System:
         start=_augmented(statement, start[: statement.nx], solution.parameters),
         variance=unpack(solution.trajectory.e[0, block.span], block.size),
         fed_back=feedback_rows(statement),
+        constants=solution.trajectory.x[0, len(statement.moving) :],
     )
 
 
@@ -181,7 +184,9 @@ def _augmented(statement: Statement, state: Array, parameters: Array) -> Array:
     return np.concatenate([state[:entries], parameters[parameters.size - statement.unknowns :]])
 
 
-def _system(statement: Statement, parameters: Array, *, start: Array, variance: Array, fed_back: int) -> System:
+def _system(
+    statement: Statement, parameters: Array, *, start: Array, variance: Array, fed_back: int, constants: Array
+) -> System:
     return System(
         statement=statement,
         parameters=parameters,
@@ -190,6 +195,7 @@ def _system(statement: Statement, parameters: Array, *, start: Array, variance: 
         states=len(statement.augmented) - statement.unknowns,
         fed_back=fed_back,
         linear=_linear(statement, fed_back),
+        constants=constants,
     )
 
 
@@ -239,19 +245,26 @@ def _with_values(design: System, truth: Mapping[Any, Any]) -> System:
             rows = slice(design.states + block.offset - first, design.states + block.offset - first + block.size)
             variance[rows, :] = 0.0
             variance[:, rows] = 0.0
-    return _system(statement, values, start=system.start, variance=variance, fed_back=design.fed_back)
+    return replace(system, variance=variance)
 
 
 def _from_statement(design: System, statement: Statement, values: Array) -> System:
     """Start and covariance as a statement has them for these values; free ones as the design has them."""
     state, _, matrices, _ = statement.boundary_values(values)
-    start = _augmented(statement, state, values)
-    start = np.where(np.isnan(start), design.start, start)
+    moving = len(statement.moving)
+    known = np.concatenate([design.start[:moving], design.constants])[: statement.nx]
+    state, matrices = statement.started(np.where(np.isnan(state), known, state), values, matrices)
     block = _estimation(statement)
     assert block is not None
     half = matrices[block.span]
-    variance = design.variance if np.isnan(half).any() else unpack(half, block.size)
-    return _system(statement, values, start=start, variance=variance, fed_back=design.fed_back)
+    return _system(
+        statement,
+        values,
+        start=_augmented(statement, state, values),
+        variance=design.variance if np.isnan(half).any() else unpack(half, block.size),
+        fed_back=design.fed_back,
+        constants=design.constants,
+    )
 
 
 def _statement_of(truth: Declarations) -> Statement:
@@ -283,6 +296,16 @@ def _check_symbols(design: System, truth: Statement) -> None:
                 received=_listed(other),
                 remedy=f"declare the same {what} in the same order and size; dynamics, noises and variances may differ",
             )
+    chosen, own = (
+        [(b.name, b.size) for b in statement.states if b.role == "decision"] for statement in (design.statement, truth)
+    )
+    if own != chosen[: len(own)]:
+        raise ProblemError(
+            "The truth has other decisions than the design, and no value of them is known.",
+            expected=f"numbers, or {_listed(chosen)} in this order: the truth has the chosen values",
+            received=_listed(own),
+            remedy="declare the same decisions, or write numbers in their place",
+        )
 
 
 def _check_measured(design: System, truth: Declarations) -> None:

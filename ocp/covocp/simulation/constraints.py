@@ -75,6 +75,8 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
     a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
     unknowns = [k for b in st.of_kind("unknown") for k in range(b.span.start, b.span.stop)]
+    gathered = [k for b in st.states if b.role == "integral" for k in range(b.span.start, b.span.stop)]
+    sums = ca.vertcat(a[0][gathered, :], a[2][st.entries(st.summed), :])
     own = ca.vertcat(a[0][:states], a[1][:fed_back], a[5][unknowns])
     rows, values, left_out = [], [], {}
     for name, value, low, high in _bounds(st, a, (states, fed_back)):
@@ -87,6 +89,8 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
             low, high = float(conditions.lower[i]), float(conditions.upper[i])
             if low == high:
                 left_out[name] = "an equality, which no noisy run meets exactly"
+            elif ca.depends_on(column[i], sums):
+                left_out[name] = "an integral along the nominal"
             elif not ca.depends_on(column[i], own):
                 left_out[name] = "the same in all runs"
             else:

@@ -15,10 +15,11 @@ from covocp.solution.solution import Solution
 def to_xarray(solution: Solution) -> Any:
     """The solution as an xarray.Dataset over the time of the nodes.
 
-    States, controls, matrices and constants under their names; their costates as "costate_<name>", standard deviations
-    of the estimates as "deviation_<name>". The entries of vectors run along "<name>_entry", the rows and columns of
-    matrices, labelled by what they belong to, along "<name>_row" and "<name>_column". An attitude also has its rotation
-    vector as "vector_<name>" and the length of that as "angle_<name>" [rad]; its deviation is that of its three errors.
+    States, controls, matrices, constants, decisions, and integrals up to each node, under their names; their costates
+    as "costate_<name>", standard deviations of the estimates as "deviation_<name>". The entries of vectors run along
+    "<name>_entry", the rows and columns of matrices, labelled by what they belong to, along "<name>_row" and
+    "<name>_column". An attitude also has its rotation vector as "vector_<name>" and the length of that as
+    "angle_<name>" [rad]; its deviation is that of its three errors.
 
     Args:
         solution: what to convert.
@@ -42,21 +43,23 @@ def to_xarray(solution: Solution) -> Any:
     coordinates: dict[str, Any] = {"time": ("time", solution.t, {"units": "s"})}
     estimated = any(block.estimation for block in solution.blocks)
     for block in solution.blocks:
-        name, constant = block.name, block.kind in ("unknown", "parameter")
+        name, constant = block.name, block.kind in ("unknown", "parameter") or block.role == "decision"
         dimensions: tuple[str, ...] = () if block.size == 1 else (f"{name}_entry",)
-        if block.kind == "matrix":
+        if block.kind == "matrix" and block.role == "moving":
             dimensions = (f"{name}_row", f"{name}_column")
             coordinates |= {dimension: list(block.labels) for dimension in dimensions}
         values = solution.values[name]
+        if block.role == "integral":
+            values = values.reshape(solution.t.size)
         variables[name] = (dimensions, values[0]) if constant else (("time", *dimensions), values)
-        if block.kind in ("state", "matrix"):
+        if block.kind in ("state", "matrix") and block.role == "moving":
             variables[f"costate_{name}"] = (("time", *dimensions), solution.costate(name))
         if block.tangent:
             vectors, dimensions = rotation_vectors(values), (f"{name}_axis",)
             coordinates[f"{name}_axis"] = ["x", "y", "z"]
             variables[f"vector_{name}"] = (("time", *dimensions), vectors)
             variables[f"angle_{name}"] = (("time",), np.linalg.norm(vectors, axis=1))
-        if estimated and block.kind in ("state", "unknown"):
+        if estimated and block.kind in ("state", "unknown") and block.role == "moving":
             variables[f"deviation_{name}"] = (("time", *dimensions), solution.deviation(name))
     return xarray.Dataset(variables, coords=coordinates, attrs=_attributes(solution))
 

@@ -250,6 +250,16 @@ def _functions(statement: Statement) -> Iterator[tuple[ca.Function, dict[str, tu
     """Every function that says something of a problem, and what its outputs (or entries of them) are called."""
     st = statement
     yield st.boundary, _boundary_parts(st)
+    if st.tied is not None:
+        groups = ((0, st.tied.states, st.state_names), (1, st.tied.matrices, st.matrix_names))
+        yield (
+            st.tied.function,
+            {
+                f"the initial value of '{names[k]}'": (output, slice(i, i + 1))
+                for output, entries, names in groups
+                for i, k in enumerate(entries)
+            },
+        )
     if st.loop is not None:
         yield st.loop.running, {"the running cost": (0, slice(None))}
         terms = {"the terminal cost": (0, slice(None)), "the weight of the deviations at the end": (1, slice(None))}

@@ -13,7 +13,7 @@ from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.origin import Classical
-from covocp.statement.statement import Block, entry_names, error_names
+from covocp.statement.statement import Block, Role, entry_names, error_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,6 +42,7 @@ RESIDUALS = {
     "costate_difference": "costates: multipliers against backward integration (relative)",
     "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
     "transversality": "condition of the free duration, k_T + H(T) (relative)",
+    "decisions": "condition of the decisions, int H_d dt + end terms (relative)",
     "mesh_error": "cost: change by halving the integration steps (relative)",
     "node_error": "nodes: change by halving the integration steps (of the range)",
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
@@ -66,6 +67,7 @@ WORRIES: dict[str, tuple[float, str]] = {
         "large: the controls or costates change within an interval; worry if it stays on twice the intervals",
     ),
     "transversality": (1e-2, "LARGE: the duration is not the best one, or the mesh too coarse: more intervals"),
+    "decisions": (1e-4, "LARGE: the decisions are not the best ones yet; a smaller tolerance=, or start from here"),
     "control_slope": (
         0.1,
         "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
@@ -100,13 +102,15 @@ def sections(solution: Solution) -> list[Section]:
     closed = solution.loop is not None
 
     def shown(block: Block) -> bool:  # the covariances of a closed loop are in its tables
-        return not closed or not (block.estimation or block.backward)
+        return block.role == "moving" and not (closed and (block.estimation or block.backward))
 
     return [
         _head(solution),
         _violations(solution.violations),
         _costs(solution),
+        _numbers(solution, "decision"),
         _states(solution),
+        _numbers(solution, "integral"),
         _unknowns(solution),
         _deviations(solution),
         _feedback(solution),
@@ -154,7 +158,7 @@ def _left_out(solution: Solution) -> Section:
     if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
         return []
     share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
-    names = [name for b in solution.blocks if b.kind == "state" and b.name != GAIN for name in error_names((b,))]
+    names = [name for b in solution.blocks if b.kind == "state" and b.role == "moving" for name in error_names((b,))]
     spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
@@ -185,7 +189,7 @@ def _gained(solution: Solution) -> Section:
 
 def _states(solution: Solution) -> Section:
     """Terminal values with targets, multipliers and, where nothing is fed back, standard deviations."""
-    blocks = tuple(b for b in solution.blocks if b.kind == "state")
+    blocks = tuple(b for b in solution.blocks if b.kind == "state" and b.role == "moving")
     if not blocks:
         return []
     target = solution.targets
@@ -196,8 +200,6 @@ def _states(solution: Solution) -> Section:
         columns.append("standard deviation")
     rows = []
     for b in blocks:
-        if solution.loop is not None and b.name == GAIN:  # a gain that is constant is a state, which has its own table
-            continue
         own = _attitude(solution, b) if b.tangent else []
         for k in range(0 if b.tangent else b.size):
             i = b.offset + k
@@ -216,6 +218,16 @@ def _attitude(solution: Solution, block: Block) -> list[list[str]]:
     vector = np.rad2deg(rotation_vectors(solution.values[block.name])[-1])
     named = zip([*(f"about {axis}" for axis in "xyz"), "angle"], [*vector, np.linalg.norm(vector)], strict=True)
     return [[f"{block.name}, {name} [deg]", number(float(value)), "-", "-"] for name, value in named]
+
+
+def _numbers(solution: Solution, role: Role) -> Section:
+    """Decisions, or integrals, with their units; a constant gain has its own table."""
+    rows = []
+    for b in solution.blocks:
+        if b.role == role and not (solution.loop is not None and b.name == GAIN):
+            values = np.atleast_1d(solution[b.name])
+            rows += [[name, number(v), b.unit] for name, v in zip(entry_names((b,)), values, strict=True)]
+    return _table([role, "value", "unit"], rows)
 
 
 def _unknowns(solution: Solution) -> Section:

@@ -270,14 +270,15 @@ class Solution:
         return result
 
     def __getitem__(self, key: Given) -> Array:
-        """Values at the nodes of a symbol, a name, an entry of one, or an expression of the problem's symbols.
+        """Values at the nodes of a symbol, a name, an entry of one, or an expression; decisions, integrals: numbers.
 
         Raises:
             ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
         """
         found = self._name(key, missing_ok=isinstance(key, ca.MX))
         if found:
-            return entry_values(self.values, found)
+            values, own = entry_values(self.values, found), block_of(found, self.blocks)
+            return values if own is None or own.role == "moving" else np.squeeze(values[-1])
         statement = self.extremal.statement
         try:
             function = statement.expression(key)

@@ -17,7 +17,7 @@ from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.threads import one_at_a_time
-from covocp.extremal.closed_loop import Statistics, close_loop, densities
+from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import finer_steps
@@ -98,7 +98,7 @@ def _along(
     u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
     x0, e0 = starts(st, mesh, values)
     if isinstance(nominal, Solution):
-        x0 = _started_like(st, nominal, x0, values)
+        x0, e0 = st.started(_started_like(st, nominal, x0, values), values, e0)
     check_model(st, x0, u[:1].ravel(), e0, duration, values)
     outcome = evaluate_controls(st, mesh, u, duration, values, x0)
     own_steps = given.substeps == "auto"
@@ -127,7 +127,7 @@ def _with_passed(solution: Solution) -> dict[str, float]:
 
 
 def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters: Array) -> Array:
-    """The initial state, with what is free there as in a solution that has it: constant gains are such states."""
+    """The initial state, with what is free there as in a solution that has it: decisions are such states."""
     result, known = x0.copy(), statement.boundary_values(parameters)[0]
     own = {block.name: block for block in nominal.blocks if block.kind == "state"}
     for block in statement.states:
@@ -252,7 +252,7 @@ def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
             remedy="build it by the same function with other numbers",
         )
     statistics = Statistics(
-        initial=unpack(other.boundary_values(values)[2][block.span], block.size),
+        initial=unpack(start_covariance(other, extremal, values)[block.span], block.size),
         density=densities(other),
         parameters=values,
     )

@@ -35,7 +35,8 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: i
     Free initial values and durations are drawn one from each of `count` equally likely ranges, in random order: few
     starts then look everywhere.
     """
-    free = [int(k) for k in np.flatnonzero(np.isnan(statement.boundary_values(parameters)[0]))]
+    tied = () if statement.tied is None else statement.tied.states
+    free = [int(k) for k in np.flatnonzero(np.isnan(statement.boundary_values(parameters)[0])) if k not in tied]
     drawn = _latin(len(free) + int(statement.duration.free), count, seed)
     own: ProblemError | None = None
     try:
@@ -70,6 +71,7 @@ def _random_guess(
     start, e0 = starts(statement, mesh, parameters)
     for k, share in zip(free, shares, strict=False):
         start[k] = _drawn_state(statement, k, float(start[k]), float(share))
+    start, e0 = statement.started(start, parameters, e0)
     duration = _drawn_duration(statement, float(shares[-1])) if statement.duration.free else statement.duration.guess
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
     wave = _wave(statement, mesh, flat, generator)
@@ -95,7 +97,8 @@ def _random_guess(
 
 def _guesses_say_little(statement: Statement) -> bool:
     """Whether all guesses are single numbers, so that the controls may be steered."""
-    return all(is_plain(statement.guesses[b.name]) for b in (*statement.controls, *statement.states))
+    own = [b for b in (*statement.controls, *statement.states) if b.role == "moving"]
+    return all(is_plain(statement.guesses[b.name]) for b in own)
 
 
 def _steered(run: Run, u: Array) -> Array:

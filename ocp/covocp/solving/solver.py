@@ -38,6 +38,7 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
+from covocp.solving.decisions import far_away
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
@@ -371,7 +372,7 @@ class Solver:
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
             raise SolveError(
                 f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
-                f"{violated}"
+                f"{violated}{far_away(solution)}"
                 "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
                 solution=solution,
                 violations=outcome.violations,

@@ -26,6 +26,10 @@ from covocp.base.threads import cached
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
 
+# What a state or a matrix stands for: something that moves, a constant that is chosen, an integral over the whole time.
+Role = Literal["moving", "decision", "integral"]
+ROLES: tuple[Role, ...] = ("moving", "decision", "integral")
+
 INPUTS = ("state", "control", "matrices", "time", "duration", "parameters")
 
 
@@ -46,6 +50,7 @@ class Block:
     backward: bool = False
     unit: str = ""
     tangent: int = 0
+    role: Role = "moving"
 
     @property
     def length(self) -> int:
@@ -65,6 +70,23 @@ class Boundary(NamedTuple):
     final: Array
     initial_matrices: Array
     final_matrices: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tied:
+    """Initial values that decisions give.
+
+    states, matrices: entries of x(0) and of the half-vectors at the start.
+    function: (state, parameters) -> their values, x(0)[states] and e(0)[matrices].
+    slopes: (state, parameters) -> slopes of both, one below the other, by the state.
+    """
+
+    states: tuple[int, ...]
+    matrices: tuple[int, ...]
+    function: ca.Function
+    slopes: ca.Function
+
+    __repr__ = short_repr
 
 
 class Columns(NamedTuple):
@@ -171,7 +193,9 @@ class Statement:
             running cost is zero here where it depends on the matrices.
         rates: (all six) -> rate of the state, rate of the stacked half-vectors, running cost.
         terminal: (state, matrices, duration, parameters) -> terminal cost.
-        boundary: (parameters) -> initial state, final state, initial matrices, final matrices (NaN: free).
+        boundary: (parameters) -> initial state, final state, initial matrices, final matrices (NaN: free, or given by
+            decisions).
+        tied: initial values that decisions give, or None; those of states are also the last of the `start` conditions.
         matrix_end: (state, duration, parameters) -> half-vectors at T of the matrices that run backward, stacked; None
             where there are none. They have no initial value, and their rates do not depend on the other matrices.
         riccati: for each matrix, (state, control, time, duration, parameters) -> F, Q, W with
@@ -193,6 +217,7 @@ class Statement:
     rates: ca.Function
     terminal: ca.Function
     boundary: ca.Function
+    tied: Tied | None
     matrix_end: ca.Function | None
     loop: Loop | None
     riccati: tuple[ca.Function | None, ...]
@@ -260,13 +285,34 @@ class Statement:
 
     @cached
     def ahead(self) -> tuple[int, ...]:
-        """Positions among `matrices` of those that run forward in time."""
-        return tuple(i for i, block in enumerate(self.matrices) if not block.backward)
+        """Positions among `matrices` of those that run forward in time, integrals of the others left out."""
+        return tuple(i for i, block in enumerate(self.matrices) if not block.backward and block.role == "moving")
 
     @cached
     def behind(self) -> tuple[int, ...]:
         """Positions among `matrices` of those that run backward in time."""
         return tuple(i for i, block in enumerate(self.matrices) if block.backward)
+
+    @cached
+    def summed(self) -> tuple[int, ...]:
+        """Positions among `matrices` of the integrals of what depends on the others; nothing depends on them."""
+        return tuple(i for i, block in enumerate(self.matrices) if block.role == "integral")
+
+    @cached
+    def riccati_forms(self) -> bool:
+        """Whether every matrix follows from the nominal and has a rate of Riccati form; integrals follow from them."""
+        moving = (i for i in range(len(self.matrices)) if i not in self.summed)
+        return not self.coupled and all(self.riccati[i] is not None for i in moving)
+
+    @cached
+    def decisions(self) -> list[int]:
+        """Entries of the state that are constants to be chosen."""
+        return [k for b in self.states if b.role == "decision" for k in range(b.span.start, b.span.stop)]
+
+    @cached
+    def moving(self) -> list[int]:
+        """Entries of the state that are neither constants to be chosen nor integrals."""
+        return [k for b in self.states if b.role == "moving" for k in range(b.span.start, b.span.stop)]
 
     @cached
     def estimated(self) -> bool:
@@ -305,9 +351,10 @@ class Statement:
 
     @cached
     def bounded_states(self) -> list[int]:
-        """Entries of the state with a bound."""
+        """Entries of the state with a bound along the path; a constant keeps its own from the start."""
         lower, upper = self.state_bounds
-        return [int(i) for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))]
+        bounded = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+        return [int(i) for i in bounded if i not in self.decisions]
 
     def slope(self, expression: Expr, name: str) -> Any:
         """Jacobian of an expression of the user's symbols by one of them, by the tangent of what is no vector."""
@@ -326,10 +373,24 @@ class Statement:
         values = self.boundary(parameters)
         return Boundary(*(np.asarray(value.full()).ravel() for value in values))
 
+    def started(self, x0: Expr, parameters: Expr, e0: Expr = None) -> tuple[Any, Any]:
+        """Initial state and half-vectors with what decisions give of them; numbers or symbols.
+
+        Args:
+            x0: initial state, of which the decisions are read.
+            parameters: of the statement.
+            e0: half-vectors at the start; None: those of `boundary`.
+        """
+        e0 = self.boundary(parameters)[2] if e0 is None else e0
+        if self.tied is None:
+            return x0, e0
+        x, e = self.tied.function(x0, parameters)
+        return _replaced(x0, self.tied.states, x), _replaced(e0, self.tied.matrices, e)
+
     @cached
     def matrix_names(self) -> tuple[str, ...]:
         """Names of the entries of the stacked half-vectors, such as 'E[x, b]'."""
-        return tuple(name for block in self.matrices for name in half_names(block.name, block.labels))
+        return tuple(name for block in self.matrices for name in entries_of(block))
 
     @cached
     def state_names(self) -> tuple[str, ...]:
@@ -340,6 +401,20 @@ class Statement:
     def control_names(self) -> tuple[str, ...]:
         """Names of the entries of the control."""
         return entry_names(self.controls)
+
+
+def _replaced(column: Expr, entries: tuple[int, ...], values: Expr) -> Any:
+    """A column with other values in some entries; of numbers as an array where it was one."""
+    if not entries:
+        return column
+    if isinstance(column, np.ndarray):
+        result = column.copy()
+        result[list(entries)] = np.asarray(values.full()).ravel()
+        return result
+    rows = ca.vertsplit(column)
+    for k, value in zip(entries, ca.vertsplit(values), strict=True):
+        rows[k] = value
+    return ca.vertcat(*rows)
 
 
 def entry_names(blocks: Iterable[Any]) -> tuple[str, ...]:
@@ -367,6 +442,11 @@ def error_size(block: Any) -> int:
 
 def _numbered(name: str, size: int) -> list[str]:
     return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+
+
+def entries_of(matrix: Any) -> list[str]:
+    """Names of the entries of the half-vector of a declared matrix or its block; an integral is one number."""
+    return [matrix.name] if matrix.role == "integral" else half_names(matrix.name, matrix.labels)
 
 
 def half_names(name: str, labels: tuple[str, ...]) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, pack, real_numbers, unpack
+from covocp.base.matrices import Array, is_semidefinite, pack, real_numbers, unpack
 from covocp.base.quadrature import interpolated
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Mesh, control_places
@@ -22,6 +22,8 @@ from covocp.transcription.steps import KEPT, moving_interval, nominal_interval
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.
 BENDING = 1.0
+# Where a decision has no bound its initial covariance is tried at so many times its magnitude.
+FAR = 10.0
 
 
 def controls_guess(statement: Statement, nodes: Array, control: str, sign: float = 1.0) -> Array:
@@ -120,8 +122,10 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
             e0[block.span] = matrix_guess(block, statement.guesses[block.name])
     known = statement.boundary_values(parameters)[2]
     e0 = np.where(np.isnan(known), e0, known)
+    x0, e0 = statement.started(np.where(np.isnan(x0), default, x0), parameters, e0)
     _check_covariances(statement, e0)
-    return np.where(np.isnan(x0), default, x0), e0
+    _check_tied(statement, x0, parameters)
+    return x0, e0
 
 
 def matrix_guess(block: Block, guess: Given) -> Array:
@@ -149,6 +153,35 @@ def _check_covariances(statement: Statement, e0: Array) -> None:
     for block in statement.matrices:
         if block.covariance:
             check_density(block.name, "initial value", unpack(e0[block.span], block.size), definite=False)
+
+
+def _check_tied(statement: Statement, x0: Array, parameters: Array) -> None:
+    """Covariances that decisions give must be covariances up to the bounds of each of them.
+
+    Raises:
+        ProblemError: names the decision and the bound.
+    """
+    if statement.tied is None or not statement.tied.matrices:
+        return
+    covariances = [block for block in statement.matrices if block.covariance]
+    for k in statement.decisions:
+        far = FAR * max(abs(float(x0[k])), 1.0)
+        for side, sign, bound in zip(("lower", "upper"), (-1.0, 1.0), statement.state_bounds, strict=True):
+            x = x0.copy()
+            x[k] = bound[k] if np.isfinite(bound[k]) else x0[k] + sign * far
+            half = np.asarray(ca.DM(statement.started(x, parameters)[1]).full()).ravel()
+            for block in covariances:
+                matrix = unpack(half[block.span], block.size)
+                if np.isnan(matrix).any() or is_semidefinite(matrix[None]):
+                    continue
+                raise ProblemError(
+                    f"The initial value of '{block.name}' is no covariance for every value of the decision "
+                    f"'{statement.state_names[k]}' that its bounds allow.",
+                    expected="a positive semidefinite matrix up to the bounds",
+                    received=f"{matrix.tolist()} where {statement.state_names[k]} = {x[k]:g}"[:200],
+                    remedy=f"give decision('{statement.state_names[k]}', ...) a {side} bound that keeps the variance "
+                    "positive",
+                )
 
 
 def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: float, parameters: Array) -> None:

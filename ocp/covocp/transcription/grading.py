@@ -83,7 +83,11 @@ def _needed(statement: Statement) -> bool:
         form is not None and (block.estimation or block.backward)
         for block, form in zip(statement.matrices, statement.riccati, strict=True)
     )
-    return known and not statement.coupled and (statement.loop is not None or statement.running_uses_matrices)
+    return (
+        known
+        and not statement.coupled
+        and (statement.loop is not None or statement.running_uses_matrices or bool(statement.summed))
+    )
 
 
 def _guess(statement: Statement, options: Options, parameters: Array) -> Trajectory:

@@ -287,7 +287,7 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
         ProblemError: a step that does not apply.
     """
     covariance = _choose_covariance_step(statement, options)
-    riccati = not statement.coupled and all(form is not None for form in statement.riccati)
+    riccati = statement.riccati_forms
     possible = riccati and options.covariance_step in ("auto", "gauss")
     if options.step == "rodas" and not possible:
         raise ProblemError(
@@ -312,13 +312,14 @@ def _choose_covariance_step(statement: Statement, options: Options) -> StepKind:
     third of those of gauss's linear systems (lag of section 6.12, 6 entries). For large ones these are cheaper (Mars
     entry, 30 entries: 1.6 and 0.2 s for Hessian and Jacobian, with rk4 1.8 and 0.7 s and twice the memory).
     """
-    riccati = all(form is not None for form in statement.riccati) and not statement.coupled
+    riccati = statement.riccati_forms
     if options.covariance_step == "auto":
         small = statement.ne <= SCALAR_ENTRIES
         stated = bool(statement.behind) and small and not _choose_eliminated(statement, options)
         return "gauss" if riccati and not stated else "rk4"
     if options.covariance_step != "rk4" and not riccati:
-        names = [b.name for b, form in zip(statement.matrices, statement.riccati, strict=True) if form is None]
+        pairs = zip(statement.matrices, statement.riccati, strict=True)
+        names = [block.name for block, form in pairs if form is None and block.role == "moving"]
         reason = "feeds back into the nominal" if statement.coupled else "is not of the form F E + E F' + Q - E W E"
         raise ProblemError(
             f"covariance_step='{options.covariance_step}' does not apply: the rate of "
@@ -340,7 +341,9 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     """
     if not statement.matrices:
         return True
-    initial = statement.boundary_values(statement.values)[2][statement.entries(statement.ahead)]
+    tied = () if statement.tied is None else statement.tied.matrices
+    own = sorted(set(statement.entries(statement.ahead)) - set(tied))
+    initial = statement.boundary_values(statement.values)[2][own]
     obstacle = None
     if statement.coupled:
         obstacle = "the rate of a state depends on a matrix"

@@ -98,11 +98,14 @@ class NLP:
         x0, xf, e0, ef = st.boundary_values(parameters)
         count = len(self.mesh.starts)
         xl, xu = np.tile(st.state_bounds[0], (count, 1)), np.tile(st.state_bounds[1], (count, 1))
+        xl[1:, st.decisions], xu[1:, st.decisions] = -np.inf, np.inf  # one bound for one number
         _fix(xl[0], xu[0], x0)
         _fix(xl[-1], xu[-1], xf)
         lows, highs = [xl / self.scales.x], [xu / self.scales.x]
         if not self.mesh.eliminated:
             el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
+            if st.tied is not None:
+                e0[list(st.tied.matrices)] = 0.0  # inserted: these variables stand for nothing
             _fix(el[0], eu[0], e0)
             _fix(el[-1], eu[-1], ef)
             lows.append(el / self.scales.e)
@@ -158,6 +161,7 @@ class NLP:
         states, matrices = zero.states.copy(), zero.matrices.copy()
         starts = list(mesh.starts)
         states[starts[1:-1]] = (parts["x"] / self.scales.x)[1:-1]
+        states[0, st.decisions] = (parts["x"] / self.scales.x)[0, st.decisions]
         if "state_bounds" in by_kind:
             bounded = st.bounded_states
             inside = sorted(set(range(mesh.intervals + 1)) - set(starts))

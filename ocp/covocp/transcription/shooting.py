@@ -13,6 +13,8 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
     full_interval,
+    gathering_step,
+    in_order,
     joint_interval,
     nominal_interval,
     propagate_step,
@@ -147,7 +149,7 @@ def passages(
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
     n, m = mesh.intervals, mesh.substeps
-    e0 = statement.boundary(parameters)[2] if e0 is None else e0
+    e0 = statement.started(x[:, 0], parameters)[1] if e0 is None else e0
     starts = x[:, :n]
     if mesh.step == "rk4" and not statement.behind:
         ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
@@ -158,13 +160,14 @@ def passages(
         before = ca.reshape(ca.vertcat(starts, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
     columns = (before, fine, *intervals.substeps(m))
     first = e0[statement.entries(statement.ahead)]
-    passed = _forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))
+    groups = [_forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))]
     if statement.matrix_end is not None:
         last = statement.matrix_end(x[:, -1], intervals.duration[:, -1], parameters)
-        other = _backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind))
-        entries = np.argsort(statement.entries(statement.ahead) + statement.entries(statement.behind)).tolist()
-        passed = tuple(ca.vertcat(a, b)[entries, :] for a, b in zip(passed, other, strict=True))
-    e, begins, halves = passed
+        groups.append(_backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind)))
+    if statement.summed:
+        first = e0[statement.entries(statement.summed)]
+        groups.append(_gathered(statement, mesh, first, columns, groups[0], _of(kicks, statement, statement.summed)))
+    e, begins, halves = (in_order(statement, *parts) for parts in zip(*groups, strict=True))
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
     return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))
@@ -197,6 +200,33 @@ def _forward(statement: Statement, mesh: Mesh, first: Expr, columns: tuple[Any, 
         first, later = first + kicks[:, 0], kicks[:, 1:]
     arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, later)
     nodes = ca.horzcat(first, passed[:, m - 1 :: m])
+    return nodes, nodes[:, :n], arrived
+
+
+def _gathered(
+    statement: Statement, mesh: Mesh, first: Expr, columns: tuple[Any, ...], ahead: tuple[Any, ...], kicks: Expr
+) -> tuple[Any, ...]:
+    """The same for integrals of what depends on the matrices that run forward: sums of what each substep adds."""
+    n, m = mesh.intervals, mesh.substeps
+    starts, after = ahead[1], ahead[2]
+    before: Any = starts
+    if m > 1:
+        inside: Expr = ca.reshape(after, after.shape[0] * m, n)
+        before = ca.vertcat(starts, inside[: after.shape[0] * (m - 1), :])
+        before = ca.reshape(before, after.shape[0], n * m)
+    step = gathering_step(statement, mesh.step, mesh.linear_solver).map(n * m)
+    later: Any = ca.cumsum(step(before, after, *columns), 1)
+    begin: Any = ca.repmat(first, 1, n)
+    if kicks is not None:
+        passed: Any = ca.cumsum(kicks, 1)
+        begin = begin + passed[:, :n]
+        first = first + kicks[:, 0]
+    spread: Any = ca.kron(begin, ca.DM.ones(1, m))
+    arrived = later + spread
+    nodes: Any = arrived[:, m - 1 :: m]
+    if kicks is not None:
+        nodes = nodes + kicks[:, 1:]
+    nodes = ca.horzcat(first, nodes)
     return nodes, nodes[:, :n], arrived
 
 

@@ -95,7 +95,8 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Traj
 
 def _neutral(statement: Statement) -> Statement:
     """The statement without the guesses that say how something moves: where they led nowhere."""
-    moving = [b.name for b in (*statement.states, *statement.controls) if not is_plain(statement.guesses[b.name])]
+    own = [b for b in (*statement.states, *statement.controls) if b.role == "moving"]
+    moving = [b.name for b in own if not is_plain(statement.guesses[b.name])]
     return replace(statement, guesses={**statement.guesses, **dict.fromkeys(moving)}) if moving else statement
 
 
@@ -170,7 +171,8 @@ def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, 
 
 def _followed(statement: Statement) -> tuple[int, ...]:
     """States whose guess says how they move: an array or a function."""
-    rows = [list(range(b.span.start, b.span.stop)) for b in statement.states if not is_plain(statement.guesses[b.name])]
+    moving = [b for b in statement.states if b.role == "moving" and not is_plain(statement.guesses[b.name])]
+    rows = [list(range(b.span.start, b.span.stop)) for b in moving]
     return tuple(k for block in rows for k in block)
 
 
@@ -221,16 +223,17 @@ def bend_size(run: Run, flat: Array, bend: Array) -> float:
     """
     if not bend.any():
         return 1.0
-    size, base = 1.0, run.states(flat)
+    rows = run.statement.moving or list(range(run.statement.nx))  # integrals bend by themselves
+    size, base, scales = 1.0, run.states(flat)[:, rows], run.scale[rows]
     if not np.isfinite(base).all():
         return size
-    full = run.states(run.clip(flat + bend))
+    full = run.states(run.clip(flat + bend))[:, rows]
     for _ in range(HALVINGS):
-        half = run.states(run.clip(flat + 0.5 * size * bend))
+        half = run.states(run.clip(flat + 0.5 * size * bend))[:, rows]
         if np.isfinite(full).all() and np.isfinite(half).all():
             moved, bow = full - base, full - 2.0 * half + base
             largest = np.abs(moved).max(axis=0)
-            scale = np.where(run.scale > 0, run.scale, _of_vectors(run.statement, largest))
+            scale = np.where(scales > 0, scales, _of_vectors(run.statement, rows, largest))
             if 2.0 * np.linalg.norm(bow / scale) <= CURVED * np.linalg.norm(moved / scale):
                 return size
             if (largest / scale).max() <= FAINT:
@@ -239,12 +242,13 @@ def bend_size(run: Run, flat: Array, bend: Array) -> float:
     return size
 
 
-def _of_vectors(statement: Statement, sizes: Array) -> Array:
-    """Sizes of the states as one for each vector, 1 where it is zero: what rounding moves is no size of its own."""
-    result = sizes.copy()
+def _of_vectors(statement: Statement, rows: list[int], sizes: Array) -> Array:
+    """Sizes of some states as one for each vector, 1 where it is zero: what rounding moves is no size of its own."""
+    result = np.zeros(statement.nx)
+    result[rows] = sizes
     for block in statement.states:
-        result[block.span] = sizes[block.span].max()
-    return np.where(result > 0, result, 1.0)
+        result[block.span] = result[block.span].max()
+    return np.where(result > 0, result, 1.0)[rows]
 
 
 def _units(run: Run, flat: Array) -> Array:

@@ -306,15 +306,20 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     interval = Interval.symbols(statement, ca.MX)
     _, states, cost = nominal_interval(statement, substeps, step)(x, *interval)
     starts = ca.horzcat(x, states[:, : substeps - 1])
-    matrices = [step_matrix(statement, i, step, solver) for i in range(len(statement.matrices))]
-    propagate = propagate_step(statement, tuple(range(len(matrices))), step, solver)
+    stepped = statement.ahead + statement.behind  # what is variable at both ends runs forward here
+    matrices = [step_matrix(statement, i, step, solver) for i in stepped]
+    propagate = propagate_step(statement, stepped, step, solver)
+    own, gathered = e[statement.entries(stepped), :], e[statement.entries(statement.summed), :]
     columns = []
-    half = e
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
-        half = propagate(half, *(matrix(starts[:, j], states[:, j], *part) for matrix in matrices))
-        columns.append(half)
-    halves = ca.horzcat(*columns)
+        after = propagate(own, *(matrix(starts[:, j], states[:, j], *part) for matrix in matrices))
+        if statement.summed:
+            ends = (own[: ahead_size(statement)], after[: ahead_size(statement)], starts[:, j], states[:, j])
+            gathered = gathered + gathering_step(statement, step, solver)(*ends, *part)
+        own = after
+        columns.append(ca.vertcat(own, gathered))
+    halves = in_order(statement, ca.horzcat(*columns))
     if statement.running_uses_matrices:
         arguments = (x, e, states, halves, *interval)
         cost = simpson_interval(statement, substeps)(*arguments)
@@ -322,6 +327,46 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
             cost = ca.if_else(early(interval), simpson_interval(statement, substeps, True)(*arguments), cost)
     fine = ca.vertcat(states, halves)
     return ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], _slopes(statement, 1))
+
+
+def ahead_size(statement: Statement) -> int:
+    """Entries of the half-vectors that run forward, integrals of them left out."""
+    return len(statement.entries(statement.ahead))
+
+
+def in_order(statement: Statement, *parts: Expr) -> Any:
+    """Rows of what runs forward, then backward, then is gathered, in the order of the statement."""
+    order = np.argsort(statement.entries(statement.ahead + statement.behind + statement.summed)).tolist()
+    rows: Expr = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
+    return rows if order == sorted(order) else rows[order, :]
+
+
+@lru_cache(maxsize=KEPT)
+def gathering_step(statement: Statement, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
+    """Integrals of what depends on matrices over one step, by Simpson's rule.
+
+    The middle is that of the steps themselves: the nominal there by its own polynomial, the matrices by half a step.
+
+    Returns:
+        (half-vectors that run forward at the start, at the end, x at the start, at the end, *interval) -> what the
+        integrals gain over the step.
+    """
+    count, nx = ahead_size(statement), statement.nx
+    ea, eb, xa, xb = (ca.MX.sym(name, size) for name, size in (("ea", count), ("eb", count), ("xa", nx), ("xb", nx)))
+    interval = Interval.symbols(statement, ca.MX)
+    if step == "rodas":
+        middle = between(statement, (0.5,))(xa, xb, *interval)
+    else:
+        fa, fb = (interval.h * _slope(statement, *interval.at(c, x)) for c, x in ((0.0, xa), (1.0, xb)))
+        middle = hermite(xa, xb, fa, fb, 0.5)
+    half = matrices_step(statement, statement.ahead, step, solver)(ea, xa, middle, *interval.part(0.0, 0.5))
+    rows: list[int] = statement.entries(statement.summed)
+    total: Any = 0
+    for c, x, own, weight in ((0.0, xa, ea, 1.0), (0.5, middle, half, 4.0), (1.0, xb, eb, 1.0)):
+        e = ca.MX.zeros(statement.ne)
+        e[statement.entries(statement.ahead)] = own
+        total = total + weight / 6.0 * statement.rates(*interval.at(c, x, e))[1][rows]
+    return ca.Function("gathering_step", [ea, eb, xa, xb, *interval], [interval.h * total], _slopes(statement, 4))
 
 
 @lru_cache(maxsize=KEPT)
@@ -341,13 +386,20 @@ def inside_interval(statement: Statement, count: int, step: StepKind, solver: st
     x = ca.horzcat(before[:nx], nominal_interval(statement, count, step)(before[:nx], *interval)[1])
     ahead, behind = statement.entries(statement.ahead), statement.entries(statement.behind)
     first, last = [before[nx:][ahead]], [after[nx:][behind]]
+    gathered = [before[nx:][statement.entries(statement.summed), :]]
     forward, backward = (matrices_step(statement, which, step, solver) for which in (statement.ahead, statement.behind))
     parts = [interval.part(j / count, (j + 1) / count) for j in range(count)]
     for j in range(count):
         first.append(forward(first[-1], x[:, j], x[:, j + 1], *parts[j]))
+        if statement.summed:
+            gather = gathering_step(statement, step, solver)
+            gathered.append(gathered[-1] + gather(*first[-2:], x[:, j], x[:, j + 1], *parts[j]))
     for j in range(count - 1, -1, -1):
         last.append(backward(last[-1], x[:, j + 1], x[:, j], *parts[j].turned()))
-    e = ca.vertcat(ca.horzcat(*first), ca.horzcat(*last[::-1]))[np.argsort(ahead + behind).tolist(), :]
+    rows = [ca.horzcat(*first), ca.horzcat(*last[::-1])]
+    if statement.summed:
+        rows.append(ca.horzcat(*gathered))
+    e = in_order(statement, *rows)
     return ca.Function("inside", [before, after, *interval], [ca.vertcat(x, e)])
 
 

@@ -39,6 +39,8 @@ def stiffness(statement: Statement, options: Options, parameters: Array) -> Stif
     longest = duration * float(np.diff(nodes).max())
     matrices = 0.0
     for block, form in zip(statement.matrices, statement.riccati, strict=True):
+        if block.role == "integral":
+            continue
         if form is None:
             slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
             matrices = max(matrices, _largest(_eigenvalues(slope)))

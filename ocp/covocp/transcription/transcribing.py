@@ -60,12 +60,15 @@ class _Variables:
         ends = np.cumsum([0, *lengths]).tolist()
         self.w = ca.MX.sym("w", ends[-1])
         x, e, u, duration = (self.w[i:j] for i, j in pairwise(ends))
-        self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
-        self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
-        self.u = ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T)
-        self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
         self.p = ca.MX.sym("p", statement.np + 1)
         self.parameters, self.cost_scale = ca.vertsplit(self.p, [0, statement.np, statement.np + 1])
+        self.x = ca.reshape(x, nx, count) * ca.repmat(ca.DM(scales.x), 1, count)
+        self.e: Any = None if mesh.eliminated else ca.reshape(e, ne, count) * ca.repmat(ca.DM(scales.e), 1, count)
+        if self.e is not None and statement.tied is not None and statement.tied.matrices:
+            first = statement.started(self.x[:, 0], self.parameters, self.e[:, 0])[1]
+            self.e = ca.horzcat(first, self.e[:, 1:])
+        self.u = ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T)
+        self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
 
 
 def _constraints(

@@ -63,8 +63,8 @@ def replannable(problem: Problem) -> Replannable:
     """The problem with parameters for all that may change between two plans.
 
     Fixed initial values of states become "initial_<state>", initial matrices "initial_<matrix>" (that of the estimation
-    covariance too), a fixed duration "duration", unless something depends on the time explicitly. Free initial values
-    and a free duration stay free.
+    covariance too), a fixed duration "duration", unless something depends on the time explicitly. Free initial values,
+    a free duration and decisions are chosen anew by each plan.
     """
     statement, own = problem.statement(), problem.declarations
     start, _, matrices, _ = statement.boundary_values(statement.values)
@@ -73,11 +73,13 @@ def replannable(problem: Problem) -> Replannable:
     if own.expected is not None and not any(matrix.estimation for matrix in own.matrices):
         own = with_estimation(own)  # so that its start can be a parameter
     for position, state in enumerate(own.states):
+        if state.role != "moving":
+            continue
         block = next(b for b in statement.states if b.name == state.name)
         own = _with_start(own, position, start[block.span], taken, entries)
     for position, matrix in enumerate(own.matrices):
         block = next(b for b in statement.matrices if b.name == matrix.name)
-        if matrix.backward is None and not np.isnan(matrices[block.span]).any():
+        if matrix.backward is None and matrix.role == "moving" and not np.isnan(matrices[block.span]).any():
             own = _with_matrix(own, position, matrices[block.span], taken, entries)
     for block in (*statement.of_kind("parameter"), *statement.of_kind("unknown")):
         value = statement.values[block.span]
@@ -121,7 +123,7 @@ def _with_start(
         return problem
     own = _parameter(problem, f"initial_{state.name}", start[known], state.unit, taken)
     name, symbol = own.name, own.symbol
-    rows = [symbol[known.tolist().index(i)] if i in known else ca.MX(np.nan) for i in range(state.size)]
+    rows = [symbol[known.tolist().index(i)] if i in known else state.initial[i] for i in range(state.size)]
     about = f"initial value of '{state.name}'"
     about += "" if known.size == state.size else f", its entries {', '.join(map(str, known.tolist()))}"
     deviation = np.full(known.size, 0.0)

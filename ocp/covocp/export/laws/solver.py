@@ -282,8 +282,12 @@ def _results(
     results = [(times, duration * ca.DM(nlp.mesh.nodes))]
     for blocks, source, what in ((nlp.statement.controls, u, "control"), (nlp.statement.states, x, "state")):
         for block in blocks:
-            about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
             name = identifier(block.name if block.name not in taken else f"{what}_{block.name}", taken)
+            if block.role == "decision":
+                port = Port(name=name, rows=block.size, unit=block.unit, about=f"decision '{block.name}'")
+                results.append((port, source[block.span, 0]))
+                continue
+            about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
             port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
             results.append((port, source[block.span, :].T))
     results += [(Port(name=n, rows=int(v.shape[0]), about=about), v) for n, (v, about) in last.items()]

@@ -61,7 +61,7 @@ def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
 
 def block_port(block: Block, taken: set[str]) -> Port:
     """The port of one of the user's symbols."""
-    about = {"state": "state", "control": "control", "matrix": "matrix"}.get(block.kind, block.kind)
+    about: str = block.kind if block.role == "moving" else block.role
     if block.kind == "matrix":
         about = "covariance of the error of the estimate" if block.estimation else about
         rows = ", ".join(block.labels)

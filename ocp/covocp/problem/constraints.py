@@ -1,0 +1,58 @@
+"""Constraints: where they hold, and what they may contain there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from covocp.base.checks import caller
+from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
+from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
+from covocp.problem.decisions import decisions_of
+from covocp.problem.declarations import Constraint, Declarations
+from covocp.problem.integrals import integrals_of
+
+PLACES = ("path", "initial", "final")
+
+
+def with_constraint(
+    own: Declarations, expression: Given, lower: Given, upper: Given, at: Given, name: str | None
+) -> Declarations:
+    """The declarations with one more constraint; arguments and errors as of `Problem.subject_to`."""
+    label = name if name is not None else f"constraint {len(own.constraints) + 1}"
+    if at is not None and (not isinstance(at, str) or at not in PLACES):
+        raise ProblemError(
+            f"'{label}' has an unknown place.",
+            expected="at='path', 'initial' or 'final'",
+            received=repr(at),
+            remedy="choose one of the three",
+        )
+    value = column_expression(label, "constraint", expression)
+    fixed: list[Any] = [*own.parameters, *own.unknowns]
+    constants = [*(q.symbol for q in fixed), own.time]
+    check_constrains(label, value, constants)
+    place = _place(own, label, value, at)
+    check_name(label, list(own.named))
+    low, high = limit_columns(label, lower, upper, check_size(label, value.shape[0]))
+    entry = Constraint(name=label, expression=value, lower=low, upper=high, at=place, where=caller())
+    return own.adding(constraints=entry)
+
+
+def _place(own: Declarations, label: str, value: ca.MX, at: Any) -> Any:
+    """Where a constraint holds: integrals have their value at the end, decisions need one row."""
+    symbols = {symbol.__hash__() for symbol in ca.symvar(value)}
+    inside = [entry.name for entry in integrals_of(own) if entry.symbol.__hash__() in symbols]
+    if inside and at not in (None, "final"):
+        raise ProblemError(
+            f"'{label}' contains the integral '{inside[0]}' elsewhere than at the end.",
+            expected="at='final', or no at=: an integral is one number, taken over the whole time",
+            received=f"at='{at}'",
+            remedy="for what has been gathered so far declare a state with this rate: state(..., initial=0)",
+        )
+    fixed: list[Any] = [*decisions_of(own), *own.parameters, *own.unknowns]
+    constant = {q.symbol.__hash__() for q in fixed}
+    if inside or (at in (None, "path") and symbols <= constant):
+        return "final"
+    return "path" if at is None else at
