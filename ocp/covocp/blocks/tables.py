@@ -71,8 +71,8 @@ class Table:
                 raise _wrong(self.name, "takes no expressions of two kinds", "SX or MX", "SX and MX")
             return self._compared(*(ca.SX(value) for value in arguments))
         if not any(isinstance(value, ca.MX) for value in arguments):
-            symbols = [ca.MX.sym("x") for _ in arguments]
-            return float(ca.Function("value", symbols, [self._looked_up(*symbols)])(*arguments))
+            point = [ca.MX.sym("x") for _ in arguments]
+            return float(ca.Function("value", point, [self._looked_up(*point)])(*arguments))
         given = [ca.MX(value) for value in arguments]
         if math.prod(knots.size - 1 for knots in self.grid) > SMALL_CELLS:
             return self._looked_up(*given)
@@ -83,7 +83,7 @@ class Table:
         """The value where every cell is compared: halves of the cells are chosen between, an axis after the other."""
         values, offsets = self.coefficients, []
         cells = [knots.size - 1 for knots in self.grid]
-        rows: list[Expr] = [ca.SX(ca.DM(row)) for row in values.reshape(-1, values.shape[-1])]
+        rows = [ca.SX(ca.DM(row)) for row in values.reshape(-1, values.shape[-1])]
         for i in reversed(range(len(cells))):
             rows = [_chosen(point[i], self.grid[i], rows[k : k + cells[i]]) for k in range(0, len(rows), cells[i])]
         for x, knots in zip(point, self.grid, strict=True):
