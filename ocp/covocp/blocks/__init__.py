@@ -11,4 +11,5 @@ from covocp.blocks import kalman as kalman
 from covocp.blocks import peak_seeking as peak_seeking
 from covocp.blocks import riccati as riccati
 from covocp.blocks import so3 as so3
+from covocp.blocks import tables as tables
 from covocp.blocks import theta_d as theta_d
