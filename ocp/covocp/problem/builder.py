@@ -34,6 +34,7 @@ from covocp.problem.checks import (
     limit_columns,
     scale_column,
 )
+from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.declarations import (
     Constraint,
     Control,
@@ -327,6 +328,21 @@ class Problem:
         self._change(with_estimation(self._declarations, initial))
         return EstimationCovariance(self._declarations.augmented, self._declarations.matrices[-1])
 
+    def closed_loop_covariance(self) -> ClosedLoopCovariance:
+        """The covariance X of the deviations of the actual system under the feedback of `minimize_expected`.
+
+        X[x, x] = E + Xhat, X[u, u] = C Xhat C'. Where a condition or a cost that is not linear contains it, the entries
+        of the gain C are controls; else the gain is the best one, of a Riccati equation.
+
+        Returns:
+            The covariance, for costs and conditions: `X[x, u]` and `X.deviation(u)`.
+
+        Raises:
+            ProblemError: called twice, no state or no control declared before it.
+        """
+        self._change(with_closed_loop(self._declarations))
+        return ClosedLoopCovariance.of(self._declarations)
+
     def dynamics(self, symbol: Given, rate: Given, noise: Given = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
 
@@ -467,7 +483,7 @@ class Problem:
 
     def _declare(self, name: str, size: Given) -> int:
         """Check that the name is new and the size sensible."""
-        check_name(name, list(self._declarations.named))
+        check_name(name, list(self._declarations.taken))
         return check_size(name, size)
 
     def _add(self, group: str, entry: Entry) -> Entry:
