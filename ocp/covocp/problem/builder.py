@@ -325,14 +325,13 @@ class Problem:
         Raises:
             ProblemError: called twice, nothing to estimate, `initial` not positive semidefinite.
         """
-        self._change(with_estimation(self._declarations, initial))
-        return EstimationCovariance(self._declarations.augmented, self._declarations.matrices[-1])
+        self._change(own := with_estimation(self._declarations, initial))
+        return EstimationCovariance(own.augmented, own.matrices[-1])
 
     def closed_loop_covariance(self) -> ClosedLoopCovariance:
         """The covariance X of the deviations of the actual system under the feedback of `minimize_expected`.
 
-        X[x, x] = E + Xhat, X[u, u] = C Xhat C'. Where a condition or a cost that is not linear contains it, the entries
-        of the gain C are controls; else the gain is the best one, of a Riccati equation.
+        Where a condition or a nonlinear cost contains it, the entries of the gain are controls; else it is the best.
 
         Returns:
             The covariance, for costs and conditions: `X[x, u]` and `X.deviation(u)`.
