@@ -59,10 +59,19 @@ JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags"
 
 # Covariances of a closed loop start where they were simulated, some close to their bound of zero, which they never
 # reach: the barrier must not move them far. Best gain: Mars entry takes 10 iterations and had no end before. Free gain:
-# measured on seven structures and bounds of the gain of the lag, on two grids.
+# measured on seven structures and bounds of the gain of the lag, on two grids. A gain that conditions on X ask for
+# begins where it nearly meets them; where gains count for little, at the start, a barrier that falls by steps wanders,
+# and steps that may leave the neighbourhood of the start end at gains so large that no integration step follows them.
 INSIDE: dict[str, dict[str, Any]] = {
     "best gain": {"mu_init": 1e-5, "bound_push": 1e-8, "bound_frac": 1e-8},
     "free gain": {"mu_init": 1e-2, "bound_push": 1e-4, "bound_frac": 1e-4},
+    "asked gain": {
+        "mu_strategy": "adaptive",
+        "adaptive_mu_globalization": "kkt-error",
+        "theta_max_fact": 0.1,
+        "bound_push": 1e-4,
+        "bound_frac": 1e-4,
+    },
 }
 
 NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
@@ -126,7 +135,7 @@ def prepare(
             "fixed_variable_treatment": "make_parameter_nodual",
         }
         if statement.loop is not None and not mesh.eliminated:
-            settings["ipopt"] |= INSIDE["best gain" if statement.behind else "free gain"]
+            settings["ipopt"] |= INSIDE[_gain_kind(statement)]
         start, e0 = starts(statement, mesh, statement.values)
         if needs_exact_bounds(statement, mesh, start, e0, statement.values):
             settings["ipopt"]["bound_relax_factor"] = 0.0
@@ -138,6 +147,16 @@ def prepare(
     settings = merged(settings, plugin_options or {})
     limit = max(LIMIT, LIMIT_PER_TOLERANCE * settings.get("ipopt", {}).get("tol", TOLERANCE))
     return ShootingSolver(statement, mesh, plugin, settings, limited, limit)
+
+
+def _gain_kind(statement: Statement) -> str:
+    """Which of the settings of closed loops: by whether X, the covariance of the loop, is in costs or conditions."""
+    if statement.behind:
+        return "best gain"
+    conditions = (statement.path, statement.start, statement.end)
+    asked = any(entry.realised is not None for entry in conditions)
+    asked = asked or (statement.loop is not None and statement.loop.spread is not None)
+    return "asked gain" if asked else "free gain"
 
 
 def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plugin: Given) -> None:

@@ -26,6 +26,7 @@ CODE = re.compile(r"`([^`]+)`")
 # Classes that a user meets without making them.
 MET = {
     "EstimationCovariance": "covocp.problem.estimation_covariance",
+    "ClosedLoopCovariance": "covocp.problem.closed_loop_covariance",
     "Sample": "covocp.solution.sample",
     "Optimality": "covocp.extremal.optimality",
     "ClosedLoop": "covocp.extremal.closed_loop",

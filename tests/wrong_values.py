@@ -118,8 +118,13 @@ def stated(**given: dict[str, Any]) -> co.Problem:
     ocp.dynamics(**to("dynamics", symbol=x, rate=u - b * x, noise=0.1))
     ocp.measurement(**to("measurement", name="m", expression=x, noise=0.1))
     total = ocp.integral(**to("integral", expression=u**2)) if "integral" in given else 0.0
-    if "minimize_expected" in given or "Gain" in given:
+    if given.keys() & {"minimize_expected", "Gain", "X", "deviation"}:
         gain = co.Gain(**given["Gain"]) if "Gain" in given else None
+        X = ocp.closed_loop_covariance()
+        if "X" in given:
+            X[given["X"]["key"]]
+        if "deviation" in given:
+            X.deviation(**to("deviation", symbol=u))
         ocp.minimize_expected(**to("minimize_expected", running=u**2, terminal_weight={"x": 1.0}, gain=gain))
     else:
         E = ocp.estimation_covariance(**to("estimation_covariance"))
@@ -206,6 +211,10 @@ def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
         yield "Problem", argument, functools.partial(given, "Problem", argument)
     yield "EstimationCovariance", "[]", functools.partial(given, "E", "key")
     yield "EstimationCovariance", "[a, ]", lambda value: given("E", "key", (value, "x"))
+    yield "ClosedLoopCovariance", "[]", functools.partial(given, "X", "key")
+    yield "ClosedLoopCovariance", "[a, ]", lambda value: given("X", "key", (value, "x"))
+    for argument in ("symbol", "smallest"):
+        yield "ClosedLoopCovariance.deviation", argument, functools.partial(given, "deviation", argument)
     for argument, call in called(co.Free, guess=1.0, lower=0.5, upper=2.0):
         yield "Free", argument, call
 

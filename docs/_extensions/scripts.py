@@ -51,6 +51,7 @@ GALLERY = (
             "closed_loop_lag",
             "worth",
             "constrained_gain",
+            "covariance_steering",
             "incorrect_statistics",
             "monte_carlo",
             "own_law",

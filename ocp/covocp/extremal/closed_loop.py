@@ -23,7 +23,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, stacked, unpack, unpack_symbolic
+from covocp.base.matrices import Array, pack_symbolic, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after, simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -34,6 +34,8 @@ from covocp.transcription.steps import KEPT
 
 # Share of the largest slope below which a direction of the state counts as moved by nothing.
 UNMOVED = 1e-10
+# Name of what terms add that are not linear in the covariance of the closed loop.
+COVARIANCES = "covariances"
 # Pairs of substeps for one time constant of filter or loop in an interval, and the most of them.
 STEPS_PER_RATE = 1.0
 LARGEST_PAIRS = 32
@@ -60,7 +62,8 @@ class ClosedLoop:
     E: covariance of the error of the estimate, (K, n, n); Xhat: of the estimate; Z: between both, <e y'>; gain: C,
         (K, m, n).
     cost: expected cost by (E-1) with Z, by term: "terminal" k, "running" int L dt, "deviations at the end"
-        1/2 tr S(T) X(T), "deviations on the way" the integral of A, B, N.
+        1/2 tr S(T) X(T), "deviations on the way" the integral of A, B, N; "covariances" what the cost has of terms that
+        are not linear in the covariance of the closed loop, where it has any.
     conservation: largest relative error of w'(E + Xhat)w, which grows by int w'Qw dt only, over the directions w that
         neither the control nor the state moves (w'F = 0, w'G = 0: constants, or the logarithm of a density plus a
         multiple of the altitude); None where there are none.
@@ -315,15 +318,16 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     function = _running(st)
     h, x, u, time, duration = np.diff(extremal.time), *_points(extremal, fine)
     p = np.tile(extremal.parameters[:, None], (1, n))
-    running = deviations = other = 0.0
+    running = deviations = other = nonlinear = 0.0
     for j in range(m + 1):
         weight = simpson_weight(j, m) * h
         covariance = joint[j::m][:n].transpose(1, 0, 2).reshape(2 * size, -1)
         at = (x[:, j].T, u[:, j].T, fine[:, j, st.nx :].T, time[:, j].T, duration[:, j].T, p)
-        L, fed, alternative = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))
+        L, fed, alternative, added = (np.asarray(v.full()).ravel() for v in function.map(n)(*at, covariance))
         running += float(weight @ L)
         deviations += float(weight @ fed)
         other += float(weight @ alternative)
+        nonlinear += float(weight @ added)
     loop = _loop(st)
     k, S = (np.asarray(v.full()) for v in loop.terminal(t.x[-1], t.duration, extremal.parameters))
     error, cross, estimate = joint[-1][:size, :size], joint[-1][:size, size:], joint[-1][size:, size:]
@@ -334,6 +338,11 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
         "deviations at the end": 0.5 * float(np.sum(S * spread)),
         "deviations on the way": deviations,
     }
+    if loop.spread_end is not None:
+        gain = loop.gain(t.x[-1], extremal.controls[-1], t.e[-1], t.duration, t.duration, extremal.parameters)
+        last = pack_symbolic(_scattered(ca.DM(joint[-1]), gain))
+        at_end = np.asarray(loop.spread_end(t.x[-1], t.duration, extremal.parameters, last).full())
+        terms[COVARIANCES] = nonlinear + float(at_end.item())
     if not best:
         return terms, None
     block = st.matrices[st.behind[0]]
@@ -343,7 +352,10 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
 
 @lru_cache(maxsize=KEPT)
 def _running(statement: Statement) -> ca.Function:
-    """(all six, joint covariance) -> L, its second-order part by (E-1) with Z, 1/2 tr(S Q + C'B C E) of (E-20)."""
+    """(all six, joint covariance) -> L, its second-order part by (E-1) with Z, 1/2 tr(S Q + C'B C E) of (E-20).
+
+    And what the cost has of terms that are not linear in the covariance of the closed loop.
+    """
     symbolic: Any = statement.symbolic
     size = len(statement.augmented)
     six = model_symbols(statement)
@@ -361,4 +373,15 @@ def _running(statement: Statement) -> ca.Function:
         block = statement.matrices[statement.behind[0]]
         S = unpack_symbolic(six[2][block.span], size)
         other = ca.trace(S @ Q) + ca.trace(C.T @ B @ C @ E)
-    return ca.Function("running", [*six, joint], [loop.running(*plain), fed / 2, other / 2])
+    added = symbolic(0)
+    if loop.spread is not None:
+        added = loop.spread(*plain, pack_symbolic(_scattered(joint, C)))
+    return ca.Function("running", [*six, joint], [loop.running(*plain), fed / 2, other / 2, added])
+
+
+def _scattered(joint: Expr, gain: Expr) -> Any:
+    """Covariance of augmented state and controls from that of error and estimate, [E Z; Z' Xhat]."""
+    size = gain.shape[1]
+    E, Z, Xhat = joint[:size, :size], joint[:size, size:], joint[size:, size:]
+    crossed = (Xhat - Z) @ gain.T
+    return ca.densify(ca.blockcat([[E + Xhat - Z - Z.T, -crossed], [-crossed.T, gain @ Xhat @ gain.T]]))

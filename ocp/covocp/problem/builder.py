@@ -30,6 +30,7 @@ from covocp.problem.checks import (
     column_expression,
     scale_column,
 )
+from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.constraints import with_constraint
 from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
@@ -395,6 +396,20 @@ class Problem:
         E = next(matrix for matrix in self._declarations.matrices if matrix.estimation)
         return EstimationCovariance(self._declarations.augmented, E)
 
+    def closed_loop_covariance(self) -> ClosedLoopCovariance:
+        """The covariance X of the deviations of the actual system under the feedback of `minimize_expected`.
+
+        Where a condition or a nonlinear cost contains it, the entries of the gain are controls; else it is the best.
+
+        Returns:
+            The covariance, for costs and conditions: `X[x, u]` and `X.deviation(u)`.
+
+        Raises:
+            ProblemError: called twice, no state or no control declared before it.
+        """
+        self._change(with_closed_loop(self._declarations))
+        return ClosedLoopCovariance.of(self._declarations)
+
     def dynamics(self, symbol: Given, rate: Given, noise: Given = None) -> None:
         """Give the rate of a state or of a symmetric matrix state.
 
@@ -521,7 +536,7 @@ class Problem:
 
     def _declare(self, name: str, size: Given) -> int:
         """Check that the name is new and the size sensible."""
-        check_name(name, list(self._declarations.named))
+        check_name(name, list(self._declarations.taken))
         return check_size(name, size)
 
     def _add(self, group: str, entry: Entry) -> Entry:

@@ -169,6 +169,26 @@ class Matrix:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Spread:
+    """The covariance of the deviations of augmented state and controls of the closed loop, as a symbol.
+
+    symbol: its half-vector; matrix: of states, unknowns and controls; states: rows of the augmented state.
+    value: the half-vector in terms of the other symbols, once the problem with the feedback is derived.
+    """
+
+    name: str
+    symbol: ca.MX
+    matrix: ca.MX
+    size: int
+    states: int
+    where: str
+    labels: tuple[str, ...]
+    value: ca.MX | None = None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Backward:
     """What makes a matrix run backward in time: its value at the end, and the Riccati form of its rate.
 
@@ -346,6 +366,7 @@ class Expansion:
 
     F, G: slopes of the rates by the augmented state and by the control; A, B, N: second derivatives of the running
     cost with the weights; Q: process noise; end: S(T); running, terminal: L and k; gain: the feedback gain C.
+    spread: what nonlinear terms of the covariance X of the closed loop add to the running and to the terminal cost.
     """
 
     F: ca.MX
@@ -360,6 +381,7 @@ class Expansion:
     gain: ca.MX
     alternative: ca.MX | None = None
     product: ca.MX | None = None
+    spread: tuple[ca.MX, ca.MX] | None = None
 
     __repr__ = short_repr
 
@@ -369,7 +391,8 @@ class Declarations:
     """All that is declared of a problem; another problem is made by replacing some of it.
 
     time, duration: symbols of the running and of the terminal time; the duration is a number where it is fixed.
-    rates: by the name of the state or the matrix. expansion: of an expected cost that was derived.
+    rates: by the name of the state or the matrix. expansion: of an expected cost that was derived. spread: the symbol
+    of the covariance of the closed loop.
     """
 
     name: str
@@ -387,6 +410,7 @@ class Declarations:
     cost: tuple[ca.MX, ca.MX] | None = None
     expected: Expected | None = None
     expansion: Expansion | None = None
+    spread: Spread | None = None
 
     __repr__ = short_repr
 
@@ -395,6 +419,11 @@ class Declarations:
         """All declarations that have a name."""
         symbols = (*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices)
         return (*symbols, *self.measurements, *self.constraints)
+
+    @property
+    def taken(self) -> tuple[Any, ...]:
+        """All declarations whose names are taken."""
+        return (*self.named, *(() if self.spread is None else (self.spread,)))
 
     @property
     def augmented(self) -> list[State | Unknown]:

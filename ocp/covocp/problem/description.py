@@ -10,6 +10,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices
 from covocp.base.pages import Part, Section, Sentence, Table, number
+from covocp.problem.closed_loop_covariance import SPREAD, reasons
 from covocp.problem.decisions import decisions_of
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
@@ -68,6 +69,9 @@ class _Written:
         vectors: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
         symbols = [entry.symbol for entry in vectors] + [matrix.symbol for matrix in problem.matrices]
         names = [entry_names((q,)) for q in vectors] + [entries_of(q) for q in problem.matrices]
+        spread = problem.declarations.spread
+        if spread is not None:
+            symbols, names = [*symbols, spread.symbol], [*names, half_names(spread.name, spread.labels)]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
@@ -302,8 +306,13 @@ def _cost(problem: Problem, written: _Written) -> Section:
             rows += [[f"{what} {name}", ", ".join(q or "0" for q in written.diagonal(what, name))] for name in weight]
         elif weight is not None:
             rows.append([what, " ".join(str(weight).split())])
+    asked = reasons(problem.declarations)
     if expected.gain is not None:
         rows.append(["gain of the feedback", repr(expected.gain)])
+    elif asked:
+        rows.append(["gain of the feedback", f"free, for {SPREAD} in {', '.join(asked)}"])
+    elif problem.declarations.spread is not None:
+        rows.append(["gain of the feedback", f"the best one: {SPREAD} is in no condition, and in no nonlinear cost"])
     return _table(["minimise the expected", ""], rows, code=(1,))
 
 

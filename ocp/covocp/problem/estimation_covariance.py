@@ -12,7 +12,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
-from covocp.problem.declarations import Declarations, Matrix, State, Unknown, declare_matrix
+from covocp.problem.declarations import Control, Declarations, Matrix, State, Unknown, declare_matrix
 from covocp.problem.tangents import tangent_slope
 from covocp.statement.statement import error_names, error_size
 
@@ -73,42 +73,63 @@ class EstimationCovariance:
         Raises:
             ProblemError: where a name is unknown, or an expression contains no augmented state.
         """
-        if not isinstance(key, tuple) or len(key) != 2:
-            raise ProblemError(
-                "A covariance is indexed by two symbols.",
-                expected="E[a, b] with a, b of " + ", ".join(self.labels),
-                received=f"E[{key}]",
-                remedy="write E[a, a] for the variance of a; E.matrix is the whole matrix",
-            )
-        left, right = (self._rows(entry) for entry in key)
-        if isinstance(left, slice) and isinstance(right, slice):
-            return self.matrix[left, right]
-        unit = ca.MX.eye(self.matrix.shape[0])
-        rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
-        return rows @ self.matrix @ columns.T
+        return block_between("E", self.matrix, self._entries, self.labels, key)
 
-    def _rows(self, key: Given) -> Any:
-        """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
-        if isinstance(key, str) and key in self.labels:  # the name of a scalar, or of a component
-            row = self.labels.index(key)
-            return slice(row, row + 1)
-        key = symbol_of(key)
-        offset, jacobians = 0, []
-        for entry in self._entries:
-            span = slice(offset, offset + error_size(entry))
-            if key is entry.symbol or (isinstance(key, str) and key == entry.name):
+
+def block_between(
+    letter: str, matrix: ca.MX, entries: Sequence[AugmentedEntry | Control], labels: tuple[str, ...], key: Given
+) -> ca.MX:
+    """The block of a covariance between two symbols, names or expressions.
+
+    Args:
+        letter: what the covariance is called.
+        matrix: the covariance of all entries.
+        entries: what its rows stand for.
+        labels: names of the rows.
+        key: the two.
+
+    Raises:
+        ProblemError: where there are not two, a name is unknown, or an expression contains no entry.
+    """
+    if not isinstance(key, tuple) or len(key) != 2:
+        raise ProblemError(
+            "A covariance is indexed by two symbols.",
+            expected=f"{letter}[a, b] with a, b of " + ", ".join(labels),
+            received=f"{letter}[{key}]",
+            remedy=f"write {letter}[a, a] for the variance of a; {letter}.matrix is the whole matrix",
+        )
+    left, right = (_rows(letter, entries, labels, entry) for entry in key)
+    if isinstance(left, slice) and isinstance(right, slice):
+        return matrix[left, right]
+    unit = ca.MX.eye(matrix.shape[0])
+    rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
+    return rows @ matrix @ columns.T
+
+
+def _rows(letter: str, entries: Sequence[AugmentedEntry | Control], labels: tuple[str, ...], key: Given) -> Any:
+    """Rows that a symbol or name stands for (a slice), or the Jacobian of an expression."""
+    if isinstance(key, str) and key in labels:  # the name of a scalar, or of a component
+        row = labels.index(key)
+        return slice(row, row + 1)
+    key = symbol_of(key)
+    offset, jacobians = 0, []
+    for entry in entries:
+        span = slice(offset, offset + error_size(entry))
+        if key is entry.symbol or (isinstance(key, str) and key == entry.name):
+            return span
+        if is_symbolic(key):
+            if key.is_symbolic() and ca.is_equal(key, entry.symbol):
                 return span
-            if is_symbolic(key):
-                if key.is_symbolic() and ca.is_equal(key, entry.symbol):
-                    return span
-                jacobians.append(tangent_slope(key, entry))
-            offset = span.stop
-        jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
-        if jacobian.nnz() == 0:
-            raise ProblemError(
-                f"'{key}' is not part of the estimated state.",
-                expected="a symbol or name of " + ", ".join(self.labels),
-                received=str(key),
-                remedy="index the covariance with states and unknowns of this problem",
-            )
-        return ca.densify(jacobian)
+            jacobians.append(tangent_slope(key, entry))
+        offset = span.stop
+    jacobian = ca.horzcat(*jacobians) if jacobians else ca.MX(1, 0)
+    if jacobian.nnz() == 0:
+        of_loop = any(isinstance(entry, Control) for entry in entries)
+        raise ProblemError(
+            f"'{key}' is not part of the {'closed loop' if of_loop else 'estimated state'}.",
+            expected="a symbol or name of " + ", ".join(labels),
+            received=str(key),
+            remedy=f"index {letter} with states{', unknowns and controls' if of_loop else ' and unknowns'} of this "
+            "problem",
+        )
+    return ca.densify(jacobian)

@@ -19,7 +19,8 @@ of width U/E(0). So the integral is taken in the second form over the first half
 rest (`integrators.simpson_interval`).
 
 So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had afterwards. The costate of S is
--Xhat/2. Where the gain is constrained (`Gain`), C is a control and the matrices are E and Xhat instead.
+-Xhat/2. Where the gain is constrained (`Gain`), or where a condition or a nonlinear cost contains the covariance of the
+closed loop (`closed_loop_covariance`), C is a control and the matrices are E and Xhat instead.
 """
 
 from __future__ import annotations
@@ -37,6 +38,17 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import pack_symbolic
 from covocp.base.riccati_rates import inverse
 from covocp.problem.checks import as_expression, find_name
+from covocp.problem.closed_loop_covariance import (
+    SPREAD,
+    check_contents,
+    check_no_feedback,
+    check_order,
+    free_gain,
+    reasons,
+    split_cost,
+    with_value,
+    with_weights,
+)
 from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
     Backward,
@@ -118,7 +130,10 @@ def _by_name(what: str, weights: Expr, entries: Sequence[Any]) -> Any:
 
 def statement_of(problem: Declarations) -> Statement:
     """The frozen statement of what is declared; of an expected cost, that of the problem derived from it."""
-    return freeze(problem if problem.expected is None else derive(problem))
+    if problem.expected is not None:
+        return freeze(derive(problem))
+    check_no_feedback(problem)
+    return freeze(problem)
 
 
 def derive(problem: Declarations) -> Declarations:
@@ -139,11 +154,15 @@ def derive(problem: Declarations) -> Declarations:
     _check_random(problem)
     _check_contents(problem, expected)
     check_expected(problem, [expected.running, expected.terminal])
+    check_order(problem)
+    gain = free_gain(problem)
+    problem, *spread = split_cost(problem)
     derived = replace(problem, expected=None)
     if not any(matrix.estimation for matrix in derived.matrices):
         derived = with_estimation(derived)
     _check_free_names(derived)
-    expansion = expand(derived, expected)
+    assert problem.expected is not None
+    expansion = with_weights(problem, expand(derived, problem.expected), *spread)
     E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
     size = E.shape[0]
     jacobian, density = measurement_slope(derived, size)
@@ -152,7 +171,7 @@ def derive(problem: Declarations) -> Declarations:
     if jacobian.shape[0]:
         blocks = [(entry.noise, entry.information) for entry in derived.measurements]
         information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
-    if expected.gain is None:
+    if gain is None:
         derived, S, expansion = _with_feedback(derived, expansion)
         fed = S @ expansion.G + expansion.N
         regained = _trace(S, expansion.Q) + _trace(fed @ _inverse(expansion.B) @ fed.T, E)
@@ -160,11 +179,14 @@ def derive(problem: Declarations) -> Declarations:
         running = expansion.running + (_trace(expansion.A, E) + _trace(S, information)) / 2
         terminal = expansion.terminal + _trace(expansion.end, E) / 2
     else:
-        derived, X, expansion = _with_free_gain(derived, expansion, expected.gain, information)
+        derived, X, expansion = _with_free_gain(derived, expansion, gain, information)
         C = expansion.gain
+        derived = with_value(derived, E, X, C)
         fed = _trace(expansion.B @ C, X @ C.T) - 2 * _trace(expansion.N, C @ X)
         running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
         terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
+        if expansion.spread is not None:
+            running, terminal = running + expansion.spread[0], terminal + expansion.spread[1]
     return replace(derived, cost=(running, terminal), expansion=expansion)
 
 
@@ -183,13 +205,18 @@ def deterministic(problem: Declarations) -> Declarations:
             received=f"'{problem.name}' with minimize()",
             remedy="leave nominal= out: the cost is deterministic already",
         )
-    if expected.gain is not None:
+    asked = reasons(problem)
+    if expected.gain is not None or asked:
         raise ProblemError(
             "nominal='deterministic' needs the best gain.",
             expected="minimize_expected() without gain=: the gain follows from the nominal",
-            received=str(expected.gain),
-            remedy="leave gain= out; or solve for nominal and gain together, nominal='combined'",
+            received=str(expected.gain) if expected.gain is not None else f"{SPREAD} in {', '.join(asked)}",
+            remedy=f"leave {'gain=' if expected.gain is not None else 'these'} out; or solve for nominal and gain "
+            "together, nominal='combined'",
         )
+    problem = split_cost(problem)[0]
+    assert problem.expected is not None
+    expected = problem.expected
     used = {s.__hash__() for c in problem.constraints for s in ca.symvar(c.expression)}
     kept = [m for m in problem.matrices if m.symbol.__hash__() in used or (not m.estimation and m.role == "moving")]
     needed = {s.__hash__() for m in kept if m.role == "integral" for s in ca.symvar(problem.rates[m.name].rate)}
@@ -246,6 +273,9 @@ def _check_contents(problem: Declarations, expected: Expected) -> None:
     contents += [(f"rate of '{name}'", entry.rate) for name, entry in rates]
     contents += [(f"noise of '{name}'", entry.noise) for name, entry in rates if entry.noise is not None]
     contents += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
+    check_contents(dict(contents[2:]), problem)
+    if problem.spread is not None:
+        known.add(problem.spread.symbol.__hash__())
     for what, expression in contents:
         for symbol in ca.symvar(expression):
             matrix = matrices.get(symbol.__hash__())
@@ -255,7 +285,8 @@ def _check_contents(problem: Declarations, expected: Expected) -> None:
                     f"The {what} of a problem with an expected cost contains {content}.",
                     expected="states, unknowns, controls, parameters, time: the actual system has no covariance",
                     received=str(expression)[:200],
-                    remedy="state a cost or a condition of covariances by minimize() or subject_to()"
+                    remedy="state a condition of E by subject_to(), or a cost by minimize(); X = "
+                    "closed_loop_covariance() may be in the expected cost"
                     if matrix
                     else f"declare '{symbol.name()}' in this problem",
                 )

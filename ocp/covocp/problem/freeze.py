@@ -18,6 +18,7 @@ from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.base.short_repr import short_repr
 from covocp.problem.checks import check_dynamics
+from covocp.problem.closed_loop_covariance import floored, used_in
 from covocp.problem.decisions import check_decisions
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.ends import boundary, tied_values, with_end_conditions
@@ -166,6 +167,8 @@ def _check_symbols(problem: Declarations) -> None:
     expressions += [(f"measurement '{m.name}'", ca.veccat(m.expression, m.noise)) for m in problem.measurements]
     expressions += [(f"'{c.name}'", c.expression) for c in problem.constraints]
     expressions += [("the cost", ca.veccat(*(problem.cost or ())))]
+    if problem.spread is not None:
+        hashes.add(problem.spread.symbol.__hash__())
     for what, expression in expressions:
         for symbol in ca.symvar(expression):
             if symbol.__hash__() not in hashes:
@@ -212,16 +215,18 @@ def _symbols(problem: Declarations) -> dict[str, Any]:
 def _stack(problem: Declarations) -> Stacked:
     """Stacked symbols, SX where every expression can be expanded, and the substitution of the user's symbols."""
     groups: list[Any] = [problem.states, problem.controls, problem.matrices, problem.parameters, problem.unknowns]
-    own = [entry.symbol for group in groups for entry in group] + [problem.time]
+    own: list[Any] = [entry.symbol for group in groups for entry in group] + [problem.time]
     if problem.free_duration is not None:
         own.append(problem.duration)
+    value: Any = None if problem.spread is None else problem.spread.value
+    known = own if problem.spread is None or value is None else [*own, problem.spread.symbol]
     every = [entry.rate for entry in problem.rates.values()]
     every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     every += [value for m in problem.measurements for value in (m.expression, m.noise)]
     every += [c.expression for c in problem.constraints] + list(problem.cost or ())
     symbolic: type = ca.SX
     try:
-        ca.Function("everything", own, every).expand()
+        ca.Function("everything", known, every).expand()
     except RuntimeError:  # interpolation tables and external functions have no SX form
         symbolic = ca.MX
     sizes = [sum(entry.symbol.shape[0] for entry in group) for group in groups]
@@ -234,10 +239,13 @@ def _stack(problem: Declarations) -> Stacked:
         offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
         arguments += [vector[i:j] for i, j in pairwise(offsets)]
     arguments += [t, duration] if problem.free_duration is not None else [t]
+    if value is not None:
+        arguments += ca.Function("spread", own, [value]).call(arguments, True, False)
 
-    def substitute(*expressions: Any) -> list[Any]:
-        function = ca.Function("substitute", own, list(expressions))
-        return list(function.call(arguments, True, False))
+    def substitute(*expressions: Any, spread: Any = None) -> list[Any]:
+        """The expressions in the stacked symbols; with another covariance of the closed loop where one is given."""
+        function = ca.Function("substitute", known, list(expressions))
+        return list(function.call(arguments if spread is None else [*arguments[:-1], spread], True, False))
 
     return Stacked(
         inputs=(x, u, e, t, duration, p),
@@ -406,6 +414,7 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
     by_parts = None
     if v.alternative is not None:
         by_parts = stacked.function("by_parts", stacked.substitute(v.alternative, v.product))
+    spread, spread_end = _spread_costs(problem, stacked)
     return Loop(
         expansion=stacked.function("expansion", slopes, without=("matrices",)),
         gain=stacked.function("gain", [ca.densify(gain)]),
@@ -415,6 +424,22 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
             "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
         ),
         by_parts=by_parts,
+        spread=spread,
+        spread_end=spread_end,
+    )
+
+
+def _spread_costs(problem: Declarations, stacked: Stacked) -> tuple[ca.Function | None, ca.Function | None]:
+    """What the covariance of the closed loop adds to the running and to the terminal cost, as functions of it."""
+    v, spread = problem.expansion, problem.spread
+    if v is None or v.spread is None or spread is None:
+        return None, None
+    joint = stacked.symbolic.sym("joint", spread.symbol.shape[0])  # type: ignore[attr-defined]
+    values = stacked.substitute(*v.spread, spread=joint)
+    x, u, _, t, duration, p = stacked.inputs
+    return (
+        ca.Function("spread", [x, u, t, duration, p, joint], values[:1]),
+        ca.Function("spread_end", [x, duration, p, joint], values[1:]),
     )
 
 
@@ -423,8 +448,14 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Condition
     chosen: list[Constraint] = [c for c in problem.constraints if c.at == at]
     values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
     names = [c.name if c.lower.size == 1 else f"{c.name}[{i}]" for c in chosen for i in range(c.lower.size)]
+    realised, spread = None, problem.spread
+    if spread is not None and any(used_in(problem, c.expression) for c in chosen):
+        none: Any = floored(stacked.symbolic.zeros(spread.symbol.shape[0]), spread.size)  # type: ignore[attr-defined]
+        own = stacked.substitute(*(c.expression for c in chosen), spread=none)
+        realised = stacked.function(f"{at}_realised", [ca.vertcat(*own)])
     return Conditions(
         function=stacked.function(f"{at}_conditions", [values]),
+        realised=realised,
         names=tuple(names),
         lower=np.concatenate([np.zeros(0), *(c.lower for c in chosen)]),
         upper=np.concatenate([np.zeros(0), *(c.upper for c in chosen)]),

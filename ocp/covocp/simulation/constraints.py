@@ -1,8 +1,9 @@
 """The constraints of the problem in the runs: which are looked at, who violates them, and what covariances promise.
 
-A run is looked at with its own state, unknowns and control, and the matrices that the solution has. An equality is met
-by no noisy run exactly, and what no run changes (a covariance, an open-loop control) is the same in all: neither is
-counted.
+A run is looked at with its own state, unknowns and control, and the matrices that the solution has; the covariance X of
+the closed loop is zero in it, whose deviations have happened: x + 3 sqrt(X[x, x]) <= 2 counts runs with x > 2. An
+equality is met by no noisy run exactly, and what no run changes (a covariance, an open-loop control) is the same in
+all: neither is counted.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
         values.append(value)
     places: tuple[tuple[Place, Conditions], ...] = (("path", st.path), ("initial", st.start), ("final", st.end))
     for place, conditions in places:
-        column = conditions.function(*a)
+        function = conditions.function if conditions.realised is None else conditions.realised
+        column = function(*a)
         for i, name in enumerate(conditions.names):
             low, high = float(conditions.lower[i]), float(conditions.upper[i])
             if low == high:

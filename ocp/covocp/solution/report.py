@@ -30,6 +30,8 @@ NO_FEEDBACK = 1e-6
 NO_GAIN = 1e-7
 # Name of the gain of a constrained feedback, and of what the deviations add to an expected cost.
 GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
+# Name of the count that says why a gain is free.
+ASKED = "gain_asked"
 # Multipliers below this share of the cost are not shown.
 NEGLIGIBLE = 1e-6
 # Relative difference of costs below which two starts count as having found the same optimum.
@@ -319,7 +321,7 @@ def _gains(solution: Solution) -> Section:
     controls = entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN))
     entries = [(u, i) for u in range(gain.shape[1]) for i in range(gain.shape[2])]
     if not entries or len(entries) > MOST_GAINS:
-        return []
+        return _asked(solution)
     middle = int(np.argmin(np.abs(solution.mesh.nodes - 0.5)))
     rows = []
     for u, i in entries:
@@ -328,8 +330,14 @@ def _gains(solution: Solution) -> Section:
         chosen = [number(history[j], 5) for j in (0, middle, -1, k)]
         rows.append([f"{controls[u]}, {solution.augmented[i]}", *chosen, number(solution.t[k], 4)])
     if np.ptp(gain, axis=0).max() <= NO_FEEDBACK * np.abs(gain).max():
-        return _table(["gain C, constant", ""], [row[:2] for row in rows])
-    return _table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)
+        return [*_asked(solution), *_table(["gain C, constant", ""], [row[:2] for row in rows])]
+    return [*_asked(solution), *_table(["gain C", "at 0", "at T/2", "at T", "largest", "at t [s]"], rows)]
+
+
+def _asked(solution: Solution) -> Section:
+    """Why the gain is not the best one of a Riccati equation, where the covariance of the loop is the reason."""
+    asked = solution.stats.get(ASKED, "")
+    return [Sentence(f"the gain is free, its entries are controls: X is in {asked}", "")] if asked else []
 
 
 def _estimated(solution: Solution) -> bool:

@@ -18,7 +18,7 @@ from covocp.base.later import later
 from covocp.base.matrices import Array, is_semidefinite, read_only, smallest_eigenvalue, unpack, unpack_costate
 from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
-from covocp.extremal.closed_loop import ClosedLoop, close_loop
+from covocp.extremal.closed_loop import COVARIANCES, ClosedLoop, close_loop
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import Dense, dense_output
 from covocp.extremal.extremal import Extremal, Outcome
@@ -501,5 +501,5 @@ def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str
     """Cost by term; of an expected cost the nominal's terms and what the deviations add."""
     if loop is None:
         return dict(terms)
-    nominal = {name: loop.cost[name] for name in ("terminal", "running")}
+    nominal = {name: loop.cost[name] for name in ("terminal", "running", COVARIANCES) if name in loop.cost}
     return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}

@@ -41,8 +41,8 @@ def mention_spread(solution: Solution) -> None:
         warn_user(
             f"{listed} contain{'s' if len(names) == 1 else ''} E, the covariance of the filter's error. The actual "
             f"system scatters by X = E + Xhat: at {t:.4g} s the deviation of {label} is {actual[k, i]:.4g}, of which E "
-            f"shows {error[k, i]:.4g}. Where the condition is about the spread, use solution.deviation('{label}') of "
-            "the solution (the root of X) and widen the margin."
+            f"shows {error[k, i]:.4g}. Where the condition is about the spread, put X = closed_loop_covariance() in "
+            "place of E."
         )
 
 
@@ -50,7 +50,8 @@ def _rows_with(conditions: Conditions, span: slice) -> tuple[list[str], Array]:
     """Names of the conditions that contain some half-vector, and which of its entries they contain."""
     if not conditions.uses_matrices:
         return [], np.zeros(0, bool)
-    rows, columns = conditions.function.jac_sparsity(0, 2).get_triplet()
+    function = conditions.function if conditions.realised is None else conditions.realised  # X contains E by right
+    rows, columns = function.jac_sparsity(0, 2).get_triplet()
     inside = [(i, j - span.start) for i, j in zip(rows, columns, strict=True) if span.start <= j < span.stop]
     used = np.zeros(span.stop - span.start, bool)
     used[[j for _, j in inside]] = True

@@ -26,6 +26,7 @@ from covocp.problem.builder import Problem
 from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.solution import Solution
+from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
@@ -159,6 +160,9 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> t
         columns = []
         for block in statement.controls:
             if block.name not in {b.name for b in nominal.blocks if b.kind == "control"}:
+                if block == free_gain_block(statement) and nominal.loop is not None:
+                    columns.append(gain_entries(statement, block, nominal, at))
+                    continue
                 raise _not_given(block.name, f"a solution of '{nominal.name}' without it")
             own = nominal.block(block.name)
             columns.append(nominal.trajectory.u[:, own.span] if same else sample[block.name].reshape(-1, block.size))

@@ -33,12 +33,13 @@ from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
-from covocp.problem.expected_cost import deterministic, statement_of
+from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
 from covocp.solving.decisions import far_away
+from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
@@ -143,7 +144,10 @@ class Solver:
         self.statement: Statement = problem.statement()
         self._problem, self._classical = problem, cast("Solver | None", None)
         asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
-        self._options = graded(self.statement, asked, self.statement.values)
+        best = with_best_gain_problems(problem)
+        mesh = {field.name: getattr(asked, field.name) for field in fields(Options)}
+        self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
+        self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
         self._own_steps = self._options.substeps == "auto"
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
@@ -188,6 +192,8 @@ class Solver:
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
+        first = self._best_gain(parameters, guess)
+        guess = guess if first is None else meeting_conditions(self._problem, first, parameters or {})
         if isinstance(guess, Solution):
             self._take_steps(guess.mesh)
         with evaluating(self.statement.name):
@@ -197,13 +203,29 @@ class Solver:
                 else:
                     guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
                     outcome, start = from_starts(self._prepared, values, guesses, reporter)
+                    if first is not None and guess is not first and not outcome.converged and not reporter.stop:
+                        guesses = make_guesses(self._solved, self._prepared.mesh, values, first)
+                        outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start)
                 outcome = self._with_finer_steps(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
+            outcome = _with_stats(outcome, **gain_counts(self._problem))
             return self._beside_classical(self._finish(outcome, allow_failure), values)
+
+    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
+        """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
+        named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
+        for solver in self._best if guess is None or named else ():
+            try:
+                with without_warnings():  # they concern another solution
+                    best: Solution = solver.solve(parameters, guess=guess, progress=False)
+            except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
+                continue
+            return best
+        return None
 
     def _closed(self, outcome: Outcome) -> Outcome:
         """Filter and feedback around the nominal of the deterministic cost."""

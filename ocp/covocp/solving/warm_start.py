@@ -14,8 +14,10 @@ from covocp.base.matrices import Array, pack
 from covocp.base.quadrature import interpolated
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
+from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
 from covocp.statement.statement import Block, Statement
+from covocp.transcription.first_guess import simulate_matrices, starts
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import own_start, ranked
 from covocp.transcription.steering import quadrature_weights, resampled
@@ -79,6 +81,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     sample = solution.at(mesh.nodes * solution.duration)
     at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
     plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
+    gain = free_gain_block(statement) if solution.loop is not None else None
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     t, m = solution.trajectory, solution.multipliers
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
@@ -88,6 +91,9 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         )
         matched = matched and other is not None and other.offset == block.offset
         if other is None:
+            if block == gain:
+                at = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
+                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, at)
             continue
         if block.kind == "state":
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
@@ -97,6 +103,8 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
             e[:, block.span] = pack(sample[block.name])
     if same and matched and solution.trajectory.u.shape == u.shape:
         u = solution.trajectory.u.copy()
+    if gain is not None and gain.name not in {b.name for b in solution.blocks}:
+        e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
     trajectory = Trajectory(x=x, u=u, e=e, duration=duration)
     constraints = (statement.path.size, statement.start.size, statement.end.size)
     if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:

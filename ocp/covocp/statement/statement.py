@@ -103,6 +103,8 @@ class Conditions:
     """Inequalities lower <= value(...) <= upper of one kind: along the path, at the start or at the end.
 
     `function` takes (state, control, matrices, time, duration, parameters); `names` has one entry for each row.
+    `realised` is the same of one run, whose spread is none: the covariance X of the closed loop is zero in it; None
+    where no row contains X.
     """
 
     function: ca.Function
@@ -110,6 +112,7 @@ class Conditions:
     lower: Array
     upper: Array
     uses_matrices: bool
+    realised: ca.Function | None = None
 
     __repr__ = short_repr
 
@@ -154,6 +157,9 @@ class Loop:
     extra_control: (state, control, time, duration, parameters) -> B - L_uu (m, m): what the weights add to L.
     by_parts: (all six) -> L + tr(S Q + C'B C E)/2, tr(S E)/2: over any time the running cost is the integral of the
         first less the growth of the second [Schmidt E-20]; None where the gain is not the best one.
+    spread: (state, control, time, duration, parameters, half-vector of the covariance of augmented state and controls)
+        -> what terms that are not linear in that covariance add to the running cost; None without them.
+    spread_end: (state, duration, parameters, that half-vector) -> the same of the terminal cost.
     """
 
     expansion: ca.Function
@@ -162,6 +168,8 @@ class Loop:
     terminal: ca.Function
     extra_control: ca.Function
     by_parts: ca.Function | None
+    spread: ca.Function | None = None
+    spread_end: ca.Function | None = None
 
     __repr__ = short_repr
 

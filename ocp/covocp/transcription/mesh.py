@@ -242,6 +242,8 @@ def _choose_points(statement: Statement, options: Options, substeps: int, group:
     if not (statement.path.size or statement.bounded_states):
         return substeps, 1
     if options.points == "auto":
+        if statement.path.realised is not None and options.substeps == "auto":
+            substeps = max(substeps, 2 * group)  # the spread of the controls is free where it begins, at t = 0
         return substeps, max(1, substeps // group)
     least = options.points * group if options.points > 1 else 1
     if options.substeps != "auto" and substeps % least:

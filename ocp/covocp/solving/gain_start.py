@@ -1,0 +1,238 @@
+"""Where a gain that is optimised starts: from the best one of another solution, or of weights that meet the conditions.
+
+The feedback of a gain of zero leaves an unstable plant to itself, and the root of its deviations has no slope there.
+The best gain is had from a Riccati equation, and a gain that meets conditions g(X) <= c at the least cost is the best
+one of a problem with the weights of X that the multipliers of the conditions are. So along the nominal of the best gain
+without conditions these weights are raised and lowered until the conditions on X alone are nearly met; what is left,
+and the nominal, is the solver's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import CovocpError
+from covocp.base.expressions import Given
+from covocp.base.matrices import Array, pack
+from covocp.base.quadrature import interpolated
+from covocp.base.short_repr import short_repr
+from covocp.extremal.closed_loop import ClosedLoop, close_loop
+from covocp.extremal.extremal import Outcome
+from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.problem.builder import Problem
+from covocp.problem.closed_loop_covariance import SMALLEST_VARIANCE, reasons, used_in, with_best_gain
+from covocp.problem.declarations import Declarations, Parameter, Place
+from covocp.problem.expected_cost import GAIN, statement_of
+from covocp.solution.origin import METHOD
+from covocp.solution.report import ASKED
+from covocp.solution.solution import Solution
+from covocp.statement.names import stacked_parameters
+from covocp.statement.statement import Block, Statement
+from covocp.transcription.mesh import Options
+
+# Parameters of the problem with weights of X: on the way and at the end.
+WEIGHTS: dict[Place, str] = {"path": "weights of X on the way", "final": "weights of X at the end"}
+# Rounds in which weights are raised and lowered; the factor by which one round may change them.
+ROUNDS, LARGEST_FACTOR = 16, 30.0
+# A condition counts as met up to this share of what feedback can take from it.
+MET = 0.05
+
+
+def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
+    """The problem with the best gain, with E for X in its conditions, and without them; none where none asks for X."""
+    chosen = [with_best_gain(problem.declarations, conditions=kept) for kept in (True, False)]
+    return tuple(Problem.of(declarations) for declarations in chosen if declarations is not None)
+
+
+def gain_counts(problem: Problem) -> dict[str, Any]:
+    """What a solution says of its gain: why it is free."""
+    asked = reasons(problem.declarations)
+    return {ASKED: ", ".join(asked)} if asked else {}
+
+
+def free_gain_block(statement: Statement) -> Block | None:
+    """The entries of a gain that is optimised: a control, or a state that is constant; None where there are none."""
+    if statement.loop is None or statement.behind:
+        return None
+    return next((b for b in (*statement.controls, *statement.states) if b.name == GAIN), None)
+
+
+def gain_entries(statement: Statement, block: Block, solution: Solution, at: Array) -> Array:
+    """The entries of a free gain at some places t/T, (K, size), from the gains of a solution, within their bounds."""
+    assert statement.loop is not None
+    assert solution.loop is not None
+    constant = block.kind == "state"
+    bounds = statement.state_bounds if constant else statement.control_bounds
+    rows, columns = (np.array(v) for v in statement.loop.gain.jac_sparsity(0, 0 if constant else 1).get_triplet())
+    inside = (columns >= block.span.start) & (columns < block.span.stop)
+    chosen = rows[inside][np.argsort(columns[inside])]  # entries of the gain, column by column
+    gains = solution.loop.gain.transpose(0, 2, 1).reshape(solution.t.size, -1)[:, chosen]
+    values = interpolated(gains, solution.t / solution.duration, at)
+    if constant:
+        values = np.tile(np.mean(values, axis=0), (at.size, 1))
+    return np.asarray(np.clip(values, bounds[0][block.span], bounds[1][block.span]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Row:
+    """A condition on X alone, g(X) <= limit.
+
+    function: (time, parameters, half-vector of X) -> g, its slope by X.
+    """
+
+    place: Place
+    limit: float
+    function: ca.Function
+
+    __repr__ = short_repr
+
+    def over(self, time: Array, parameters: Given, halves: Array) -> tuple[Array, Array]:
+        """g and its slopes at some times, (K,) and (K, entries)."""
+        columns = (time[None, :], np.tile(parameters[:, None], (1, time.size)), halves.T)
+        value, slope = (np.asarray(v.full()) for v in self.function.map(time.size)(*columns))
+        return value.ravel(), slope.reshape(time.size, -1)
+
+
+def meeting_conditions(problem: Problem, best: Solution, parameters: Mapping[str, Any]) -> Solution:
+    """A solution along the same nominal whose gain nearly meets the conditions on X alone; `best` where none is needed.
+
+    Args:
+        problem: with the conditions.
+        best: solution with the best gain, without them.
+        parameters: values of parameters other than the declared ones, by name.
+    """
+    own = problem.declarations
+    rows = _rows(own)
+    if not rows or best.loop is None:
+        return best
+    try:
+        statement = statement_of(_weighted(own))
+        found = _searched(statement, rows, best, parameters)
+    except (CovocpError, RuntimeError):  # a weight that no gain exists for: the best gain is a start as well
+        return best
+    return best if found is None else found
+
+
+def _rows(own: Declarations) -> list[_Row]:
+    """The conditions on X alone that have an upper limit, row by row."""
+    assert own.spread is not None
+    constants: list[Any] = [*own.parameters, *own.unknowns]
+    known = [entry.symbol for entry in constants]
+    p, half = ca.vertcat(ca.MX(0, 1), *known), own.spread.symbol
+    stacked = ca.MX.sym("p", p.shape[0])
+    allowed = {s.__hash__() for s in (*known, own.time, half)}
+    rows = []
+    for c in own.constraints:
+        for i in range(c.lower.size):
+            row = c.expression[i]
+            alone = all(s.__hash__() in allowed for s in ca.symvar(row))
+            if not used_in(own, row) or not alone or not np.isfinite(c.upper[i]) or c.at == "initial":
+                continue
+            inner = ca.Function("row", [own.time, *known, half], [row, ca.densify(ca.jacobian(row, half))])
+            parts = ca.vertsplit(stacked, np.cumsum([0, *(s.shape[0] for s in known)]).tolist()) if known else []
+            arguments = [own.time, stacked, half]
+            function = ca.Function("row", arguments, inner.call([own.time, *parts, half]))
+            rows.append(_Row(place=c.at, limit=float(c.upper[i]), function=function))
+    return rows
+
+
+def _weighted(own: Declarations) -> Declarations:
+    """The problem with the best gain and weights of X that are parameters."""
+    result = with_best_gain(own, conditions=False)
+    assert result is not None
+    assert result.expected is not None
+    assert result.spread is not None
+    spread, costs = result.spread, {}
+    n = spread.states
+    for place, name in WEIGHTS.items():
+        size = spread.symbol.shape[0]
+        symbol = ca.MX.sym(name, size)
+        entry = Parameter(name=name, symbol=symbol, size=size, where="", unit="", value=np.zeros(size))
+        result = result.adding(parameters=entry)
+        kept = ca.DM.ones(size) if place == "path" else ca.DM(pack(np.pad(np.ones((n, n)), (0, spread.size - n))))
+        costs[place] = ca.dot(ca.sparsify(kept) * symbol, spread.symbol)
+    assert result.expected is not None
+    expected = replace(
+        result.expected,
+        running=result.expected.running + costs["path"],
+        terminal=result.expected.terminal + costs["final"],
+    )
+    return replace(result, expected=expected)
+
+
+def _searched(statement: Statement, rows: list[_Row], best: Solution, parameters: Mapping[str, Any]) -> Solution | None:
+    """The solution along the nominal of `best` with weights of X that come closest to the conditions; None: no need."""
+    options = Options(grid=best.mesh.nodes, control=best.mesh.control)  # type: ignore[arg-type]
+    assert best.loop is not None
+    loop = best.loop
+    outcome: Outcome | None = None
+    least = _spread_halves(loop, fed=False)
+    weights = np.zeros(len(rows))
+    closest, found = np.inf, outcome
+    for turn in range(ROUNDS):
+        shares, weights, slopes = _raised(rows, weights, best, _spread_halves(loop, fed=True), least)
+        worst = max(shares)
+        if turn == 0 and worst <= 1.0:
+            return None
+        if outcome is not None and worst < closest:
+            closest, found = worst, outcome
+        if not np.isfinite(worst) or (turn and worst <= 1.0 + MET and (worst >= 1.0 - MET or turn > ROUNDS // 2)):
+            break
+        values = stacked_parameters(statement, {**parameters, **slopes})
+        mesh = evaluation_mesh(statement, options, values)
+        outcome = evaluate_controls(statement, mesh, best.trajectory.u, best.duration, values, best.trajectory.x[0])
+        closed = close_loop(outcome.extremal) if outcome.converged else None
+        if closed is None:
+            break
+        loop = closed
+    return None if found is None else Solution.of(found, METHOD)
+
+
+def _raised(
+    rows: list[_Row], weights: Array, best: Solution, halves: Array, least: Array
+) -> tuple[list[float], Array, dict[str, Array]]:
+    """Of each condition what feedback leaves, as a share of what it may leave; other weights, and the weights of X.
+
+    Args:
+        rows: the conditions.
+        weights: of each so far.
+        best: whose times and parameters count.
+        halves: half-vectors of X at the nodes.
+        least: those that no feedback can better, E.
+    """
+    t, p, after = best.t, best.parameters, weights.copy()
+    unit = abs(best.cost) if best.cost else 1.0
+    shares = []
+    slopes = {name: np.zeros(halves.shape[1]) for name in WEIGHTS.values()}
+    for i, row in enumerate(rows):
+        at = slice(None) if row.place == "path" else slice(-1, None)
+        value, slope = row.over(t[at], p, halves[at])
+        floor = row.over(t[at], p, least[at])[0]
+        room = np.maximum(row.limit - floor, MET * np.abs(row.limit - value) + np.finfo(float).tiny)
+        share = (value - floor) / room
+        k = int(np.argmax(share))
+        shares.append(float(share[k]))
+        if not weights[i] and shares[i] > 1.0:
+            reduced = max(float(value[k] - floor[k]), np.finfo(float).tiny)
+            after[i] = unit / reduced / (float(t[-1]) if row.place == "path" else 1.0)
+        else:
+            after[i] *= float(np.clip(shares[i] ** 2, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR))
+        slopes[WEIGHTS[row.place]] += after[i] * slope[k]
+    return shares, after, slopes
+
+
+def _spread_halves(loop: ClosedLoop, *, fed: bool) -> Array:
+    """Half-vectors of the covariance of states, unknowns and controls at the nodes; with or without the feedback."""
+    moved = loop.gain @ loop.Xhat if fed else 0.0 * loop.gain
+    inner = loop.X if fed else loop.E
+    top = np.concatenate([inner, -moved.transpose(0, 2, 1)], axis=2)
+    bottom = np.concatenate([-moved, moved @ loop.gain.transpose(0, 2, 1)], axis=2)
+    joint = np.concatenate([top, bottom], axis=1)
+    diagonal = np.arange(joint.shape[1])
+    joint[:, diagonal, diagonal] = np.maximum(joint[:, diagonal, diagonal], SMALLEST_VARIANCE)
+    return pack(joint)

@@ -1,0 +1,88 @@
+"""Problems with conditions on the covariance of the closed loop, and the known optimum of one of them."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize
+
+import covocp as co
+
+NOISE, DENSITY, TIME = 0.01, 0.01, 5.0
+F, G, M = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+START = np.diag([0.2, 0.1])
+
+
+def wall(limit: float = 2.0) -> tuple[co.Problem, ca.MX]:
+    """A wall that the position keeps clear of by three deviations, and the position."""
+    ocp = co.Problem(10.0, "wall")
+    x, v = ocp.state("x", initial=0.0, final=0.0, variance=0.01), ocp.state("v", initial=0.0, final=0.0, variance=1e-4)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u, noise=2e-4)
+    ocp.measurement("position", x, noise=0.01)
+    X = ocp.closed_loop_covariance()
+    ocp.minimize_expected(running=0.5 * u**2 + 2 * (x - 1.9) ** 2, terminal_weight={x: 5.0, v: 5.0})
+    ocp.subject_to(x + 3 * ca.sqrt(X[x, x]), upper=limit, name="wall")
+    return ocp, x
+
+
+def double_integrator(*, unit: float = 1.0, time: float = TIME, miss: float = 0.0) -> tuple[co.Problem, ca.MX, ca.MX]:
+    """From rest to rest; the problem, its position and its control."""
+    ocp = co.Problem(time, "double integrator")
+    x = ocp.state("x", initial=unit, final=0.0, variance=START[0, 0] * unit**2)
+    v = ocp.state("v", initial=0.0, final=0.0, variance=START[1, 1] * unit**2)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u, noise=NOISE * unit**2)
+    ocp.measurement("position", x, noise=DENSITY * unit**2)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: miss, v: miss})
+    return ocp, x, u
+
+
+def ellipse(limits: tuple[float, float], *, unit: float = 1.0) -> co.Problem:
+    """It ends with variances of at most so much, in units squared."""
+    ocp, *_ = double_integrator(unit=unit)
+    X = ocp.closed_loop_covariance()
+    scaled = np.array(limits) * unit**2
+    ocp.subject_to(ca.diag(X.matrix) / scaled, upper=1.0, at="final", name="ellipse")
+    return ocp
+
+
+def margin(limit: float, *, smallest: float | None = None) -> co.Problem:
+    """Its control stays away from its limits by three deviations of the feedback; None: the root is written out."""
+    ocp, _, u = double_integrator(time=4.0, miss=2.0)
+    X = ocp.closed_loop_covariance()
+    deviation = ca.sqrt(X[u, u]) if smallest is None else X.deviation(u, smallest)
+    ocp.subject_to(ca.vertcat(u + 3 * deviation, 3 * deviation - u), upper=limit, name="margin")
+    return ocp
+
+
+def ellipse_by_duality(limits: tuple[float, float]) -> tuple[float, np.ndarray]:
+    """Least expected cost of the feedback of the ellipse, and the weights of the end that reach it.
+
+    Of linear systems the least cost for given variances at the end is the greatest, over weights l >= 0 of the end, of
+    the cost of the best gain for S(T) = diag(l) less l'limits/2: covariance steering without a gap. The filter and S
+    are integrated by scipy.
+    """
+
+    def error_rate(_: float, e: np.ndarray) -> np.ndarray:
+        E = e.reshape(2, 2)
+        return (F @ E + E @ F.T + NOISE * G @ G.T - E @ M.T @ M @ E / DENSITY).ravel()
+
+    E = solve_ivp(error_rate, (0, TIME), START.ravel(), rtol=1e-10, atol=1e-12, dense_output=True, method="LSODA")
+
+    def cost(weights: np.ndarray) -> float:
+        end = np.diag(weights)
+
+        def rate(s: float, z: np.ndarray) -> np.ndarray:  # s = T - t
+            S, at = z[:4].reshape(2, 2), E.sol(TIME - s).reshape(2, 2)
+            gained = at @ M.T @ M @ at / DENSITY
+            return np.append((F.T @ S + S @ F - S @ G @ G.T @ S).ravel(), 0.5 * np.trace(S @ gained))
+
+        z = solve_ivp(rate, (0, TIME), np.append(end.ravel(), 0.0), rtol=1e-9, atol=1e-11, method="LSODA").y[:, -1]
+        return float(z[4] + 0.5 * np.trace(end @ E.y[:, -1].reshape(2, 2)) - 0.5 * weights @ np.array(limits))
+
+    found = minimize(lambda w: -cost(np.exp(w)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4})
+    return -float(found.fun), np.exp(found.x)
