@@ -40,6 +40,7 @@ GALLERY = (
             "noisy_integrator",
             "unknown_gain",
             "designed_excitation",
+            "attitude_slew",
             "bought_sensor",
         ),
     ),
