@@ -109,6 +109,12 @@ def stated(**given: dict[str, Any]) -> co.Problem:
     b = ocp.unknown(**to("unknown", name="b", mean=0.1, variance=0.2))
     u = ocp.control(**to("control", name="u"))
     d = ocp.decision(**to("decision", name="d", guess=0.5, lower=0.1, upper=2.0)) if "decision" in given else 1.0
+    if given.keys() & {"attitude", "cosine", "error"}:
+        turned = {"name": "C", "initial": np.eye(3), "rate": ca.MX.zeros(3), "variance": 0.1}
+        attitude = ocp.attitude(**to("attitude", **turned))
+        if "attitude" not in given:
+            attitude.cosine(**to("cosine", body_axis=[1, 0, 0], direction=[0, 0, 1]))
+            attitude.error(**to("error", reference=np.eye(3)))
     if "symmetric" in given:
         ocp.symmetric(**to("symmetric", name="S", size=2, initial=np.eye(2)))
         ocp.dynamics("S", ca.MX.zeros(2, 2))
@@ -198,7 +204,7 @@ def called(function: Call, /, **valid: Any) -> Iterator[tuple[str, Call]]:
 def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
     """Of what states a problem."""
     given = functools.partial(in_statement, solved=solved)
-    symbols = ("state", "unknown", "parameter", "control", "decision", "integral", "symmetric")
+    symbols = ("state", "attitude", "unknown", "parameter", "control", "decision", "integral", "symmetric")
     for method in (*symbols, "estimation_covariance", "dynamics"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
@@ -209,6 +215,8 @@ def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
         yield "Gain", argument, functools.partial(given, "Gain", argument)
     for argument in ("duration", "name"):
         yield "Problem", argument, functools.partial(given, "Problem", argument)
+    for method, argument in (("cosine", "body_axis"), ("cosine", "direction"), ("error", "reference")):
+        yield f"Attitude.{method}", argument, functools.partial(given, method, argument)
     yield "EstimationCovariance", "[]", functools.partial(given, "E", "key")
     yield "EstimationCovariance", "[a, ]", lambda value: given("E", "key", (value, "x"))
     yield "ClosedLoopCovariance", "[]", functools.partial(given, "X", "key")

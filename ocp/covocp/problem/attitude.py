@@ -162,7 +162,7 @@ def as_quaternion(name: str, value: Given, what: str = "attitude") -> ca.MX:
             so3.from_quaternion(numbers)
             return ca.MX(ca.DM(numbers / np.linalg.norm(numbers)))
         received = f"shape {shape}"
-    except (TypeError, ValueError) as error:  # a ProblemError among them
+    except (TypeError, ValueError, OverflowError) as error:  # a ProblemError among them
         received = error.received if isinstance(error, ProblemError) else shown(value)
     raise ProblemError(
         f"The {what} of '{name}' is no attitude.",
@@ -183,7 +183,7 @@ def _unit(name: str, what: str, value: Given) -> Any:
         return as_expression(name, what, value, (3, 1))
     try:
         numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     length = float(np.linalg.norm(numbers)) if numbers.shape == (3,) else np.nan
     if not np.isfinite(length) or length == 0.0:
@@ -220,7 +220,7 @@ def _evaluated(guess: Callable[[Any], Any], s: Given) -> Any:
         values = np.asarray(guess(places), dtype=float)
         if values.shape[:1] == places.shape and values.ndim > 1:
             return values
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     return np.array([np.asarray(guess(float(c)), dtype=float) for c in places])
 
@@ -257,7 +257,7 @@ def _quaternions(name: str, values: Given, start: Array) -> Array:
         if given.shape[-1:] != (4,) or given.ndim > 2:
             raise ValueError(f"shape {np.shape(values)}")
         so3.from_quaternion(given)
-    except (TypeError, ValueError) as error:  # a ProblemError is a ValueError
+    except (TypeError, ValueError, OverflowError) as error:  # a ProblemError is a ValueError
         raise ProblemError(
             f"The guess of '{name}' is no course of attitudes.",
             expected="attitudes over the nodes: rotations (K, 3, 3), unit quaternions (K, 4), one of them, or a "
