@@ -90,6 +90,17 @@ def test_import_leaves_the_names_of_the_folders_to_the_user(tmp_path):
     assert found.stdout.strip() == "[]"
 
 
+def test_import_loads_neither_scipy_nor_the_laws(tmp_path):
+    """Both take longer than all the rest; a law is loaded when it is asked for."""
+    found = run_python(
+        "import sys, covocp; print(sorted({'scipy', 'matplotlib', 'covocp.blocks.theta_d'} & set(sys.modules)));"
+        "print(covocp.blocks.theta_d.__name__)",
+        tmp_path,
+    )
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.split() == ["[]", "covocp.blocks.theta_d"]
+
+
 def test_modules_of_the_user_with_the_names_of_the_folders_do_not_collide(tmp_path):
     for name in ("ocp", "models", "solvers"):
         (tmp_path / f"{name}.py").write_text("mine = True\n", encoding="utf-8")
