@@ -195,3 +195,17 @@ def test_printed_and_drawn_as_rotation_vector_and_angle():
     panel = next(axes for axes in solution.plot().axes if axes.get_ylabel() == "attitude [°]")
     assert [text.get_text() for text in panel.get_legend().get_texts()] == ["about x", "about y", "about z", "angle"]
     assert panel.get_lines()[3].get_ydata()[-1] == pytest.approx(np.rad2deg(1.0))
+
+
+def test_an_attitude_with_both_ends_free_points_where_it_is_told():
+    """From one direction to another one, the roll free at both ends: the angle between them, at constant speed."""
+    ocp = co.Problem(2.0, "pointing")
+    omega = ocp.control("omega", 3)
+    attitude = ocp.attitude("attitude", initial=None, rate=omega)
+    for at, goal in (("initial", [1.0, 0.0, 0.0]), ("final", [0.6, 0.8, 0.0])):
+        apart = attitude.matrix @ ca.DM(goal) - ca.DM([1.0, 0.0, 0.0])
+        ocp.subject_to(apart[1:], lower=np.zeros(2), upper=np.zeros(2), at=at)
+    ocp.minimize(running=ca.sumsqr(omega))
+    solution = co.solve(ocp, intervals=10)
+    assert solution.cost == pytest.approx(np.arccos(0.6) ** 2 / 2.0, rel=1e-6)
+    assert np.linalg.norm(solution.trajectory.x, axis=1) == pytest.approx(1.0, abs=1e-8)

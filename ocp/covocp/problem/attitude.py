@@ -199,11 +199,11 @@ def _unit(name: str, what: str, value: Given) -> Any:
 def _guess(own: Declarations, name: str, guess: Guess, first: ca.MX, target: ca.MX | None) -> Guess:
     """Where a solver starts, as quaternions: what the user gives, else the shortest way between the ends.
 
-    Without a final attitude it is simulated: the attitude turns as the controls make it.
+    Without a final attitude it is simulated: the attitude turns as the controls make it; where both are free it stands.
     """
-    if guess is None and target is None:
-        return None
     start = _numbers(own, first)
+    if guess is None and target is None:
+        return np.array([1.0, 0.0, 0.0, 0.0]) if np.isnan(start).any() else None
     if callable(guess):
         return lambda s: _quaternions(name, _evaluated(guess, s), start)
     if guess is not None:

@@ -71,6 +71,9 @@ def _random_guess(
     start, e0 = starts(statement, mesh, parameters)
     for k, share in zip(free, shares, strict=False):
         start[k] = _drawn_state(statement, k, float(start[k]), float(share))
+    for block in statement.states:
+        if block.tangent:  # a random quaternion, of unit length
+            start[block.span] /= np.linalg.norm(start[block.span])
     start, e0 = statement.started(start, parameters, e0)
     duration = _drawn_duration(statement, float(shares[-1])) if statement.duration.free else statement.duration.guess
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
