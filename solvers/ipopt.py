@@ -137,7 +137,8 @@ def prepare(
         if statement.loop is not None and not mesh.eliminated:
             settings["ipopt"] |= INSIDE[_gain_kind(statement)]
         start, e0 = starts(statement, mesh, statement.values)
-        if needs_exact_bounds(statement, mesh, start, e0, statement.values):
+        # a decided variance that is relaxed below its bound would be negative
+        if statement.decisions or needs_exact_bounds(statement, mesh, start, e0, statement.values):
             settings["ipopt"]["bound_relax_factor"] = 0.0
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}

@@ -286,9 +286,9 @@ def _check_symbols(design: System, truth: Statement) -> None:
     # Gains that were optimised are states or controls of the design, after those of the actual system.
     rows = {"state": design.entries, "control": design.fed_back or design.statement.nu}
     for kind, what in (("state", "states"), ("unknown", "unknowns"), ("control", "controls")):
-        blocks = [b for b in design.statement.blocks if b.kind == kind]
+        blocks = [b for b in design.statement.blocks if b.kind == kind and b.role == "moving"]
         own = [(b.name, b.size) for b in blocks if b.offset < rows.get(kind, b.offset + 1)]
-        other = [(b.name, b.size) for b in truth.blocks if b.kind == kind]
+        other = [(b.name, b.size) for b in truth.blocks if b.kind == kind and b.role == "moving"]
         if own != other:
             raise ProblemError(
                 f"The truth has other {what} than the design.",
@@ -297,14 +297,14 @@ def _check_symbols(design: System, truth: Statement) -> None:
                 remedy=f"declare the same {what} in the same order and size; dynamics, noises and variances may differ",
             )
     chosen, own = (
-        [(b.name, b.size) for b in statement.states if b.role == "decision"] for statement in (design.statement, truth)
+        [(b.name, b.size) for b in statement.states if b.role != "moving"] for statement in (design.statement, truth)
     )
     if own != chosen[: len(own)]:
         raise ProblemError(
-            "The truth has other decisions than the design, and no value of them is known.",
+            "The truth has other decisions or integrals than the design, and no value of them is known.",
             expected=f"numbers, or {_listed(chosen)} in this order: the truth has the chosen values",
             received=_listed(own),
-            remedy="declare the same decisions, or write numbers in their place",
+            remedy="declare the same decisions and integrals, or none and numbers in place of decisions",
         )
 
 
