@@ -169,3 +169,11 @@ def test_guesses_of_attitudes(kind):
     ocp, attitude = declared(guess=guess, final=rotations[-1])
     ocp.minimize(running=ca.sumsqr(ocp.declarations.controls[0].symbol))
     assert co.solve(ocp, intervals=10).cost == pytest.approx(1.0, rel=1e-7)
+
+
+def test_a_direction_by_a_parameter_is_of_any_length():
+    ocp = co.Problem(1.0)
+    rate, sun = ocp.control("rate", 3), ocp.parameter("sun", [0.0, 3.0, 4.0])
+    attitude = ocp.attitude("attitude", initial=np.eye(3), rate=rate)
+    value = ca.Function("value", [attitude.quaternion, sun], [attitude.cosine([0, 0, 2.0], sun)])
+    assert float(value([1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 4.0])) == pytest.approx(0.8, abs=1e-15)

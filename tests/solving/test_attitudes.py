@@ -209,3 +209,26 @@ def test_an_attitude_with_both_ends_free_points_where_it_is_told():
     solution = co.solve(ocp, intervals=10)
     assert solution.cost == pytest.approx(np.arccos(0.6) ** 2 / 2.0, rel=1e-6)
     assert np.linalg.norm(solution.trajectory.x, axis=1) == pytest.approx(1.0, abs=1e-8)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_start_by_a_parameter_takes_the_short_way_whatever_its_sign(sign):
+    """A start that passes half a turn, where the quaternion of a rotation changes its sign."""
+    ocp = co.Problem(10.0, "sign")
+    start = ocp.parameter("start", so3.to_quaternion(so3.exp([3.0, 0.0, 0.0])))
+    omega = ocp.control("omega", 3)
+    ocp.attitude("attitude", initial=start, final=so3.exp([2.5, 0.0, 0.0]), rate=omega)
+    ocp.minimize(running=ca.sumsqr(omega))
+    solver = co.Solver(ocp, intervals=10)
+    solution = solver.solve({start: sign * so3.to_quaternion(so3.exp([3.3, 0.0, 0.0]))}, progress=False)
+    assert solution.cost == pytest.approx(0.8**2 / 10.0, rel=1e-6)
+
+
+def test_a_goal_by_a_decision():
+    """How far to turn about one axis, against a price: 2 s / T = 1 with T = 2."""
+    ocp = co.Problem(2.0, "decided")
+    omega = ocp.control("omega", 3)
+    s = ocp.decision("s", guess=0.5, lower=0.0, upper=3.0)
+    ocp.attitude("attitude", initial=np.eye(3), final=so3.exp(ca.vertcat(s, 0, 0)), rate=omega)
+    ocp.minimize(running=ca.sumsqr(omega), terminal=-s)
+    assert co.solve(ocp, intervals=10)["s"] == pytest.approx(1.0, abs=1e-5)

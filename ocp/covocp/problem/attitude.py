@@ -13,7 +13,7 @@ from covocp.base.checks import density_matrix, is_symbolic
 from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.geometry import Chart
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, real_numbers
 from covocp.base.short_repr import short_repr
 from covocp.blocks import so3
 from covocp.blocks.rotation_chart import AXES, conjugate, rotation, rotation_chart, turning
@@ -66,7 +66,7 @@ class Attitude:
 
         Args:
             body_axis: x in body axes, shape (3,), of any length.
-            direction: y in inertial axes, shape (3,), of any length; or an expression, of unit length.
+            direction: y in inertial axes, shape (3,), of any length, numbers or an expression.
 
         Raises:
             ProblemError: a vector of another shape, of length zero, NaN.
@@ -92,6 +92,9 @@ def with_attitude(
     symbol = ca.MX.sym(name, chart.size)
     free = ca.MX(ca.DM.nan(chart.size, 1))
     first = free if initial is None else as_quaternion(name, initial, "initial attitude")
+    known = _numbers(own, first)
+    if not first.is_constant() and np.isfinite(known).all():  # of q and -q the one that the guess begins with
+        first = ca.if_else(ca.dot(first, known) < 0, -first, first)
     target = None if final is None else as_quaternion(name, final, "final attitude")
     state = State(
         name=name,
@@ -151,14 +154,14 @@ def as_quaternion(name: str, value: Given, what: str = "attitude") -> ca.MX:
     """
     symbolic = is_symbolic(value)
     try:
-        value = value.full() if isinstance(value, ca.DM) else value
-        shape = tuple(value.shape) if symbolic else np.shape(value)
+        value = value if symbolic else real_numbers(value)
+        shape = tuple(value.shape)
         if shape == (3, 3):
             return ca.MX(ca.densify(ca.MX(_column(so3.to_quaternion(value)))))
         if shape in ((4,), (4, 1)):
             if symbolic:
                 return ca.MX(value) / ca.norm_2(value)
-            numbers = np.asarray(value, dtype=float).ravel()
+            numbers = value.ravel()
             so3.from_quaternion(numbers)
             return ca.MX(ca.DM(numbers / np.linalg.norm(numbers)))
         received = f"shape {shape}"
@@ -180,9 +183,9 @@ def _column(value: Given) -> Any:
 def _unit(name: str, what: str, value: Given) -> Any:
     """A direction as a column of unit length."""
     if is_symbolic(value):
-        return as_expression(name, what, value, (3, 1))
+        return as_expression(name, what, value, (3, 1)) / ca.norm_2(value)
     try:
-        numbers = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).ravel()
+        numbers = real_numbers(value).ravel()
     except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     length = float(np.linalg.norm(numbers)) if numbers.shape == (3,) else np.nan
@@ -210,6 +213,8 @@ def _guess(own: Declarations, name: str, guess: Guess, first: ca.MX, target: ca.
         return _quaternions(name, guess, start)
     assert target is not None
     end = _numbers(own, target)
+    if np.isnan(end).any():
+        return None if np.isfinite(start).all() else np.array([1.0, 0.0, 0.0, 0.0])
     return geodesic(end if np.isnan(start).any() else start, end)
 
 
@@ -217,19 +222,23 @@ def _evaluated(guess: Callable[[Any], Any], s: Given) -> Any:
     """Attitudes at some places, by a function of all of them, or of one."""
     places = np.atleast_1d(s)
     try:
-        values = np.asarray(guess(places), dtype=float)
+        values = real_numbers(guess(places))
         if values.shape[:1] == places.shape and values.ndim > 1:
             return values
     except (TypeError, ValueError, OverflowError):
         pass
-    return np.array([np.asarray(guess(float(c)), dtype=float) for c in places])
+    return np.array([real_numbers(guess(float(c))) for c in places])
 
 
 def _numbers(own: Declarations, value: ca.MX) -> Array:
-    """An end with the parameters at their declared values."""
-    known = [*own.parameters]
-    function = ca.Function("end", [entry.symbol for entry in known], [value])
-    return np.asarray(function.call([ca.DM(entry.value) for entry in known])[0].full()).ravel()
+    """An end with parameters as declared and decisions at their guesses; NaN where it has other symbols."""
+    decided = [state for state in own.states if state.role == "decision"]
+    symbols = [*(entry.symbol for entry in own.parameters), *(state.symbol for state in decided)]
+    if {s.__hash__() for s in ca.symvar(value)} - {s.__hash__() for s in symbols}:
+        return np.full(value.shape[0], np.nan)
+    guesses: list[Any] = [state.guess for state in decided]
+    numbers = [ca.DM(v) for v in (*(entry.value for entry in own.parameters), *guesses)]
+    return np.asarray(ca.Function("end", symbols, [value]).call(numbers)[0].full()).ravel()
 
 
 def geodesic(start: Array, end: Array) -> Callable[[Any], Array]:
@@ -251,11 +260,11 @@ def _quaternions(name: str, values: Given, start: Array) -> Array:
         ProblemError: no attitudes.
     """
     try:
-        given = np.asarray(values, dtype=float)
+        given = real_numbers(values)
         if given.shape[-2:] == (3, 3):
             given = so3.to_quaternion(given)
         if given.shape[-1:] != (4,) or given.ndim > 2:
-            raise ValueError(f"shape {np.shape(values)}")
+            raise ValueError(f"shape {given.shape}")
         so3.from_quaternion(given)
     except (TypeError, ValueError, OverflowError) as error:  # a ProblemError is a ValueError
         raise ProblemError(
