@@ -57,9 +57,11 @@ def angle_to_the_sun(solution: co.Solution) -> np.ndarray:
 
 def main() -> None:
     """Solve the slews."""
-    ocp, _, torque, _ = slew(40.0, "least torque")
+    ocp, _, torque, attitude = slew(40.0, "least torque")
     ocp.minimize(running=ca.sumsqr(torque))
     gentle = co.solve(ocp, points=2)
+    to_the_sun = 180.0 / np.pi * ca.acos(attitude.cosine(TELESCOPE, SUN))
+    gentle.plot("attitude", {"telescope to Sun [°]": to_the_sun}, "torque").savefig("attitude_slew.png", dpi=120)
     print(gentle)
     print(f"closest to the Sun: {angle_to_the_sun(gentle).min():.2f} deg\n")
 
@@ -83,7 +85,6 @@ def main() -> None:
         drift = np.rad2deg(solution.deviation("bias")[-1]) * 3600.0
         print(f"{name:17s} roll known to {roll:.2f} arc minutes, bias to {drift.round(2)} arc seconds a second")
     solution.plot("attitude", "torque", ("rms", "bias")).savefig("attitude_knowledge.png", dpi=120)
-    gentle.plot().savefig("attitude_slew.png", dpi=120)
 
 
 if __name__ == "__main__":

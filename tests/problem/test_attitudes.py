@@ -177,3 +177,11 @@ def test_a_direction_by_a_parameter_is_of_any_length():
     attitude = ocp.attitude("attitude", initial=np.eye(3), rate=rate)
     value = ca.Function("value", [attitude.quaternion, sun], [attitude.cosine([0, 0, 2.0], sun)])
     assert float(value([1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 4.0])) == pytest.approx(0.8, abs=1e-15)
+
+
+@wrong("name 'final attitude' is used twice")
+def test_a_name_that_the_end_of_an_attitude_needs():
+    ocp = co.Problem(1.0)
+    rate = ocp.control("rate", 3)
+    ocp.subject_to(rate, upper=np.ones(3), name="final attitude")
+    ocp.attitude("attitude", initial=np.eye(3), final=so3.exp([0.1, 0.0, 0.0]), rate=rate)

@@ -82,7 +82,7 @@ def test_the_compiled_controller_points_as_python_does(tmp_path):
     assert np.sqrt(np.mean(sample.deviations**2, axis=0)) == pytest.approx(predicted, rel=0.35)
 
 
-def test_what_a_controller_tells_of_its_nominal_is_of_unit_length(tmp_path):
+def test_an_exported_attitude_is_of_unit_length_between_the_nodes(tmp_path):
     laws = co.export_c(pointing(), tmp_path / "unit", feedback=False).python()
     for time in np.linspace(0.01, 3.99, 23):
         assert np.linalg.norm(laws.sample(time)["attitude"]) == pytest.approx(1.0, abs=1e-14)

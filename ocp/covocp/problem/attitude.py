@@ -17,7 +17,7 @@ from covocp.base.matrices import Array, real_numbers
 from covocp.base.short_repr import short_repr
 from covocp.blocks import so3
 from covocp.blocks.rotation_chart import AXES, conjugate, rotation, rotation_chart, turning
-from covocp.problem.checks import as_expression
+from covocp.problem.checks import as_expression, check_name
 from covocp.problem.declarations import Constraint, Declarations, Dynamics, Guess, State
 
 
@@ -117,6 +117,7 @@ def with_attitude(
     moves = Dynamics(rate=turning(symbol, omega), noise=density, where=where, one_density=False)
     declared = own.adding(states=state, rates={name: moves})
     for constraint in _ends(chart, state, initial is None):
+        check_name(constraint.name, list(own.named))
         declared = declared.adding(constraints=constraint)
     return declared, Attitude(name, symbol)
 
