@@ -7,7 +7,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.transcription.nlp import NLP
+from covocp.transcription.program import Program
 
 # A run that has not brought its largest violation below this share of the smallest one before, for so many iterations,
 # has lost its way, unless it violates (in the units of the NLP) less than this: then it may take its time.
@@ -19,7 +19,7 @@ NEAR = 1e-3
 class Monitor(ca.Callback):
     """Ipopt's iteration callback: reports progress, and stops when the user asks."""
 
-    def __init__(self, nlp: NLP) -> None:
+    def __init__(self, nlp: Program) -> None:
         ca.Callback.__init__(self)
         self._sizes = {"x": nlp.w.shape[0], "g": nlp.g.shape[0], "p": nlp.p.shape[0], "f": 1}
         self._progress: Progress | None = None

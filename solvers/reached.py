@@ -11,9 +11,9 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
 from covocp.base.short_repr import short_repr
-from covocp.transcription.nlp import NLP, Scales
+from covocp.transcription.nlp import Scales
+from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.scales import choose_scales, magnitudes
-from covocp.transcription.trajectory import Trajectory
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
 SMALLEST_SHARE = 1e-6
@@ -23,8 +23,10 @@ SIMILAR = 1.5
 DISPLACEMENT = 1e-4
 
 
-# The trajectory of a point, its cost terms and constraint values (`NLP.unpack`).
-Evaluated = tuple[Trajectory, dict[str, Any]]
+# The trajectories of a point, its cost terms and constraint values (`Program.unpack`).
+Evaluated = tuple[Trajectories, dict[str, Any]]
+# Magnitudes of each part of a program.
+Magnitudes = tuple[Scales, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +63,7 @@ class Start:
 class Round:
     """A run, with its residuals where it ended at a point that may be stationary."""
 
-    nlp: NLP
+    nlp: Program
     point: Point
     where: Evaluated
     residuals: Residuals | None
@@ -78,7 +80,7 @@ class Round:
 class FirstOrder:
     """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
 
-    def __init__(self, nlp: NLP, solver: ca.Function, plugin: str) -> None:
+    def __init__(self, nlp: Program, solver: ca.Function, plugin: str) -> None:
         """Take Ipopt's functions, or make one: every other plugin has its own."""
         self.nlp = nlp
         self._gradient: Any = None
@@ -86,17 +88,17 @@ class FirstOrder:
         if plugin == "ipopt":
             self._gradient, self._jacobian = solver.get_function("nlp_grad_f"), solver.get_function("nlp_jac_g")
 
-    def cost(self, w: Array, parameters: Array) -> tuple[float, Array]:
+    def cost(self, w: Array, parameters: Arrays) -> tuple[float, Array]:
         """The cost and its gradient by the variables."""
         if self._gradient is None:
             outputs = [self.nlp.f, ca.gradient(self.nlp.f, self.nlp.w)]
             self._gradient = ca.Function("gradient", [self.nlp.w, self.nlp.p], outputs)
-        value, slope = self._gradient(w, np.append(parameters, 1.0))
+        value, slope = self._gradient(w, self.nlp.p_of(parameters, 1.0))
         return float(value), np.asarray(slope.full()).ravel()
 
-    def constraints(self, w: Array, parameters: Array, weights: Array) -> tuple[Array, Array]:
+    def constraints(self, w: Array, parameters: Arrays, weights: Array) -> tuple[Array, Array]:
         """The constraints, and the slope by the variables of their sum with these weights."""
-        p = np.append(parameters, 1.0)
+        p = self.nlp.p_of(parameters, 1.0)
         if self._jacobian is not None:
             values, jacobian = self._jacobian(w, p)
             slope = ca.mtimes(jacobian.T, ca.DM(weights)).full()  # not by scipy: importing it takes longer than a solve
@@ -108,36 +110,42 @@ class FirstOrder:
         return np.asarray(values.full()).ravel(), np.asarray(slope).ravel()
 
 
-def reached_scales(nlp: NLP, trajectory: Trajectory, parameters: Array, *, again: bool) -> Scales:
+def reached_scales(nlp: Program, trajectories: Trajectories, parameters: Arrays, *, again: bool) -> Magnitudes:
     """The magnitudes at a point that was reached.
 
     Args:
         nlp: in which the point was found.
-        trajectory: the point.
-        parameters: of the statement.
-        again: whether the NLP itself is in the scales of such a point: controls that are then far smaller are zero.
+        trajectories: the point.
+        parameters: of the statements.
+        again: whether the program itself is in the scales of such a point: controls that are then far smaller are zero.
     """
-    found = choose_scales(nlp.statement, nlp.mesh, trajectory, parameters)
-    least = SMALLEST_SHARE * nlp.scales.u.reshape(-1, found.u.size).max(axis=0, initial=0.0) if again else 0.0
-    return replace(found, u=np.maximum(found.u, least), duration=trajectory.duration)
+    result = []
+    for part, trajectory, own in nlp.each(trajectories, parameters):
+        found = choose_scales(part.statement, part.mesh, trajectory, own)
+        least = SMALLEST_SHARE * part.scales.u.reshape(-1, found.u.size).max(axis=0, initial=0.0) if again else 0.0
+        result.append(replace(found, u=np.maximum(found.u, least), duration=trajectory.duration))
+    return tuple(result)
 
 
-def not_zero(nlp: NLP, scales: Scales) -> Scales:
-    """Magnitudes in which an NLP can work: states and matrices that are zero but for roundoff have none."""
-    x, e = (SMALLEST_SHARE * own for own in (nlp.scales.x, nlp.scales.e))
-    return replace(scales, x=np.maximum(scales.x, x), e=np.maximum(scales.e, e))
+def not_zero(nlp: Program, scales: Magnitudes) -> Magnitudes:
+    """Magnitudes in which a program can work: states and matrices that are zero but for roundoff have none."""
+    least = [(SMALLEST_SHARE * own.x, SMALLEST_SHARE * own.e) for own in nlp.scales]
+    return tuple(
+        replace(own, x=np.maximum(own.x, x), e=np.maximum(own.e, e)) for own, (x, e) in zip(scales, least, strict=True)
+    )
 
 
-def similar(nlp: NLP, scales: Scales) -> bool:
-    """Whether other magnitudes are about those that an NLP works in."""
-    own = nlp.scales
-    time = np.array([scales.duration / own.duration])
-    ratios: list[Array] = [scales.x / own.x, scales.e / own.e, np.ravel(scales.u / own.u), time]
+def similar(nlp: Program, scales: Magnitudes) -> bool:
+    """Whether other magnitudes are about those that a program works in."""
+    ratios: list[Array] = []
+    for new, own in zip(scales, nlp.scales, strict=True):
+        time = np.array([new.duration / own.duration])
+        ratios += [new.x / own.x, new.e / own.e, np.ravel(new.u / own.u), time]
     return bool(np.abs(np.log10(np.concatenate(ratios))).max(initial=0.0) <= SIMILAR)
 
 
-def carried(point: Point, old: NLP, new: NLP, *, dual: bool) -> Start:
-    """A point in the units of another NLP of the same problem, with its multipliers or without."""
+def carried(point: Point, old: Program, new: Program, *, dual: bool) -> Start:
+    """A point in the units of another program of the same problem, with its multipliers or without."""
     unit = old.units(new.scales)
     ones = np.ones(0)
     rows = np.concatenate([ones, *(b.scale / a.scale for a, b in zip(old.rows, new.rows, strict=True))])
@@ -146,23 +154,25 @@ def carried(point: Point, old: NLP, new: NLP, *, dual: bool) -> Start:
     return Start(w=point.w / unit, lam_x=point.lam_x * unit, lam_g=point.lam_g * rows)
 
 
-def residuals(first: FirstOrder, point: Point, parameters: Array, where: Evaluated, scales: Scales | None) -> Residuals:
+def residuals(
+    first: FirstOrder, point: Point, parameters: Arrays, where: Evaluated, scales: Magnitudes | None
+) -> Residuals:
     """The residuals of a point.
 
     Args:
-        first: of the NLP.
+        first: of the program.
         point: variables and multipliers.
-        parameters: of the statement.
+        parameters: of the statements.
         where: trajectory and values there.
         scales: magnitudes of the variables there; None: what the trajectory shows, where a control counts with no less
-            than the scale of the NLP (an upper bound, and cheaper).
+            than the scale of the program (an upper bound, and cheaper).
     """
-    nlp, (trajectory, values) = first.nlp, where
+    nlp, (trajectories, values) = first.nlp, where
     bounds = nlp.bounds(parameters)
     bound = scales is None
     if scales is None:
-        scales = magnitudes(nlp.statement, trajectory, parameters)
-        scales = replace(scales, u=np.maximum(scales.u, nlp.scales.u))
+        own = [(magnitudes(part.statement, t, p), part) for part, t, p in nlp.each(trajectories, parameters)]
+        scales = tuple(replace(entry, u=np.maximum(entry.u, part.scales.u)) for entry, part in own)
     able = not_zero(nlp, scales)
     unit, row = nlp.units(able), nlp.row_units(able)
     lam_x, room_x = complementary(point.lam_x, point.w, bounds["lbx"], bounds["ubx"])
@@ -178,7 +188,7 @@ def residuals(first: FirstOrder, point: Point, parameters: Array, where: Evaluat
     for limits in (bounds["lbg"], bounds["ubg"]):  # the size of a limit is one of what it limits
         row = np.maximum(row, np.where(np.isfinite(limits), np.abs(limits), 0.0))
     worst = max(float((excess / row).max(initial=0.0)), float((apart / unit).max(initial=0.0)))
-    size = abs(values["running"]) + abs(values["terminal"])
+    size = sum(abs(costs["running"]) + abs(costs["terminal"]) for costs in values["parts"])
     if not np.isfinite([slope, rest, missed, worst, size]).all():
         return Residuals(slope=np.inf, complementarity=np.inf, infeasibility=np.inf, violation=np.inf)
     if not bound and max(slope, rest, missed) > LIMIT * size:
@@ -187,7 +197,7 @@ def residuals(first: FirstOrder, point: Point, parameters: Array, where: Evaluat
     return Residuals(slope=slope / size, complementarity=rest / size, infeasibility=missed / size, violation=worst)
 
 
-def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: Array) -> float:
+def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: Arrays) -> float:
     """Second-order change of the cost where all variables change by their magnitudes, away from zero."""
     step = np.where(w < 0, -unit, unit)
     _, moved = first.cost(w + DISPLACEMENT * step, parameters)

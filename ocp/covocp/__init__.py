@@ -10,12 +10,12 @@
     ocp.minimize_expected(running=u**2, terminal_weight={x: 2.0})
     print(co.solve(ocp))
 
-To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback); expressions are
-CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several methods), `evaluate` (a given control),
-`methods`. To judge a solution: `certify` (is it the global minimum?), `worth` (does the combined design pay?),
-`simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To keep and to fly it:
-`Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`,
-`SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
+To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback), `Phases` (problems
+one after the other); expressions are CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several
+methods), `evaluate` (a given control), `methods`. To judge a solution: `certify` (is it the global minimum?), `worth`
+(does the combined design pay?), `simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To
+keep and to fly it: `Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is
+said by `ProblemError`, `SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
 
 `help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
 """
@@ -34,6 +34,7 @@ from covocp.base.errors import SolveError as SolveError
 from covocp.problem.builder import Problem as Problem
 from covocp.problem.declarations import Free as Free
 from covocp.problem.declarations import Gain as Gain
+from covocp.problem.phases import Phases as Phases
 from covocp.solution.solution import Solution as Solution
 from covocp.solving.evaluation import evaluate as evaluate
 from covocp.solving.solver import Solver as Solver
@@ -44,9 +45,11 @@ __all__ = [
     "Problem",
     "Free",
     "Gain",
+    "Phases",
     "solve",
     "Solver",
     "Solution",
+    "PhasesSolution",
     "methods",
     "compare",
     "Comparison",
@@ -88,6 +91,7 @@ if TYPE_CHECKING:
     from covocp.simulation.laws import simulate_law as simulate_law
     from covocp.simulation.sampled_loop import SampledSimulation as SampledSimulation
     from covocp.simulation.sampled_loop import simulate_sampled as simulate_sampled
+    from covocp.solution.phases import PhasesSolution as PhasesSolution
     from covocp.solving.comparison import Comparison as Comparison
     from covocp.solving.comparison import compare as compare
     from covocp.solving.loading import load as load
@@ -106,6 +110,7 @@ else:
         "simulate_law": "covocp.simulation.laws",
         "simulate_sampled": "covocp.simulation.sampled_loop",
         "SampledSimulation": "covocp.simulation.sampled_loop",
+        "PhasesSolution": "covocp.solution.phases",
         "MonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
         "Worth": "covocp.analysis.combined_gain",

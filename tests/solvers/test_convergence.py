@@ -9,7 +9,7 @@ from random_problems import draw
 import covocp as co
 from covocp.extremal.optimality import complementarity
 from covocp.models import unknown_lag
-from covocp.solvers import ipopt
+from covocp.solvers import runs
 from covocp.solvers.gradient.memory import damped, learnt
 
 LAG_MINIMA = (7.08523844, 7.71199)  # of the lag with weight 10 on 50 intervals, from starts of the right size
@@ -68,7 +68,7 @@ def test_ordinary_solves_take_one_round() -> None:
 
 
 def test_without_another_round_the_failure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ipopt, "LARGEST_ROUNDS", 1)
+    monkeypatch.setattr(runs, "LARGEST_ROUNDS", 1)
     with pytest.raises(co.SolveError, match="not in those of the point that was reached: slope") as caught:
         lag(guess={"u": 1e8})
     assert caught.value.solution is not None

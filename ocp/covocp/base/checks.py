@@ -46,7 +46,7 @@ def check_kind(value: Given, kind: type, remedy: str) -> None:
             f"This is not a {kind.__name__.lower()}.",
             expected=f"a {kind.__name__}",
             received=kind_and_name(value),
-            remedy=remedy,
+            remedy=getattr(value, "instead", remedy),
         )
 
 

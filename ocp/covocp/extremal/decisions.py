@@ -40,12 +40,13 @@ class DecisionSlopes:
         return float(share.max(initial=0.0))
 
 
-def decision_slopes(extremal: Extremal, costates: Costates) -> DecisionSlopes:
+def decision_slopes(extremal: Extremal, costates: Costates, given: Array | None = None) -> DecisionSlopes:
     """Slopes of the Lagrangian by the decisions along an extremal, by its costates.
 
     Args:
         extremal: the solution.
         costates: of its multipliers, at the nodes.
+        given: multipliers of initial states that an earlier statement of a chain gives, (nx,).
     """
     if extremal.mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
@@ -53,6 +54,7 @@ def decision_slopes(extremal: Extremal, costates: Costates) -> DecisionSlopes:
     rows = extremal.statement.decisions
     at_start = start_slopes(extremal, costates)[rows]
     total = at_start + _mismatches(extremal, costates)[rows]
+    total = total if given is None else total + given[rows]
     return DecisionSlopes(total=total, size=_sizes(extremal, costates))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.links import Within
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_end, refined_run
 from covocp.transcription.mesh import Mesh, Options, with_substeps
@@ -34,7 +36,7 @@ ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
 
-def mesh_error(extremal: Extremal, running: float) -> float:
+def mesh_error(extremal: Extremal, running: float, within: Within | None = None) -> float:
     """Relative change of the cost by halving the integration steps, to first order.
 
     Where rates depend on the time explicitly, they may jump: then that of the states over a segment, where it is more.
@@ -46,12 +48,18 @@ def mesh_error(extremal: Extremal, running: float) -> float:
     Args:
         extremal: trajectory and multipliers.
         running: its running cost.
+        within: what the rest of a chain says of it: the cost is then that of all, and what the later statements cost by
+            its end is no part of what is missed there.
 
     Returns:
         |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
     st, t = extremal.statement, extremal.trajectory
     cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    if within is not None:
+        cost += within.others
+        own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
+        extremal = replace(extremal, multipliers=own)
     change, missed, moved = _change(extremal, running, 2)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):

@@ -19,6 +19,7 @@ from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
+from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import model_symbols, repeated
@@ -104,6 +105,7 @@ def assess(
     smallest_eigenvalue: float,
     loop: ClosedLoop | None = None,
     cost_identity: float | None = None,
+    within: Within | None = None,
 ) -> Optimality:
     """Evaluate all necessary conditions along an extremal.
 
@@ -114,6 +116,7 @@ def assess(
         smallest_eigenvalue: of its covariances.
         loop: its closed loop.
         cost_identity: difference of its cost and of that from the covariances of the loop.
+        within: what the rest of a chain says of it. The curvature, which is one of all together, is then not computed.
 
     Returns:
         The record.
@@ -132,27 +135,33 @@ def assess(
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
         if not st.path.size:
             control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
-            control_error = _control_error(extremal, costates, free[:-1] & free[1:])
+            others = 0.0 if within is None else within.size
+            control_error = _control_error(extremal, costates, free[:-1] & free[1:], others)
     return Optimality(
         stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
         control_slope=control_slope / scale,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(values) if st.autonomous else None,
-        transversality=_transversality(extremal, costates, values) if st.duration.free else None,
+        transversality=_transversality(extremal, costates, values, within) if st.duration.free else None,
         mesh_error=mesh_error,
         node_error=node_error(extremal),
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
-        curvature=_curvature(extremal),
-        complementarity=complementarity(extremal),
-        decisions=decision_slopes(extremal, costates).relative if st.decisions else None,
+        curvature=_curvature(extremal) if within is None else None,
+        complementarity=complementarity(extremal, 0.0 if within is None else within.size),
+        decisions=_decisions(extremal, costates, within),
         cost_identity=cost_identity,
         **_loop_identities(loop),
     )
 
 
-def complementarity(extremal: Extremal) -> float:
-    """Sum of |multiplier| times distance from the bound, of controls, states, matrices and conditions, by the cost."""
+def complementarity(extremal: Extremal, others: float = 0.0) -> float:
+    """Sum of |multiplier| times distance from the bound, of controls, states, matrices and conditions, by the cost.
+
+    Args:
+        extremal: the solution.
+        others: size of the cost of the rest of a chain.
+    """
     extremal = refined(extremal)  # limits act at all its nodes
     st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
     groups: list[tuple[Array, Array, Array, Array]] = [
@@ -166,7 +175,7 @@ def complementarity(extremal: Extremal) -> float:
     for weights, values, lower, upper in groups:
         kept, distance = complementary(weights, values, lower, upper)
         total += float(np.sum(np.abs(kept) * distance))
-    return total / max(_absolute_cost(extremal), NO_COST)
+    return total / max(_absolute_cost(extremal) + others, NO_COST)
 
 
 def identities(
@@ -256,7 +265,7 @@ def _path_slopes(extremal: Extremal) -> Array:
     return result
 
 
-def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_]) -> float:
+def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_], others: float) -> float:
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
@@ -265,7 +274,7 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     points = extremal.mesh.points
     if points > 1:  # costates jump inside the intervals
         fine = refined(extremal)
-        return _control_error(fine, discrete_costates(fine)[0], np.repeat(free, points, axis=0))
+        return _control_error(fine, discrete_costates(fine)[0], np.repeat(free, points, axis=0), others)
     st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
     values = fine_trajectory(extremal, 2 * mesh.substeps)
     h = np.diff(extremal.time)[:, None]
@@ -293,7 +302,7 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
         return float("nan")
     steps = np.linalg.solve(curvatures[1], np.array(slopes)[..., None])[..., 0]
     total = np.einsum("jk,jni,kni,n->", QUADRATIC_PRODUCTS, slopes, steps, h[:, 0])
-    return float(0.5 * total / max(_absolute_cost(extremal), np.finfo(float).tiny))
+    return float(0.5 * total / max(_absolute_cost(extremal) + others, np.finfo(float).tiny))
 
 
 def _absolute_cost(extremal: Extremal) -> float:
@@ -341,8 +350,8 @@ def _variation(values: Array) -> float:
     return float(np.ptp(values[:, 0]) / max(float(values[:, 1].max()), np.finfo(float).tiny))
 
 
-def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
-    """k_T + slope of the end conditions + int H_T dt + H(T), relative to the largest terms of H."""
+def _transversality(extremal: Extremal, costates: Costates, values: Array, within: Within | None) -> float:
+    """k_T + slope of the end conditions and of a link + int H_T dt + H(T), relative to the largest terms of H."""
     if extremal.mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
         costates = discrete_costates(extremal)[0]
@@ -357,12 +366,19 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array) -> fl
     slope += passage_end(extremal, costates.matrices[-1, behind])[1]
     (explicit,) = along(duration_slope(st), extremal, costates)
     slope += float(np.trapezoid(explicit[:, 0], extremal.time))
+    slope += 0.0 if within is None else within.by_duration
     residual = slope + float(values[-1, 0])
     at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
     at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
     if (at_lower and residual > 0) or (at_upper and residual < 0):
         residual = 0.0  # the bound holds what would go on
     return abs(residual) / max(float(values[:, 1].max()), abs(slope), float(np.finfo(float).tiny))
+
+
+def _decisions(extremal: Extremal, costates: Costates, within: Within | None) -> float | None:
+    if not extremal.statement.decisions:
+        return None
+    return decision_slopes(extremal, costates, None if within is None else within.start).relative
 
 
 def _curvature(extremal: Extremal) -> float | None:

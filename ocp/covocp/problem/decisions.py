@@ -81,6 +81,11 @@ def check_decisions(problem: Declarations) -> None:
         _check_bounded(entry, costs)
 
 
+def matters(problem: Declarations, symbol: ca.MX) -> bool:
+    """Whether anything that is stated, costs included, depends on a symbol."""
+    return _uses([*_everything_but_costs(problem), *(problem.cost or ())], symbol)
+
+
 def _everything_but_costs(problem: Declarations) -> list[Any]:
     """All expressions of a problem that matter for its solution, without its cost."""
     used: list[Any] = [value for rate in problem.rates.values() for value in (rate.rate, rate.noise)]

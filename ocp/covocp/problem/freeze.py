@@ -50,14 +50,18 @@ class Stacked:
         return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
 
 
-def freeze(problem: Declarations) -> Statement:
+def freeze(problem: Declarations, *, part: bool = False) -> Statement:
     """Build the statement of a problem.
+
+    Args:
+        problem: what is declared.
+        part: whether it is one of several phases: what costs and what can be chosen may then lie in the others.
 
     Raises:
         ProblemError: dynamics or cost missing, symbols of another problem, a cost that depends on nothing, a
             measurement noise that is singular.
     """
-    _check_complete(problem)
+    _check_complete(problem, part)
     problem = with_end_conditions(problem)
     stacked = _stack(problem)
     x, u, e, t, _, p = stacked.inputs
@@ -114,7 +118,7 @@ def _all(*groups: Iterable[Any]) -> list[Any]:
     return [entry for group in groups for entry in group]
 
 
-def _check_complete(problem: Declarations) -> None:
+def _check_complete(problem: Declarations, part: bool) -> None:
     """Everything that must be declared is there, and nothing comes from another problem."""
     moving = _all(problem.states, (m for m in problem.matrices if not m.estimation and m.backward is None))
     check_dynamics(moving, problem.rates)
@@ -132,7 +136,7 @@ def _check_complete(problem: Declarations) -> None:
             received="none",
             remedy="say what is to be minimised",
         )
-    if not problem.controls and problem.free_duration is None:
+    if not problem.controls and problem.free_duration is None and not part:
         free = [s for s in problem.states if not s.initial.is_constant() or np.isnan(ca.evalf(s.initial).full()).any()]
         if not free:
             raise ProblemError(
@@ -150,13 +154,14 @@ def _check_complete(problem: Declarations) -> None:
             received=f"a covariance of {covariance.size} rows for {entry_augmented} states and unknowns",
             remedy="move the call down",
         )
-    _check_symbols(problem)
+    _check_symbols(problem, part)
     check_integrals(problem)
-    check_decisions(problem)
+    if not part:
+        check_decisions(problem)
     check_readings(problem.measurements, problem.matrices)
 
 
-def _check_symbols(problem: Declarations) -> None:
+def _check_symbols(problem: Declarations, part: bool) -> None:
     """Every symbol in every expression belongs to this problem; the cost depends on something."""
     known = _symbols(problem)
     hashes = {symbol.__hash__() for symbol in known.values()}
@@ -194,7 +199,7 @@ def _check_symbols(problem: Declarations) -> None:
             )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
-    if all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
+    if not part and all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
         raise ProblemError(
             "The cost depends on nothing that can be chosen.",
             expected="a cost of states, controls, matrix states or the free duration",

@@ -205,7 +205,7 @@ def _states(solution: Solution) -> Section:
         own = _attitude(solution, b) if b.tangent else []
         for k in range(0 if b.tangent else b.size):
             i = b.offset + k
-            multiplier = number(solution.multipliers.final[i] if bound[i] else None)
+            multiplier = number(solution.final_multipliers[0][i] if bound[i] else None)
             own.append([entry_names((b,))[k], number(solution.trajectory.x[-1, i]), number(target[i]), multiplier])
         if deviations:
             unit = np.rad2deg(1.0) if b.tangent else 1.0
@@ -358,7 +358,7 @@ def _matrix(solution: Solution, block: Block) -> Section:
         rows = [[label, *(number(v, 6) for v in final[i, : i + 1])] for i, label in enumerate(labels)]
         rows = [row + [""] * (block.size + 1 - len(row)) for row in rows]
         columns = [f"{kind} {block.name} at T", *labels]
-    multipliers = solution.multipliers.final_matrices[block.span]
+    multipliers = solution.final_multipliers[1][block.span]
     pairs = zip(*half_indices(block.size), multipliers, strict=True)
     fixed = [
         [f"{block.name}[{labels[min(i, j)]}, {labels[max(i, j)]}]", number(value)]

@@ -23,6 +23,7 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import Dense, dense_output
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
+from covocp.extremal.links import Within
 from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
@@ -67,6 +68,7 @@ class Solution:
         targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
         stored_problem: of a solution read from a file, what its problem was, to tell it from others.
+        within: of one of several phases, what the others say of it.
     """
 
     name: str
@@ -90,9 +92,10 @@ class Solution:
     stored_dense: Dense | None = None
     stored_optimality: Optimality | None = None
     stored_problem: Fingerprint | None = None
+    within: Within | None = None
 
     @staticmethod
-    def of(outcome: Outcome, method: str) -> Solution:
+    def of(outcome: Outcome, method: str, within: Within | None = None) -> Solution:
         """The solution of an outcome, with the estimate of its mesh error."""
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
@@ -108,7 +111,7 @@ class Solution:
             rates=rates,
             end_rates=end_rates,
             filter_gain=filter_gains(extremal),
-            mesh_error=mesh_error(extremal, outcome.cost_terms["running"]),
+            mesh_error=mesh_error(extremal, outcome.cost_terms["running"], within),
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),
             blocks=st.blocks,
@@ -116,6 +119,7 @@ class Solution:
             targets=st.boundary_values(extremal.parameters)[1],
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             loop=loop,
+            within=within,
         )
         return read_only(solution)
 
@@ -198,7 +202,7 @@ class Solution:
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
             return identities(self.extremal, *known)
-        return assess(self.extremal, self.costates, *known)
+        return assess(self.extremal, self.costates, *known, self.within)
 
     @property
     def cost_identity(self) -> float | None:
@@ -385,9 +389,17 @@ class Solution:
                 return np.asarray(values[..., 0] if len(rows) == 1 else values)
         b = self.block(self._name(key, tuple(b for b in self.blocks if b.kind in ("state", "matrix"))))
         if b.kind == "matrix":
-            return unpack_costate(self.multipliers.final_matrices[b.span], b.size)
-        values = self.multipliers.final[b.span]
+            return unpack_costate(self.final_multipliers[1][b.span], b.size)
+        values = self.final_multipliers[0][b.span]
         return np.asarray(values[0] if b.size == 1 else values)
+
+    @property
+    def final_multipliers(self) -> tuple[Array, Array]:
+        """Of the terminal values of states and half-vectors, without what the phases after it cost by them."""
+        m = self.multipliers
+        if self.within is None:
+            return m.final, m.final_matrices
+        return m.final - self.within.end, m.final_matrices - self.within.end_matrices
 
     def covariance(self, a: Given, b: Given = None) -> Array:
         """Covariance of the deviations of the actual system between two symbols, (K, size of a, size of b).

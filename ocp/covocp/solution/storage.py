@@ -38,6 +38,7 @@ SUFFIXES = (".npz", ".json")
 REASON = 160  # letters of a reason that an error quotes
 # Fields: of the problem, which is not kept; of the candidate, whose own fields are entries of the file.
 NOT_KEPT, OPENED = "stated", "extremal"
+OPTIONAL = ("within",)  # not there where they are None
 NEEDED = ("stored_costates", "stored_dense")  # may be None in a solution that knows its problem, not in a file
 # Of the numbers that methods report, those that the printed summary takes for granted.
 STATS: dict[str, Any] = {
@@ -247,7 +248,8 @@ def _plain(value: Any) -> Any:
     tree: dict[str, Any] = {}
     for name in _parts(kind):
         entry = _plain(getattr(value, name))
-        tree |= entry if name == OPENED else {name: entry}
+        if name not in OPTIONAL or entry is not None:
+            tree |= entry if name == OPENED else {name: entry}
     return tree or value
 
 
@@ -277,7 +279,7 @@ def _made(hint: Any, value: Any, place: str, missing: list[str], wrong: list[str
                 entries[name] = _made(kind, value, place, missing, wrong)
             elif name in value:
                 entries[name] = _made(kind, value[name], here, missing, wrong)
-            else:
+            elif name not in OPTIONAL:
                 missing.append(here)
         return hint(**entries) if len(missing) + len(wrong) == faults else None
     if origin is tuple and isinstance(value, tuple):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from covocp.base.errors import (
     SolveError,
     evaluating,
     no_option,
-    spelling,
     warn_user,
     without_warnings,
 )
@@ -34,12 +32,17 @@ from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
+from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, from_starts
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
+from covocp.solving.methods import METHODS as METHODS
+from covocp.solving.methods import check_method as check_method
+from covocp.solving.methods import method_options as method_options
+from covocp.solving.methods import methods as methods
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
@@ -48,7 +51,8 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Mesh, Options, with_substeps
 
-METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
+if TYPE_CHECKING:
+    from covocp.solution.phases import PhasesSolution
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
@@ -69,17 +73,6 @@ WORSE = 1e-6
 # Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
-
-
-def methods() -> tuple[str, ...]:
-    """Names of the methods installed."""
-    return tuple(METHODS)
-
-
-def method_options(method: str) -> dict[str, Any]:
-    """Options of a method besides those of the mesh, with their defaults."""
-    parameters = inspect.signature(importlib.import_module(METHODS[method]).prepare).parameters
-    return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
 
 
 def check_problem(problem: Given) -> None:
@@ -119,13 +112,7 @@ class Solver:
         **options: Any,
     ) -> None:
         """Build the statement and make the method ready."""
-        if method not in METHODS:
-            raise ProblemError(
-                "There is no such method.",
-                expected="one of " + ", ".join(repr(name) for name in METHODS),
-                received=repr(method),
-                remedy=spelling(method, METHODS, "correct method="),
-            )
+        check_method(method)
         check_problem(problem)
         self._prepare = importlib.import_module(METHODS[method]).prepare
         known, own = {field.name for field in fields(Options)}, method_options(method)
@@ -443,27 +430,36 @@ def _noted(solution: Solution, **stats: Any) -> Solution:
     return replace(solution, stats={**solution.stats, **stats})
 
 
+@overload
+def solve(problem: Problem, method: str = "ipopt", **options: Any) -> Solution: ...
+
+
+@overload
+def solve(problem: Phases, method: str = "ipopt", **options: Any) -> PhasesSolution: ...
+
+
 @one_at_a_time
-@checked(progress=truth, allow_failure=truth)
+@checked(method=text, nominal=text, progress=truth, allow_failure=truth)
 def solve(
-    problem: Problem,
+    problem: Problem | Phases,
     method: str = "ipopt",
     *,
-    intervals: int = 100,
+    intervals: Given = 100,
     guess: Given = None,
     nominal: str = "combined",
     progress: bool = True,
     allow_failure: bool = False,
     parameters: Mapping[str, Any] | None = None,
     **options: Any,
-) -> Solution:
-    """Solve a problem; `Solver` behind it solves again without rebuilding.
+) -> Solution | PhasesSolution:
+    """Solve a problem; `Solver` behind it solves again without rebuilding. Or several phases as one problem.
 
     Args:
-        problem: what to solve.
+        problem: what to solve; `Phases`: by the method "ipopt".
         method: a name in `methods()`.
-        intervals: number of control intervals.
-        guess: where to start; see `Solver.solve`.
+        intervals: number of control intervals; of phases that of each, or a list of one for each.
+        guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
+            or a dict by name of the phase.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
         progress: whether to show the iterations on a terminal.
         allow_failure: return the last iterate of a run that did not converge instead of raising.
@@ -471,13 +467,18 @@ def solve(
         options: of the mesh and of the method; see `Solver`.
 
     Returns:
-        The solution.
+        The solution; a `PhasesSolution` of phases.
 
     Raises:
         ProblemError: the statement or an option is wrong.
         SolveError: the method did not converge (carries the last iterate).
         Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
     """
+    if isinstance(problem, Phases):
+        check_method(method)
+        run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
+        run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
+        return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
     extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
     if extra and not isinstance(guess, str):
         raise ProblemError(

@@ -283,16 +283,6 @@ def _fix(lower: Array, upper: Array, values: Array) -> None:
     lower[known] = upper[known] = values[known]
 
 
-def check_finite(nlp: NLP, w: Array, parameters: Array) -> None:
-    """The cost must be finite where a solver starts: the running cost on the way, the terminal cost at the end.
-
-    Raises:
-        OutsideDomainError: names the part that is not.
-    """
-    trajectory, values = nlp.unpack(w, parameters)
-    check_costs(trajectory, values["running"], values["terminal"])
-
-
 def check_costs(trajectory: Trajectory, running: float, terminal: float) -> None:
     """Costs of a first trajectory must be finite.
 

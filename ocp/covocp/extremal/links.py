@@ -1,0 +1,215 @@
+"""Costates where one statement of a chain ends and the next begins, and what must hold there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Annotated, Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
+from covocp.extremal.costates import discrete_costates, terminal_costates
+from covocp.extremal.decisions import start_slopes
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.hamiltonian import Costates
+from covocp.statement.chain import Link
+from covocp.transcription.nlp import terminal_slopes
+from covocp.transcription.steps import KEPT
+
+# Distance from a bound, relative to the largest magnitude of a state, below which it holds the state.
+AT_BOUND = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainOutcome:
+    """What a method returns for a chain: an extremal and the cost terms of each statement, and how the run ended.
+
+    The multipliers of an extremal that is not the last lack what its half-vectors at the end mean for the later ones,
+    where matrices are eliminated; see `completed`.
+
+    Attributes:
+        extremals: the last iterate.
+        link_multipliers: of the states that each link gives.
+        cost_terms: terminal and running cost of each.
+        converged: whether the method's own test was met.
+        message: how it ended, a sentence.
+        violations: largest violation of each violated constraint by its name.
+        stats: iterations, times, what the method counts.
+    """
+
+    extremals: tuple[Extremal, ...]
+    link_multipliers: tuple[Array, ...]
+    cost_terms: tuple[Mapping[str, float], ...]
+    converged: bool
+    message: str
+    violations: Mapping[str, float]
+    stats: Mapping[str, Any]
+
+    __repr__ = short_repr
+
+    @property
+    def cost(self) -> float:
+        """All terms together."""
+        return float(sum(value for terms in self.cost_terms for value in terms.values()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Within:
+    """What the rest of a chain says of one of its statements.
+
+    Attributes:
+        others: cost of the others.
+        size: sum of the sizes of the cost terms of the others.
+        start: multipliers of the initial states that the statement before gives, (nx,), zero elsewhere.
+        by_duration: slope of what the later statements cost by the duration, through the link.
+        end: slopes of what the later ones cost by the state at the end, (nx,).
+        end_matrices: by the half-vectors there, (ne,).
+    """
+
+    others: float
+    size: float
+    start: Annotated[Array, "x"]
+    by_duration: float
+    end: Annotated[Array, "x"]
+    end_matrices: Annotated[Array, "e"]
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passed:
+    """An extremal of a chain with its costates, and what the rest of the chain says of it."""
+
+    extremal: Extremal
+    costates: Costates
+    within: Within
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkSlopes:
+    """Slopes of what the later statements cost by state, half-vectors and duration at the end before a link."""
+
+    state: Array
+    matrices: Array
+    duration: float
+
+    __repr__ = short_repr
+
+
+def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, ...]:
+    """The extremals with their costates, from the last to the first: the costates at the end of one follow the next.
+
+    Args:
+        outcome: of a method.
+        links: of the chain.
+    """
+    sizes = [sum(abs(value) for value in terms.values()) for terms in outcome.cost_terms]
+    result: list[Passed] = []
+    for i in range(len(outcome.extremals) - 1, -1, -1):
+        extremal = outcome.extremals[i]
+        st = extremal.statement
+        slopes = LinkSlopes(state=np.zeros(st.nx), matrices=np.zeros(st.ne), duration=0.0)
+        if result:
+            later = result[-1]
+            slopes = link_slopes(links[i], extremal, later.extremal, later.costates)
+            if extremal.mesh.eliminated and st.matrices:
+                m = extremal.multipliers
+                through = replace(m, final_matrices=m.final_matrices + slopes.matrices)
+                extremal = replace(extremal, multipliers=through)
+        start = np.zeros(st.nx)
+        if i:
+            start[list(links[i - 1].states)] = outcome.link_multipliers[i - 1]
+        others = outcome.cost - sum(outcome.cost_terms[i].values())
+        within = Within(
+            others=others,
+            size=float(sum(sizes) - sizes[i]),
+            start=start,
+            by_duration=slopes.duration,
+            end=slopes.state,
+            end_matrices=slopes.matrices,
+        )
+        result.append(Passed(extremal=extremal, costates=discrete_costates(extremal)[0], within=within))
+    return tuple(result[::-1])
+
+
+def link_slopes(link: Link, before: Extremal, after: Extremal, costates: Costates) -> LinkSlopes:
+    """Slopes of what the later statements cost by what the statement before a link ends with.
+
+    For a jump x+ = J(x) these are J_x' p+, and for its covariance E+ = J_x E J_x' + N the slopes of tr(P+ E+).
+
+    Args:
+        link: between both.
+        before: the extremal that ends there.
+        after: the extremal that begins there.
+        costates: of the latter.
+    """
+    by_x, by_e = slopes_at_start(after, costates)
+    t = before.trajectory
+    ends = (t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters)
+    values = _slopes(link)(*ends, by_x[list(link.states)], by_e[list(link.matrices)])
+    state, matrices, duration = (np.asarray(v.full()).ravel() for v in values)
+    return LinkSlopes(state=state, matrices=matrices, duration=float(duration[0]))
+
+
+def slopes_at_start(extremal: Extremal, costates: Costates) -> tuple[Array, Array]:
+    """Slopes of the Lagrangian by the initial state and half-vectors: costates, and conditions at the start."""
+    st, t = extremal.statement, extremal.trajectory
+    by_e = costates.matrices[0].copy()
+    if st.start.size and st.ne:
+        e = ca.MX.sym("e", st.ne)
+        at = (t.x[0], extremal.controls[0], e, 0.0, t.duration, extremal.parameters)
+        value = ca.dot(ca.DM(extremal.multipliers.start), st.start.function(*at))
+        by_e += np.asarray(ca.Function("by_e", [e], [ca.densify(ca.gradient(value, e))])(t.e[0]).full()).ravel()
+    return start_slopes(extremal, costates), by_e
+
+
+@lru_cache(maxsize=KEPT)
+def _slopes(link: Link) -> ca.Function:
+    """(*arguments of the link, weights of its states and matrices) -> slopes by x, e and T."""
+    names = [link.function.name_in(i) for i in range(link.function.n_in())]
+    inputs = [ca.MX.sym(name, link.function.size1_in(i)) for i, name in enumerate(names)]
+    weights = [ca.MX.sym("px", len(link.states)), ca.MX.sym("pe", len(link.matrices))]
+    states, matrices = link.function(*inputs)
+    value = ca.dot(weights[0], states) + ca.dot(weights[1], matrices)
+    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in inputs[:3]]
+    return ca.Function("link_slopes", [*inputs, *weights], slopes)
+
+
+def link_residual(before: Passed, after: Passed, link: Link) -> float:
+    """Largest difference of p(T) and k_x + J_x' p+ at a link, and of p+ and zero where a state starts free.
+
+    Of states that are neither prescribed nor held by a bound there; relative to the largest costate on both sides.
+
+    Args:
+        before: what ends there.
+        after: what begins there.
+        link: between both.
+    """
+    first, second = before.extremal, after.extremal
+    end = terminal_costates(first)[0]
+    own = terminal_slopes(
+        first.statement, first.trajectory, first.parameters, first.multipliers.end, first.multipliers.path[-1]
+    )[0]
+    missed = (end - own - before.within.end)[_loose(first, -1)]
+    start = slopes_at_start(second, after.costates)[0]
+    given = np.isin(np.arange(start.size), link.states)
+    free = _loose(second, 0) & ~given
+    missed = np.concatenate([missed, start[free], (start + after.within.start)[given & _loose(second, 0)]])
+    size = max(float(np.abs(passed.costates.state).max(initial=0.0)) for passed in (before, after))
+    return float(np.abs(missed).max(initial=0.0)) / max(size, float(np.finfo(float).tiny))
+
+
+def _loose(extremal: Extremal, node: int) -> Any:
+    """Entries of the state at the first or last node that are neither prescribed nor at a bound."""
+    st, x = extremal.statement, extremal.trajectory.x
+    lower, upper = st.state_bounds
+    known = st.boundary_values(extremal.parameters)[0 if node == 0 else 1]
+    size = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
+    inside = np.minimum(x[node] - lower, upper - x[node]) > AT_BOUND * size
+    return np.isnan(known) & inside

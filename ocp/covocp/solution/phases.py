@@ -1,0 +1,204 @@
+"""The solution of several phases: one ordinary solution for each, and what holds where they meet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from covocp.base.checks import as_number
+from covocp.base.errors import ProblemError, spelling
+from covocp.base.expressions import Given
+from covocp.base.matrices import Array
+from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
+from covocp.base.threads import methods_one_at_a_time
+from covocp.solution.report import sections
+from covocp.solution.sample import Sample
+from covocp.solution.solution import Solution
+
+# Residual where phases meet from which on the printout worries about it.
+LARGE_LINK = 1e-4
+
+
+@methods_one_at_a_time
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PhasesSolution:
+    """Several phases solved as one problem (or their last iterate: see `converged`).
+
+    `solution[name]` or `solution[number]` is the `Solution` of a phase, whose costates, multipliers and residuals are
+    those within the whole: p at its end contains what the later phases cost. Its times begin at zero.
+
+    Attributes:
+        name: of the whole.
+        method: that found it.
+        converged: whether the method's own test was met.
+        message: how the method ended.
+        phases: their solutions in order.
+        link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p.
+        violations: of constraints, by name with that of the phase.
+        stats: iterations, times, what the method counts.
+    """
+
+    name: str
+    method: str
+    converged: bool
+    message: str
+    phases: tuple[Solution, ...]
+    link_residuals: tuple[float, ...]
+    violations: Mapping[str, float]
+    stats: Mapping[str, Any]
+
+    # What functions say that take one problem or solution.
+    instead = "give one of its phases, solution[name]; what concerns all phases together is not available here"
+
+    @property
+    def cost(self) -> float:
+        """The cost of all phases."""
+        return float(sum(phase.cost for phase in self.phases))
+
+    @property
+    def cost_terms(self) -> Mapping[str, float]:
+        """The cost of each phase by its name."""
+        return {phase.name: phase.cost for phase in self.phases}
+
+    @property
+    def status(self) -> str:
+        """How the run ended, in words."""
+        return self.message if self.converged else f"NOT CONVERGED: {self.message}"
+
+    @property
+    def durations(self) -> Array:
+        """Of the phases [s], shape (phases,)."""
+        return np.array([phase.duration for phase in self.phases])
+
+    @property
+    def duration(self) -> float:
+        """Of all phases together [s]."""
+        return float(self.durations.sum())
+
+    @property
+    def starts(self) -> Array:
+        """When each phase begins [s], shape (phases,); the first one at zero."""
+        return np.concatenate([np.zeros(1), np.cumsum(self.durations)[:-1]])
+
+    @property
+    def t(self) -> Array:
+        """Times of the nodes of all phases [s]; where two meet the time is there twice."""
+        return np.concatenate([start + phase.t for start, phase in zip(self.starts, self.phases, strict=True)])
+
+    def __len__(self) -> int:
+        """Number of phases."""
+        return len(self.phases)
+
+    def __iter__(self) -> Iterator[Solution]:
+        """The phases in order."""
+        return iter(self.phases)
+
+    def __getitem__(self, key: Given) -> Solution:
+        """The solution of a phase, by its name or its number (from 0; -1 is the last).
+
+        Raises:
+            ProblemError: there is no such phase.
+        """
+        names = [phase.name for phase in self.phases]
+        if isinstance(key, str) and key in names:
+            return self.phases[names.index(key)]
+        whole = isinstance(key, (int, np.integer)) and not isinstance(key, bool)
+        if whole and -len(names) <= key < len(names):
+            return self.phases[int(key)]
+        raise ProblemError(
+            f"There is no phase '{key}'.",
+            expected="one of " + ", ".join(repr(name) for name in names) + f", or a number from 0 to {len(names) - 1}",
+            received=repr(key)[:100],
+            remedy=spelling(key, names, "index a phase first: solution[name][symbol]; or use solution.at(t)[symbol]"),
+        )
+
+    def at(self, t: Given, *, side: str = "after") -> Sample:
+        """Values at any times of the whole, between the nodes as the integrator computes them.
+
+        Args:
+            t: a time or an array of times [s], within [0, duration].
+            side: where two phases meet: "after" (what the later one starts with) or "before" (what the earlier one
+                ends with).
+
+        Returns:
+            What `[name]` gives the values of; NaN in phases that have no such name. Matrices whose size differs
+            between phases, such as E where states appear, are left out: ask the phase.
+
+        Raises:
+            ProblemError: where a time lies outside, or is not a number; another side.
+        """
+        times = np.atleast_1d(as_number("at", "times", t))
+        margin = 1e-9 * self.duration
+        inside = times.ndim == 1 and bool(((times >= -margin) & (times <= self.duration + margin)).all())
+        if not inside or side not in ("before", "after"):
+            raise ProblemError(
+                "A solution has no values there.",
+                expected=f"a time or a row of times within [0, {self.duration:g}] s; side='before' or 'after'",
+                received=f"{str(t)[:100]}, side={side!r}",
+                remedy="stay within the duration of all phases",
+            )
+        found = np.searchsorted(self.starts[1:], times, side="right" if side == "after" else "left")
+        samples: list[tuple[Any, Mapping[str, Array]]] = []
+        for k, phase in enumerate(self.phases):
+            chosen = np.flatnonzero(found == k)
+            local = np.clip(times[chosen] - self.starts[k], 0.0, phase.duration)
+            samples.append((chosen, phase.at(local if chosen.size else np.zeros(1)).values))
+        values = _merged(samples, times)
+        if np.ndim(t) == 0:
+            values = {name: value[0] for name, value in values.items()}
+        return Sample(t=t, values=values, symbols={})
+
+    def sections(self) -> list[Section]:
+        """The whole, and each phase, in sentences and tables."""
+        text = f"{self.name or 'phases'}: {self.message} ({self.method})"
+        head: Section = [Sentence(text if self.converged else f"NOT CONVERGED: {text}", warning=not self.converged)]
+        rows = [
+            [phase.name, number(start, 6), number(start + phase.duration, 6), number(phase.cost, 8)]
+            for start, phase in zip(self.starts, self.phases, strict=True)
+        ]
+        rows.append(["all phases", number(0.0, 6), number(self.duration, 6), number(self.cost, 8)])
+        table: Section = [Table(columns=["phase", "from [s]", "to [s]", "cost"], rows=rows)]
+        pairs = zip(self.phases[:-1], self.phases[1:], self.link_residuals, strict=True)
+        met = [
+            [f"{one.name} to {two.name}", number(value, 3) + (" LARGE" if value > LARGE_LINK else "")]
+            for one, two, value in pairs
+        ]
+        columns = ["costates where phases meet: p against k_x + J' p+ (relative)", ""]
+        links: Section = [Table(columns=columns, rows=met)] if met else []
+        violated = [[name, number(value, 4)] for name, value in self.violations.items()]
+        limits: Section = [Table(columns=["violated constraint", "by"], rows=violated)] if violated else []
+        return [head, limits, table, links, *(section for phase in self.phases for section in sections(phase))]
+
+    def __repr__(self) -> str:
+        """One line."""
+        names = ", ".join(phase.name for phase in self.phases)
+        return f"<PhasesSolution of '{self.name}' ({names}) by {self.method}: {self.status}, cost {self.cost:.8g}>"
+
+    def __str__(self) -> str:
+        """The summary that print shows."""
+        return as_text(self.sections())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the same summary."""
+        return as_html(self.sections())
+
+
+def _merged(samples: list[tuple[Any, Mapping[str, Array]]], times: Array) -> dict[str, Array]:
+    """Values by name at all times from those of the phases at theirs; NaN where a phase has no such name."""
+    shapes: dict[str, set[tuple[int, ...]]] = {}
+    for _, values in samples:
+        for name, value in values.items():
+            shapes.setdefault(name, set()).add(value.shape[1:])
+    result: dict[str, Array] = {}
+    for name, found in shapes.items():
+        if len(found) > 1 or name in ("time", "duration"):
+            continue
+        whole = np.full((times.size, *next(iter(found))), np.nan)
+        for chosen, values in samples:
+            if chosen.size and name in values:
+                whole[chosen] = values[name]
+        result[name] = whole
+    return {"time": times, **result}

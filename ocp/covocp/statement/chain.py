@@ -1,0 +1,67 @@
+"""Statements one after the other: what the end of each gives to the start of the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
+from covocp.statement.statement import Statement
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Link:
+    """What the end of a statement gives to the start of the next one.
+
+    states: entries of the later initial state that are given; the others start as the later statement says.
+    matrices: entries of the later half-vectors at the start that are given.
+    parameters: where these lie among the parameters of the later statement, which have them as initial values.
+    names: of the rows, states first.
+    function: (state and half-vectors at the end, duration, parameters, parameters of the later statement) -> states,
+        matrices.
+    """
+
+    states: tuple[int, ...]
+    matrices: tuple[int, ...]
+    parameters: tuple[int, ...]
+    names: tuple[str, ...]
+    function: ca.Function
+
+    __repr__ = short_repr
+
+    def values(self, x: Array, e: Array, duration: float, parameters: Array, later: Array) -> tuple[Array, Array]:
+        """The states and the half-vectors that are given, as numbers."""
+        states, matrices = self.function(x, e, duration, parameters, later)
+        return np.asarray(states.full()).ravel(), np.asarray(matrices.full()).ravel()
+
+    def filled(self, later: Array, matrices: Array) -> Array:
+        """The parameters of the later statement with the half-vectors at its start."""
+        result = later.copy()
+        result[list(self.parameters)] = matrices
+        return result
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """Statements one after the other, each with its own time that starts at zero; a link between any two."""
+
+    name: str
+    statements: tuple[Statement, ...]
+    links: tuple[Link, ...]
+
+    __repr__ = short_repr
+
+
+def started_at(statement: Statement, link: Link, states: Array) -> Statement:
+    """The later statement with the initial states that a link gives as its own."""
+    p = ca.MX.sym("parameters", statement.np)
+    initial, *others = statement.boundary(p)
+    rows = ca.vertsplit(initial) if statement.nx > 1 else [initial]
+    for entry, value in zip(link.states, states, strict=True):
+        rows[entry] = ca.MX(float(value))
+    names = (statement.boundary.name_in(), statement.boundary.name_out())
+    boundary = ca.Function("boundary", [p], [ca.vertcat(*rows), *others], *names)
+    return replace(statement, boundary=boundary)

@@ -1,0 +1,318 @@
+"""Runs of an NLP solver from one start, each in the scales of the point that the last one reached."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.errors import ProblemError
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import ENDED, STOPPED, Guess
+from covocp.solvers.monitor import Monitor
+from covocp.solvers.plugins import silent
+from covocp.solvers.reached import (
+    FirstOrder,
+    Magnitudes,
+    Point,
+    Round,
+    Start,
+    carried,
+    not_zero,
+    reached_scales,
+    residuals,
+    similar,
+)
+from covocp.solvers.statuses import Status, status_of
+from covocp.transcription.program import Arrays, Program, Trajectories
+
+MAX_ITERATIONS = 1000
+# Runs from one start, each in the scales of the point that the last one reached.
+LARGEST_ROUNDS = 6
+# A run that ends after so few iterations had met its tolerance where it began: the next one has this share of it.
+AT_ONCE, STRICTER = 1, 0.03
+# Relative length of the step along the gradient by which the curvature of the cost is probed.
+PROBE = 1e-4
+SMALLEST_CURVATURE = 1e-6
+
+NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
+
+STALE = "the tolerance was met in the scales of the start, but not in those of the point that was reached"
+REMEDY = "start closer (guess=), or give the magnitudes of states and controls (scale=)"
+
+
+class Runs:
+    """Runs of an NLP solver on one program; it is built at the first start, which gives its scales."""
+
+    def __init__(
+        self,
+        build: Callable[[Magnitudes | None, Trajectories, Arrays], Program],
+        plugin: str,
+        settings: dict[str, Any],
+        limited: bool,
+        limit: float,
+    ) -> None:
+        """Keep the settings.
+
+        Args:
+            build: the program in some magnitudes; None: in those of trajectories, with these parameters.
+            plugin: of CasADi.
+            settings: of the plugin.
+            limited: whether its Hessian is of limited memory.
+            limit: of the residuals of a converged point.
+        """
+        self._build_program = build
+        self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
+        self._strictness = 1.0
+        self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
+        self._monitor: Monitor | None = None
+        self._nlp: Program | None = None
+        self._cold: ca.Function | None = None
+        self._warm: ca.Function | None = None
+
+    def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
+        """Run from these guesses, one for each part; the last iterate is returned whatever happens.
+
+        Where the run converged in the scales of the start, but not in those of the point it reached, it goes on from
+        there in new ones.
+
+        Returns:
+            The last run, and its counts.
+        """
+        begin = time.perf_counter()
+        if self._strictness < 1.0:
+            self._strictness, self._warm = 1.0, None
+        trajectories = tuple(guess.trajectory for guess in guesses)
+        known = [(g.multipliers, g.costates) for g in guesses if g.multipliers is not None and g.costates is not None]
+        dual = len(known) == len(guesses)
+        warm = dual and all(guess.warm for guess in guesses)
+        nlp, solver = self._build(parameters, trajectories, warm, progress.shown)
+        built = time.perf_counter()
+        start = Start(w=nlp.pack(trajectories))
+        if dual:
+            lam_x, lam_g = nlp.pack_multipliers([m for m, _ in known], [c for _, c in known])
+            start = Start(w=start.w, lam_x=lam_x, lam_g=lam_g)
+        tentative = any(guess.tentative for guess in guesses)
+        first = self._run(nlp, solver, start, parameters, progress, tentative)
+        lost = self._lost_way(first.status)
+        if lost and tentative:  # there are other starts
+            rounds = [self._judged(nlp, first, parameters)]
+        else:
+            rounds = self._rounds(nlp, first, parameters, progress)
+        last = rounds[-1]
+        counts = {
+            "iterations": sum(entry.point.iterations for entry in rounds) if last.point.iterations >= 0 else -1,
+            "build_seconds": built - begin,
+            "solve_seconds": time.perf_counter() - built,
+            "return_status": last.point.status,
+            "hessian": "limited-memory" if self._limited else "exact",
+        }
+        return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
+
+    def _rounds(self, nlp: Program, first: Point, parameters: Arrays, progress: Progress) -> list[Round]:
+        """The first run judged in the scale of the point it reached, and further ones from there until that holds.
+
+        A round that fails is followed by one without multipliers. The last entry is the one to return: a converged one,
+        or the best.
+        """
+        done = [self._judged(nlp, first, parameters)]
+        while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS:
+            best = min(done, key=lambda entry: entry.worst)
+            if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
+                break
+            at_once = 0 <= done[-1].point.iterations <= AT_ONCE
+            if self._plugin == "ipopt" and done[-1] is best and at_once:  # new scales alone do not move it
+                self._tighten()
+            nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
+            solver = self._warm_solver() if start.lam_x is not None else self._cold
+            assert solver is not None
+            point = self._run(nlp, solver, start, parameters, progress)
+            done.append(self._judged(nlp, point, parameters, again=True))
+        if not done[-1].converged:
+            done.append(done.pop(done.index(min(done, key=lambda entry: entry.worst))))
+        return done
+
+    def _tighten(self) -> None:
+        """Ask more of Ipopt in the warm starts that follow."""
+        self._strictness *= STRICTER
+        self._warm = None
+
+    def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
+        """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
+        where = point.where
+        status = status_of(point.status)
+        if not (point.success or (status is not None and status.judged)):
+            return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
+        assert self._cold is not None
+        first = FirstOrder(nlp, self._cold, self._plugin)
+        found = residuals(first, point, parameters, where, None)
+        if not found.hold(self._limit):  # an upper bound so far
+            found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
+        return Round(nlp=nlp, point=point, where=where, residuals=found, converged=found.hold(self._limit))
+
+    def _rescaled(self, last: Round, first: Program, parameters: Arrays, dual: bool) -> tuple[Program, Start]:
+        """The NLP in the scales of the point that a run reached, and that point in its units."""
+        nlp = last.nlp
+        scales = not_zero(nlp, reached_scales(nlp, last.where[0], parameters, again=nlp is not first))
+        if nlp is not self._nlp or not similar(nlp, scales):
+            self._transcribe(scales, last.where[0], parameters)
+        assert self._nlp is not None
+        return self._nlp, carried(last.point, nlp, self._nlp, dual=dual)
+
+    def _run(
+        self,
+        nlp: Program,
+        solver: ca.Function,
+        start: Start,
+        parameters: Arrays,
+        progress: Progress,
+        tentative: bool = False,
+    ) -> Point:
+        """One run of the NLP solver; a tentative one may be given up."""
+        bounds = nlp.bounds(parameters)
+        w0 = np.clip(start.w, bounds["lbx"], bounds["ubx"])
+        scale = self._cost_scale(solver, w0, parameters)
+        arguments: dict[str, Any] = {"x0": w0, "p": nlp.p_of(parameters, scale), **bounds}
+        if start.lam_x is not None and start.lam_g is not None:
+            arguments |= {"lam_x0": start.lam_x / scale, "lam_g0": start.lam_g / scale}
+        if self._monitor is not None:
+            self._monitor.attach(progress, scale, bounds, tentative)
+        try:
+            result = solver(**arguments)
+        except RuntimeError as error:  # a plugin that gives up by raising; its last iterate is lost, the start is not
+            result = {"x": ca.DM(w0), "lam_x": ca.DM.zeros(w0.size), "lam_g": ca.DM.zeros(bounds["lbg"].size)}
+            reason = str(error).strip().splitlines()[-1]
+            stats: dict[str, Any] = {"success": False, "return_status": f"{self._plugin} gave up: {reason}"}
+        else:
+            stats = solver.stats()
+        w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
+        success, status = bool(stats["success"]), str(stats.get("return_status", ""))
+        evaluable = True
+        try:
+            where = nlp.unpack(w, parameters)
+        except RuntimeError:  # a solve inside the model that gives up: the last iterate is lost, the start is not
+            w, lam_x, lam_g, where = w0, 0.0 * lam_x, 0.0 * lam_g, nlp.unpack(w0, parameters)
+            success, status, evaluable = False, NOT_EVALUABLE.format(status), False
+        return Point(
+            w=w,
+            lam_x=scale * lam_x,
+            lam_g=scale * lam_g,
+            where=where,
+            success=success,
+            status=status,
+            iterations=int(stats.get("iter_count", -1)),
+            evaluable=evaluable,
+        )
+
+    def _lost_way(self, status: str) -> dict[str, Any]:
+        """Whether the run lost its way, as a count."""
+        if self._monitor is not None and self._monitor.wandered:
+            return {"wandered": STOPPED}
+        known = status_of(status)
+        return {"wandered": ENDED} if known is not None and known.lost else {}
+
+    def message(self, last: Round) -> str:
+        """How the run ended, a sentence."""
+        status, known = last.point.status, status_of(last.point.status)
+        if last.converged:
+            return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
+        if last.residuals is not None and last.point.success:
+            return f"{STALE}: {last.residuals}; {REMEDY}"
+        if not last.point.evaluable:
+            return status
+        return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
+
+    def _build(
+        self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool
+    ) -> tuple[Program, ca.Function]:
+        """The program and its solver, made at the first call; a second solver shares the functions for warm starts.
+
+        Other plugins than Ipopt print their iterations where somebody watches that call.
+        """
+        if self._nlp is None or self._cold is None:
+            if self._plugin != "ipopt" and not watched:
+                self._settings = silent(self._plugin, self._settings)
+            self._transcribe(None, trajectories, parameters)
+        assert self._nlp is not None
+        assert self._cold is not None
+        return self._nlp, self._warm_solver() if warm else self._cold
+
+    def _transcribe(self, scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> None:
+        """The program in these scales, and its solver."""
+        self._nlp = self._build_program(scales, trajectories, parameters)
+        if self._plugin == "ipopt":
+            self._monitor = Monitor(self._nlp)
+        self._cold, self._warm = self._make({}), None
+
+    def _warm_solver(self) -> ca.Function:
+        """The solver for starts with multipliers; other plugins than Ipopt have one for all."""
+        assert self._cold is not None
+        if self._plugin != "ipopt":
+            return self._cold
+        if self._warm is None:
+            shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
+                {} if self._limited else {"hess_lag": "nlp_hess_l"}
+            )
+            self._warm = self._make(
+                {option: self._cold.get_function(name) for option, name in shared.items()}, warm=True
+            )
+        return self._warm
+
+    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> ca.Function:
+        nlp = self._nlp
+        assert nlp is not None
+        settings = {**self._settings, **functions}
+        if nlp.jacobian is not None and "jac_g" not in settings:
+            settings["jac_g"] = nlp.jacobian
+        if self._monitor is not None:
+            settings["iteration_callback"] = self._monitor
+        if warm:
+            settings["ipopt"] = {
+                **settings["ipopt"],
+                "warm_start_init_point": "yes",
+                "warm_start_bound_push": 1e-8,
+                "warm_start_mult_bound_push": 1e-8,
+                "warm_start_slack_bound_push": 1e-8,
+                "mu_init": 1e-6,
+            }
+            settings["ipopt"]["tol"] *= self._strictness
+        try:
+            return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+        except RuntimeError as error:
+            raise ProblemError(
+                f"The NLP plugin '{self._plugin}' refuses its settings.",
+                expected="options that it has, in plugin_options; a C compiler where compile=True",
+                received=str(error).strip().splitlines()[-1],
+                remedy="correct plugin_options=, or leave compile= out",
+            ) from error
+
+    def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Arrays) -> float:
+        """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
+
+        Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
+        """
+        if self._plugin != "ipopt":  # each plugin has functions of its own, and a scaling of its own
+            return 1.0
+        with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
+            return self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)
+
+    def _curvature_along(self, gradient: ca.Function, w0: Array, parameters: Arrays) -> float:
+        """|g' H g| / g' g of the cost, g its slopes, and what stands for it where it is no number."""
+        assert self._nlp is not None
+        p = self._nlp.p_of(parameters, 1.0)
+        value, first = (np.asarray(v.full()).ravel() for v in gradient(w0, p))
+        if not np.isfinite(value[0]):
+            self._nlp.check_finite(w0, parameters)
+        size = float(np.linalg.norm(first))
+        largest = max(abs(float(value[0])), float(np.abs(first[self._nlp.chosen]).max(initial=0.0)))
+        if not np.isfinite(size) or size == 0.0:
+            return 1.0
+        largest = largest if largest > 0.0 else size
+        step = PROBE / size
+        second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
+        curvature = abs(float((first - second) @ first)) / (step * size**2)
+        return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
