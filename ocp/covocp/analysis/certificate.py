@@ -35,6 +35,7 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
+from covocp.solution.phases import check_whole
 from covocp.solution.solution import Solution
 
 Verdict = Literal["global minimum (certified)", "not certified", "does not apply"]
@@ -122,6 +123,7 @@ def certify(solution: Solution, *, progress: bool = True) -> Certificate:
         ProblemError: where it is no solution.
     """
     check_kind(solution, Solution, "certify(solve(problem))")
+    check_whole(solution, "certify()")
     extremal = solution.extremal
     obstacle = why_not(extremal.statement, solution.parameters)
     if obstacle:

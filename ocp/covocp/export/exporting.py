@@ -268,7 +268,11 @@ def _functions(what: Given, ranges: Mapping[str, Any], units: Mapping[str, str],
             "This cannot be exported.",
             expected="a Solution, a casadi.Function, a list of them, or a Problem",
             received=f"{type(what).__name__}: {what!r}"[:100],
-            remedy="make a casadi.Function of a law: casadi.Function('law', [x, t], [u], ['x', 't'], ['u'])",
+            remedy=getattr(
+                what,
+                "instead",
+                "make a casadi.Function of a law: casadi.Function('law', [x, t], [u], ['x', 't'], ['u'])",
+            ),
         )
     laws = function_laws(functions, ranges, units, tolerance)
     return Content(laws=tuple(laws), title="Functions: " + ", ".join(law.name for law in laws) + ".")

@@ -143,7 +143,9 @@ def _design(solution: Solution) -> System:
             "This cannot be simulated.",
             expected="a Solution",
             received=type(solution).__name__,
-            remedy="solve or evaluate the problem first: simulate(solve(problem), runs, seed)",
+            remedy=getattr(
+                solution, "instead", "solve or evaluate the problem first: simulate(solve(problem), runs, seed)"
+            ),
         )
     if solution.origin is Origin.OTHER_TRUTH:
         raise ProblemError(

@@ -22,6 +22,25 @@ from covocp.solution.solution import Solution
 LARGE_LINK = 1e-4
 
 
+def check_whole(solution: Solution, what: str) -> None:
+    """A solution must be one of a whole problem, not of a phase.
+
+    Args:
+        solution: to be checked.
+        what: is asked of it, a function.
+
+    Raises:
+        ProblemError: it is that of a phase.
+    """
+    if solution.within is not None:
+        raise ProblemError(
+            f"{what} does not apply to one of several phases.",
+            expected="the solution of a Problem by itself",
+            received=f"the phase '{solution.name}'",
+            remedy="what it would say of the phase alone is not true of all phases together",
+        )
+
+
 @methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhasesSolution:

@@ -25,6 +25,7 @@ from covocp.extremal.path_limits import NOTED
 from covocp.problem.builder import Problem
 from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
+from covocp.solution.phases import check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.unused import mention_forgotten
@@ -79,7 +80,10 @@ def evaluate(
     else:
         with evaluating(str(getattr(problem, "name", ""))):
             solution = _along(problem, nominal, intervals, {} if parameters is None else parameters, options)
-    return solution if truth is None else _under(solution, truth)
+    if truth is None:
+        return solution
+    check_whole(solution, "evaluate() under another truth")
+    return _under(solution, truth)
 
 
 def _along(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import is_whole
-from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, evaluating, no_option
+from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, evaluating, no_option, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
@@ -23,10 +23,10 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import TRIED
-from covocp.solving.unused import mention_forgotten, mention_lengths
+from covocp.solving.unused import mention_lengths
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.chain import Chain, started_at
-from covocp.statement.names import stacked_parameters, unknown_name
+from covocp.statement.names import stacked_parameters
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.stiffness import resolve_mesh
@@ -83,8 +83,6 @@ def solve_phases(
             raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ())
     mesh_options = {name: value for name, value in options.items() if name in known}
     asked_options = tuple(Options(intervals=n, **mesh_options) for n in _intervals(chain, intervals))
-    for problem in phases.problems:
-        mention_forgotten(problem)
     guesses = _guess_of_each(chain, guess, asked_options)
     values = _values(chain, parameters or {})
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
@@ -126,7 +124,7 @@ def _guess_of_each(chain: Chain, guess: Given, options: tuple[Options, ...]) -> 
     if isinstance(guess, Mapping):
         for name in guess:
             if name not in names:
-                raise unknown_name(name, tuple(names))
+                raise _no_such("phase", name, names)
         listed = [guess.get(name) for name in names]
     else:
         listed = list(guess) if isinstance(guess, (PhasesSolution, list, tuple)) else []
@@ -153,10 +151,21 @@ def _values(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
     ]
     for name in parameters:
         if not any(name in names for names in own):
-            raise unknown_name(name, tuple(dict.fromkeys(n for names in own for n in names)))
+            raise _no_such("parameter", name, [n for names in own for n in names])
     return tuple(
         stacked_parameters(st, {name: value for name, value in parameters.items() if name in names})
         for st, names in zip(chain.statements, own, strict=True)
+    )
+
+
+def _no_such(what: str, name: Given, known: list[str]) -> ProblemError:
+    """The error for a name that none of the phases has."""
+    listed = list(dict.fromkeys(known))
+    return ProblemError(
+        f"There is no {what} '{name}'.",
+        expected="one of " + ", ".join(listed) if listed else f"none: no phase has a {what}",
+        received=repr(name)[:100],
+        remedy=spelling(name, listed, "correct or remove it"),
     )
 
 
