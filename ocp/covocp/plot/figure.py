@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from covocp.solution.phases import PhasesSolution
     from covocp.solution.solution import Solution
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -34,6 +35,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1.2)))
 BOUND: dict[str, Any] = {"color": "#666666", "linewidth": 0.8, "linestyle": (0, (4, 3))}
+MARK: dict[str, Any] = {"color": "#999999", "linewidth": 0.7, "linestyle": (0, (1, 2))}  # between phases
 TARGET: dict[str, Any] = {
     "marker": "o",
     "markersize": 4.5,
@@ -133,8 +135,6 @@ def plot_solutions(
         ProblemError: no solution, a name is unknown, or the labels do not fit.
         ExportError: the file cannot be written.
     """
-    import matplotlib
-
     if path is not None:
         check_target(path, SUFFIXES)
     given = list(solutions)
@@ -143,16 +143,50 @@ def plot_solutions(
     words = known | dict(units or {})
     panels = choose_panels(given, names, costates=costates, gains=gains, over=over, units=words)
     abscissa = "time [s]" if over is None else abscissa_label(given, over, words)
+    return drawn_figure(given, legend, panels, abscissa=abscissa, sigmas=tuple(sigmas), title=title, path=path)
+
+
+def drawn_figure(
+    given: Sequence[Solution | PhasesSolution],
+    legend: list[str],
+    panels: list[Panel],
+    *,
+    abscissa: str,
+    sigmas: tuple[float, ...],
+    title: str | None,
+    path: str | Path | None,
+    marks: tuple[float, ...] = (),
+    span: tuple[float, float] | None = None,
+) -> Figure:
+    """The figure of some panels.
+
+    Args:
+        given: what they are of.
+        legend: labels of these.
+        panels: their curves.
+        abscissa: its label.
+        sigmas: widths of the bands.
+        title: of the figure; None: the name.
+        path: where it is written too, or None.
+        marks: places along the abscissa where a line is drawn.
+        span: of the abscissa of all panels; None: of their curves.
+    """
+    import matplotlib
+
     rows, columns = _grid(len(panels))
     with matplotlib.rc_context(STYLE):
         width, height = SINGLE if len(panels) == 1 else PANEL
         figure = _figure((width * columns, height * rows + HEAD))
         axes = figure.subplots(rows, columns, squeeze=False)
         for place, panel in zip(axes.ravel(), panels, strict=False):
-            _draw(place, panel, len(given), tuple(sigmas))
+            _draw(place, panel, len(given), sigmas)
+            for mark in marks:
+                place.axvline(mark, zorder=1, **MARK)
+            if span is not None:
+                place.set_xlim(*span)
         _arrange(figure, axes, len(panels), abscissa)
         _title(figure, given, legend, title)
-        _legend(figure, given, legend, panels, tuple(sigmas))
+        _legend(figure, given, legend, panels, sigmas)
         if path is not None:
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
@@ -246,7 +280,9 @@ def apart_from_pyplot() -> Iterator[None]:
         _FOR_PYPLOT.reset(token)
 
 
-def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: str | None) -> None:
+def _title(
+    figure: Figure, solutions: Sequence[Solution | PhasesSolution], labels: list[str], title: str | None
+) -> None:
     """Name of the problem, and below it a warning of solutions that did not converge."""
     names = list(dict.fromkeys(s.name for s in solutions if s.name))
     text = title if title is not None else names[0] if len(names) == 1 else ""
@@ -259,7 +295,11 @@ def _title(figure: Figure, solutions: list[Solution], labels: list[str], title: 
 
 
 def _legend(
-    figure: Figure, solutions: list[Solution], labels: list[str], panels: list[Panel], sigmas: tuple[float, ...]
+    figure: Figure,
+    solutions: Sequence[Solution | PhasesSolution],
+    labels: list[str],
+    panels: list[Panel],
+    sigmas: tuple[float, ...],
 ) -> None:
     """Which solution is which, and what bands, circles and thin dashes mean."""
     from matplotlib.lines import Line2D

@@ -72,7 +72,7 @@ def choose_panels(
     blocks: dict[str, Block] = {}
     for solution in solutions:
         for block in solution.blocks:
-            blocks.setdefault(block.name, block)
+            blocks[block.name] = _together(blocks.get(block.name, block), block)
     keys = [key for name in names for key in _keys(solutions, name)] or _usual(drawn, blocks)
     if gains:
         keys += [Quantity(word=w) for w in (GAIN, FILTER) if any(knows(solution, w) for solution in solutions)]
@@ -84,6 +84,26 @@ def choose_panels(
             panels += _costates(drawn, block)
     panels = _explained_once(panels)
     return panels if over is None else over_panels(drawn, panels, _resolved(solutions, over), units)
+
+
+def _together(one: Block, other: Block) -> Block:
+    """A covariance of the estimation error with the rows of two solutions; of everything else the first counts."""
+    if not (one.estimation and other.estimation) or one.labels == other.labels:
+        return one
+    labels = tuple(dict.fromkeys((*one.labels, *other.labels)))
+    return replace(one, labels=labels, size=len(labels))
+
+
+def _in_order(values: Array, own: tuple[str, ...], labels: tuple[str, ...]) -> Array:
+    """Values of a matrix (K, n, n) in another order of its rows; NaN for those that it has not."""
+    if own == labels:
+        return values
+    places = [own.index(label) if label in own else -1 for label in labels]
+    missing = np.array([place < 0 for place in places])
+    result = values[:, places][:, :, places].copy()
+    result[:, missing] = np.nan
+    result[:, :, missing] = np.nan
+    return result
 
 
 def _explained_once(panels: list[Panel]) -> list[Panel]:
@@ -140,7 +160,8 @@ def _of_key(drawn: list[Drawn], key: Given, blocks: Mapping[str, Block], units: 
         return _expression(drawn, key)
     block = _block(key, blocks)
     if block.kind == "matrix":
-        return _matrix([(d, d.t, d.sample[key]) for d in drawn if d.knows(key)], block, units)
+        known = [(d, d.solution.block(key).labels) for d in drawn if d.knows(key)]
+        return _matrix([(d, d.t, _in_order(d.sample[key], own, block.labels)) for d, own in known], block, units)
     return _vector(drawn, block, units)
 
 
@@ -329,7 +350,8 @@ def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[
             )
             for i in range(own.size)
         ]
-    bounds = _bounds(drawn[0].solution.statement, block)
+    owner = next((d.solution for d in drawn if d.knows(block.name)), None)
+    bounds = _bounds(None, block) if owner is None else _bounds(owner.statement, owner.block(block.name))
     suffix = " (estimate)" if block.kind == "unknown" else ""
     return _separated(block, suffix + unit_of(block.name, units), curves, bounds)
 
@@ -400,7 +422,7 @@ def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) ->
     """A block of the covariance of the actual deviations, at the nodes."""
     curves: list[Curve] = []
     names: tuple[str, ...] = ()
-    for d in drawn:
+    for d in [d for d in drawn if all(not isinstance(part, str) or d.knows(part) for part in key)] or drawn:
         values = d.solution.covariance(*key)
         names = tuple(f"{i}, {j}" for i in range(values.shape[1]) for j in range(values.shape[2]))
         flat = values.reshape(values.shape[0], -1)
@@ -425,8 +447,9 @@ def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
     pairs = [pair for group in _pairs(block) for pair in group]
     entries = tuple(f"{block.labels[i]}, {block.labels[j]}" for i, j in pairs)
     curves = [
-        Curve(t=d.solution.t, y=d.solution.costate(block.name)[:, i, j], order=d.order, entry=k)
+        Curve(t=d.solution.t, y=costates[:, i, j], order=d.order, entry=k)
         for d in chosen
+        for costates in [_in_order(d.solution.costate(block.name), d.solution.block(block.name).labels, block.labels)]
         for k, (i, j) in enumerate(pairs)
     ]
     return [Panel(label=f"costate of {block.name}", entries=entries, curves=tuple(curves))]

@@ -16,7 +16,7 @@ from covocp.problem.decisions import decisions_of, matters
 from covocp.problem.declarations import Declarations, Matrix, Parameter, State, Unknown
 from covocp.problem.freeze import freeze
 from covocp.statement.chain import Chain, Link
-from covocp.statement.statement import entries_of, entry_names
+from covocp.statement.statement import Statement, entries_of, entry_names
 
 
 def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], jumps: Sequence[Any]) -> Chain:
@@ -46,8 +46,16 @@ def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], ju
         later = _carrying(phases[k], carried)
         links.append(_link(own[-1], later, carried, jumping[k]))
         own.append(replace(later, cost=later.cost or _no_cost()))
-    statements = tuple(freeze(phase, part=True) for phase in own)
-    return Chain(name=name, statements=statements, links=tuple(links))
+    return Chain(name=name, statements=tuple(_frozen(phase) for phase in own), links=tuple(links))
+
+
+def _frozen(phase: Declarations) -> Statement:
+    """The statement of a phase; what is wrong with it is said with its name."""
+    try:
+        return freeze(phase, part=True)
+    except ProblemError as error:
+        own = {name: getattr(error, name) for name in ("expected", "received", "remedy")}
+        raise ProblemError(f"In the phase '{phase.name}': {error.problem}", **own) from error
 
 
 def _no_cost() -> tuple[ca.MX, ca.MX]:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
+from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
 from covocp.solution.report import sections
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 # Residual where phases meet from which on the printout worries about it.
 LARGE_LINK = 1e-4
@@ -170,6 +175,16 @@ class PhasesSolution:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols={})
 
+    def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
+        """Draw all phases over the whole time; see `covocp.plot.phases.plot_phases`."""
+        figures = later("plot.phases")
+        later("plot.figure").check_plot_options(options, figures.plot_phases)
+        return figures.plot_phases(self, *names, **options)  # type: ignore[no-any-return]
+
+    def save(self, path: str | Path) -> Path:
+        """Write all phases to a .npz or .json file; see `covocp.solution.phases_storage.save`."""
+        return later("solution.phases_storage").save(self, path)  # type: ignore[no-any-return]
+
     def sections(self) -> list[Section]:
         """The whole, and each phase, in sentences and tables."""
         text = f"{self.name or 'phases'}: {self.message} ({self.method})"
@@ -201,8 +216,8 @@ class PhasesSolution:
         return as_text(self.sections())
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the same summary."""
-        return as_html(self.sections())
+        """What a notebook shows: the same summary, and the figure."""
+        return as_html(self.sections(), later("plot.embedding").embedded(self.plot))
 
 
 def _merged(samples: list[tuple[Any, Mapping[str, Array]]], times: Array) -> dict[str, Array]:

@@ -13,12 +13,12 @@ import types
 import typing
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal, TypeVar, Union
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from covocp.extremal.optimality import Optimality
 from covocp.solution.fingerprint import Fingerprint, fingerprint
 from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
+
+T = TypeVar("T")
 
 FORMAT = "covocp solution"
 VERSION = 3
@@ -84,7 +86,23 @@ def save(solution: Solution, path: str | Path) -> Path:
             plain data or does not fit together.
     """
     check_target(path, SUFFIXES)
-    tree = {"format": FORMAT, "version": VERSION, **to_tree(solution)}
+    return write({"format": FORMAT, "version": VERSION, **checked_tree(solution)}, path)
+
+
+def write(tree: Mapping[str, Any], path: str | Path) -> Path:
+    """Write a tree to a file that is complete or not there."""
+    with written_whole(path, SUFFIXES) as part:
+        part.write_bytes(packed(tree, part.suffix))
+    return Path(path)
+
+
+def checked_tree(solution: Solution) -> dict[str, Any]:
+    """The entries of a solution, as they can be read again.
+
+    Raises:
+        ExportError: they cannot.
+    """
+    tree = to_tree(solution)
     try:
         from_tree(tree)
     except DamagedFileError as error:
@@ -94,9 +112,7 @@ def save(solution: Solution, path: str | Path) -> Path:
             received=str(error),
             remedy="save the solution that the solver returned",
         ) from error
-    with written_whole(path, SUFFIXES) as part:
-        part.write_bytes(packed(tree, part.suffix))
-    return Path(path)
+    return tree
 
 
 def read(path: str | Path) -> Solution:
@@ -105,6 +121,19 @@ def read(path: str | Path) -> Solution:
     Raises:
         ProblemError: no such file, not a file of this format or version, or damaged (a checksum tells).
     """
+    return made(path, opened(path, {FORMAT: VERSION}), from_tree)
+
+
+def opened(path: str | Path, versions: Mapping[str, int]) -> Mapping[str, Any]:
+    """The tree in a file of one of some formats.
+
+    Args:
+        path: the file.
+        versions: by format, the version that is read.
+
+    Raises:
+        ProblemError: no such file, of another format or version, or damaged.
+    """
     file = _checked_path(path)
     try:
         tree, sealed = unpacked(file.read_bytes())
@@ -112,10 +141,11 @@ def read(path: str | Path) -> Solution:
         raise _unreadable(file, str(error), "check the path and its permissions") from error
     except (DamagedFileError, *FOREIGN) as error:
         raise _damaged(file, error) from error
-    if not isinstance(tree, dict) or repr(tree.get("format")) != repr(FORMAT):
+    words = {repr(name): number for name, number in versions.items()}
+    if not isinstance(tree, dict) or repr(tree.get("format")) not in words:
         raise _unreadable(file, "it is of another format", "give a file that Solution.save wrote")
     version = repr(tree.get("version"))
-    if version != repr(VERSION):
+    if version != repr(words[repr(tree["format"])]):
         older = " and has no checksum" if version in ("1", "2") else ""
         raise _unreadable(
             file,
@@ -126,12 +156,21 @@ def read(path: str | Path) -> Solution:
         raise _unreadable(
             file, "its checksum does not fit: it is damaged, or was changed", "take a copy, or solve and save again"
         )
+    return tree
+
+
+def made(path: str | Path, tree: Mapping[str, Any], make: Callable[[Mapping[str, Any]], T]) -> T:
+    """What is made of the tree in a file.
+
+    Raises:
+        ProblemError: it contradicts itself.
+    """
     try:
-        return from_tree(tree)
+        return make(tree)
     except FOREIGN as error:
-        raise _damaged(file, error) from error
+        raise _damaged(Path(path), error) from error
     except DamagedFileError as error:
-        raise _unreadable(file, str(error)[:REASON], "solve and save again") from error
+        raise _unreadable(Path(path), str(error)[:REASON], "solve and save again") from error
 
 
 def _checked_path(path: str | Path) -> Path:

@@ -1,0 +1,87 @@
+"""Figures of several phases over the whole time, with a line where one ends and the next begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from covocp.base.arguments import checked, optional, positives, text, texts_by_name, truth
+from covocp.base.expressions import Given
+from covocp.base.files import check_target
+from covocp.base.matrices import Array
+from covocp.plot.curves import Panel
+from covocp.plot.figure import SUFFIXES, drawn_figure
+from covocp.plot.panels import abscissa_label, choose_panels
+from covocp.solution.phases import PhasesSolution
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@checked(
+    "plot()",
+    costates=truth,
+    sigmas=positives,
+    units=optional(texts_by_name),
+    title=optional(text),
+)
+def plot_phases(
+    solution: PhasesSolution,
+    *names: Any,
+    costates: bool = False,
+    over: Given = None,
+    sigmas: Sequence[float] = (1.0,),
+    units: Mapping[str, str] | None = None,
+    title: str | None = None,
+    path: str | Path | None = None,
+) -> Figure:
+    """Draw several phases over the whole time, a panel a quantity; each in the phases that have it.
+
+    Args:
+        solution: of the phases.
+        names: what to draw, as of one solution: symbols of any phase, or names; None: states, controls and unknowns
+            with bands, then covariances.
+        costates: whether to draw the costates of the states and matrices drawn.
+        over: what is the abscissa: the name of a scalar state or control; None: time, with a line between phases.
+        sigmas: widths of the bands in standard deviations.
+        units: by name, for the axes.
+        title: of the figure; by default the name of the phases.
+        path: also write the figure there (.png, .pdf or .svg).
+
+    Returns:
+        The figure.
+
+    Raises:
+        ProblemError: a name is unknown.
+        ExportError: the file cannot be written.
+    """
+    if path is not None:
+        check_target(path, SUFFIXES)
+    phases = list(solution.phases)
+    words = {block.name: block.unit for phase in phases for block in phase.blocks} | dict(units or {})
+    panels = choose_panels(phases, names, costates=costates, over=over, units=words)
+    shifts = solution.starts if over is None else np.zeros(len(phases))
+    return drawn_figure(
+        [solution],
+        [solution.name],
+        [_joined(panel, shifts) for panel in panels],
+        abscissa="time [s]" if over is None else abscissa_label(phases, over, words),
+        sigmas=tuple(sigmas),
+        title=title,
+        path=path,
+        marks=tuple(solution.starts[1:].tolist()) if over is None else (),
+        span=(0.0, solution.duration) if over is None else None,
+    )
+
+
+def _joined(panel: Panel, shifts: Array) -> Panel:
+    """A panel of the phases as one of the whole time."""
+    return replace(
+        panel,
+        curves=tuple(replace(curve, t=curve.t + shifts[curve.order], order=0) for curve in panel.curves),
+        ellipses=tuple(replace(ellipse, order=0) for ellipse in panel.ellipses),
+    )
