@@ -37,9 +37,37 @@ def problem() -> co.Problem:
     v = ocp.state("v", initial=0.0, lower=0.0, guess=lambda s: 0.4 * s * (1.0 - s))
     m = ocp.state("m", initial=1.0, final=FINAL_MASS, lower=FINAL_MASS, upper=1.0, guess=lambda s: 1.0 - 0.4 * s)
     thrust = ocp.control("thrust", lower=0.0, upper=LARGEST_THRUST, guess=1.0)
+    _move(ocp, h, v, m, thrust)
+    ocp.minimize(terminal=-h)
+    return ocp
+
+
+def _move(ocp: co.Problem, h: ca.MX, v: ca.MX, m: ca.MX, thrust: ca.MX | float) -> None:
+    """The equations of motion."""
     drag = DRAG * v**2 * ca.exp(-DENSITY_DECAY * (h - 1.0))
     ocp.dynamics(h, v)
     ocp.dynamics(v, (thrust - drag) / m - 1.0 / h**2)
     ocp.dynamics(m, -thrust / EXHAUST_SPEED)
-    ocp.minimize(terminal=-h)
-    return ocp
+
+
+def phases() -> co.Phases:
+    """The same ascent in three phases of free duration: full thrust, the singular arc, a coast; normalised units.
+
+    Returns:
+        The phases "full thrust", "singular arc", which alone has the control "thrust", and "coast".
+    """
+    problems: list[co.Problem] = []
+    for name, guess, upper in (("full thrust", 0.02, 0.1), ("singular arc", 0.05, 0.2), ("coast", 0.12, 0.5)):
+        ocp = co.Problem(duration=co.Free(guess=guess, lower=0.001, upper=upper), name=name)
+        first = not problems
+        h = ocp.state("h", initial=1.0 if first else None, lower=1.0)
+        v = ocp.state("v", initial=0.0 if first else None, lower=0.0)
+        m = ocp.state("m", initial=1.0 if first else None, lower=FINAL_MASS, upper=1.0)
+        thrust: ca.MX | float = LARGEST_THRUST if first else 0.0
+        if name == "singular arc":
+            thrust = ocp.control("thrust", lower=0.0, upper=LARGEST_THRUST, guess=1.5)
+        _move(ocp, h, v, m, thrust)
+        problems.append(ocp)
+    problems[-1].subject_to(m, lower=FINAL_MASS, upper=FINAL_MASS, at="final", name="final mass")
+    problems[-1].minimize(terminal=-h)
+    return co.Phases(problems, name="Goddard's rocket")

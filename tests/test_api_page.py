@@ -38,9 +38,10 @@ MET = {
     "Timing": "covocp.export.compiled.package",
 }
 # By the user: their data are set on construction.
-MADE = ("Free", "Gain", "Problem", "Solver", "SolveError", "Interrupted")
+MADE = ("Free", "Gain", "Phases", "Problem", "Solver", "SolveError", "Interrupted")
 HELD = (
     "Solution",
+    "PhasesSolution",
     "MonteCarlo",
     "CPackage",
     "Comparison",

@@ -256,6 +256,53 @@ def solving() -> Iterator[tuple[str, str, Call]]:
     yield "certify", "solution", co.certify
 
 
+def in_phases() -> Iterator[tuple[str, str, Call]]:
+    """Of several phases: what states them, what solves them, and what asks for results."""
+    few: dict[str, Any] = {**SMALL, "max_iterations": 1, "allow_failure": True}
+
+    def parts() -> tuple[co.Problem, co.Problem]:
+        first, second = co.Problem(1.0, name="first"), co.Problem(1.0, name="second")
+        for ocp in (first, second):
+            x, u = (
+                ocp.state("x", initial=1.0 if ocp is first else None, variance=0.1 * (ocp is first)),
+                ocp.control("u"),
+            )
+            ocp.dynamics(x, u, noise=0.1)
+            E = ocp.estimation_covariance()
+            ocp.minimize(running=u**2, terminal=E[x, x])
+        return first, second
+
+    def jumping(**given: Any) -> Any:
+        first, second = parts()
+        phases, before = co.Phases([first, second]), first.states[0].symbol
+        phases.jump(**{"x": second.states[0].symbol, "expression": 0.5 * before, "noise": 0.1, **given})
+        return co.solve(phases, **few)
+
+    def solved(**given: Any) -> Any:
+        return co.solve(**{"problem": co.Phases(parts(), name="both"), **few, **given})
+
+    yield "Phases", "problems", co.Phases
+    yield "Phases", "one of the problems", lambda v: co.Phases([parts()[0], v])
+    yield "Phases", "name", lambda v: co.Phases(parts(), name=v)
+    for argument in ("x", "expression", "noise"):
+        yield "Phases.jump", argument, lambda v, n=argument: jumping(**{n: v})
+    for argument in ("method", "intervals", "guess", "nominal", "progress", "allow_failure", "parameters", "tolerance"):
+        yield "solve phases", argument, lambda v, n=argument: solved(**{n: v})
+    yield "solve phases", "guess of one", lambda v: solved(guess=[v, None])
+    yield "solve phases", "intervals of one", lambda v: solved(intervals=[v, 2])
+    solution = solved()
+    yield "PhasesSolution", "[]", solution.__getitem__
+    for argument, call in called(solution.at, t=0.5, side="after"):
+        yield "PhasesSolution.at", argument, call
+    for name in ("costates", "over", "sigmas", "units", "title", "path"):
+        yield "PhasesSolution.plot", name, lambda v, n=name: solution.plot("x", **{n: v})
+    yield "PhasesSolution.plot", "names", solution.plot
+    yield "PhasesSolution.save", "path", solution.save
+    for name, function in {"evaluate": co.evaluate, "certify": co.certify, "compare": co.compare}.items():
+        yield name, "phases", lambda _, f=function: f(co.Phases(parts()))
+        yield name, "a solution of phases", lambda _, f=function: f(solution)
+
+
 def results() -> Iterator[tuple[str, str, Call]]:
     """Of what asks for results."""
     solution, closed, runs = made()["solution"], made()["closed"], made()["runs"]
@@ -472,6 +519,6 @@ def laws() -> Iterator[tuple[str, str, Call]]:
 
 # Name of the function, name of the argument, and the call with a value for it.
 CASES: dict[str, Callable[[], Iterator[tuple[str, str, Call]]]] = {
-    function.__name__: function for function in (statements, solving, results, simulations, exports, laws)
+    function.__name__: function for function in (statements, solving, in_phases, results, simulations, exports, laws)
 }
 SLOW = {"statements that are solved": functools.partial(statements, solved=True)}

@@ -26,7 +26,7 @@ GALLERY = (
         "first",
         "First steps",
         "Small problems, each with one idea.",
-        ("first_order_lag", "plain_problems", "final_variance", "free_terminal_time"),
+        ("first_order_lag", "plain_problems", "final_variance", "free_terminal_time", "launch_vehicle"),
     ),
     (
         "identification",
@@ -42,6 +42,7 @@ GALLERY = (
             "designed_excitation",
             "attitude_slew",
             "bought_sensor",
+            "experiment_then_steering",
         ),
     ),
     (

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.base.arguments import checked, one_of
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
@@ -139,6 +140,7 @@ class PhasesSolution:
             remedy=spelling(key, names, "index a phase first: solution[name][symbol]; or use solution.at(t)[symbol]"),
         )
 
+    @checked(side=one_of("before", "after"))
     def at(self, t: Given, *, side: str = "after") -> Sample:
         """Values at any times of the whole, between the nodes as the integrator computes them.
 
@@ -157,11 +159,11 @@ class PhasesSolution:
         times = np.atleast_1d(as_number("at", "times", t))
         margin = 1e-9 * self.duration
         inside = times.ndim == 1 and bool(((times >= -margin) & (times <= self.duration + margin)).all())
-        if not inside or side not in ("before", "after"):
+        if not inside:
             raise ProblemError(
                 "A solution has no values there.",
-                expected=f"a time or a row of times within [0, {self.duration:g}] s; side='before' or 'after'",
-                received=f"{str(t)[:100]}, side={side!r}",
+                expected=f"a time or a row of times within [0, {self.duration:g}] s",
+                received=str(t)[:100],
                 remedy="stay within the duration of all phases",
             )
         found = np.searchsorted(self.starts[1:], times, side="right" if side == "after" else "left")

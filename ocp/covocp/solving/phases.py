@@ -26,7 +26,7 @@ from covocp.solving.attempts import TRIED
 from covocp.solving.unused import mention_lengths
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.chain import Chain, started_at
-from covocp.statement.names import stacked_parameters
+from covocp.statement.names import name_of, stacked_parameters
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.stiffness import resolve_mesh
@@ -58,7 +58,7 @@ def solve_phases(
         nominal: "combined".
         progress: whether to show the iterations on a terminal.
         allow_failure: return the last iterate of a run that did not converge instead of raising.
-        parameters: values by name, in all phases that have them.
+        parameters: values by name or symbol, in all phases that have them.
         options: of mesh and method.
 
     Raises:
@@ -84,7 +84,7 @@ def solve_phases(
     mesh_options = {name: value for name, value in options.items() if name in known}
     asked_options = tuple(Options(intervals=n, **mesh_options) for n in _intervals(chain, intervals))
     guesses = _guess_of_each(chain, guess, asked_options)
-    values = _values(chain, parameters or {})
+    values = _values(chain, {} if parameters is None else parameters)
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         run = _Run(chain, prepare, {k: v for k, v in options.items() if k in own}, reporter)
         outcome = run.solve(asked_options, values, guesses)
@@ -149,12 +149,17 @@ def _values(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
         [b.name for b in st.blocks if b.kind in ("parameter", "unknown") and b.name[:-3] not in names]
         for st, names in zip(chain.statements, carried, strict=True)
     ]
-    for name in parameters:
-        if not any(name in names for names in own):
-            raise _no_such("parameter", name, [n for names in own for n in names])
+    if not isinstance(parameters, Mapping):
+        stacked_parameters(chain.statements[0], parameters)  # says what it should be
+    pairs = list(zip(chain.statements, own, strict=True))
+    by_name: dict[str, Any] = {}
+    for key, value in parameters.items():
+        found = [name for st, names in pairs if (name := name_of(key, st.symbols, tuple(names), missing_ok=True))]
+        if not found:
+            raise _no_such("parameter", key, [n for names in own for n in names])
+        by_name[found[0]] = value
     return tuple(
-        stacked_parameters(st, {name: value for name, value in parameters.items() if name in names})
-        for st, names in zip(chain.statements, own, strict=True)
+        stacked_parameters(st, {name: value for name, value in by_name.items() if name in names}) for st, names in pairs
     )
 
 
@@ -290,8 +295,9 @@ def _finished(solution: PhasesSolution, allow_failure: bool) -> PhasesSolution:
             return solution
         lines = [f"  {name}: {value:.6g}" for name, value in list(solution.violations.items())[:10]]
         violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
+        named = f" of '{solution.name}'" if solution.name else ""
         raise SolveError(
-            f"'{solution.name or 'The phases'}' were not solved by {solution.method}: {solution.message}.{violated}"
+            f"The phases{named} were not solved by {solution.method}: {solution.message}.{violated}"
             "\n  The last iterate is on this error (.solution): look at its phases, or use it as a guess.",
             solution=solution,  # type: ignore[arg-type]
             violations=solution.violations,
