@@ -21,7 +21,7 @@ from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.steps import KEPT
 
 # Distance from a bound, relative to the largest magnitude of a state, below which it holds the state.
-AT_BOUND = 1e-6
+AT_BOUND = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
