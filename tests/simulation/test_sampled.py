@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -78,7 +80,7 @@ class Recorder:
     """A law that holds the nominal's mean control and notes what it is given."""
 
     period = 0.325
-    seen: dict[float, np.ndarray] = {}
+    seen: ClassVar[dict[float, np.ndarray]] = {}
 
     def step(self, measurement, time):
         Recorder.seen[round(time, 6)] = np.asarray(measurement)

@@ -141,7 +141,7 @@ class _Simulation:
         domain = plan.domain[:, None]
         where = {int(k): i for i, k in enumerate(plan.stored)}
         sampled = {int(k): i for i, k in enumerate(plan.samples)}
-        if sampled:
+        if 0 in sampled:
             self._sample(0)
         self._store(where[0])
         before = self.before
