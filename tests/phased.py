@@ -9,14 +9,24 @@ import covocp as co
 RESTITUTION, DRAG = 0.7, 0.2
 
 
-def lag(duration: float, name: str, *, first: bool = True, last: bool = True) -> co.Problem:
-    """The lag with an unknown time constant, or one part of it: the cost is that of knowing the constant at the end."""
+def lag(
+    duration: float, name: str, *, first: bool = True, last: bool = True, at: list[float] | None = None
+) -> co.Problem:
+    """The lag with an unknown time constant, or one part of it: the cost is that of knowing the constant at the end.
+
+    Args:
+        duration: of the part.
+        name: of it.
+        first: whether it is the first one.
+        last: whether it is the last one.
+        at: when the position is measured; None: always.
+    """
     ocp = co.Problem(duration=duration, name=name)
     x = ocp.state("x", initial=0.0 if first else None, final=1.0 if last else None, variance=1.0 if first else None)
     b = ocp.unknown("b", mean=1.0, variance=5.0)
     u = ocp.control("u")
     ocp.dynamics(x, -b * x + u, noise=1.0)
-    ocp.measurement("position", x, noise=1.0)
+    ocp.measurement("position", x, noise=1.0, at=at)
     E = ocp.estimation_covariance()
     ocp.minimize(running=0.5 * u**2, terminal=10.0 * E[b, b] if last else 0.0)
     return ocp

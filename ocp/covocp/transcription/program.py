@@ -71,10 +71,14 @@ class Program:
     def pack_multipliers(
         self, multipliers: Sequence[Multipliers], costates: Sequence[tuple[Array, Array]]
     ) -> tuple[Array, Array]:
-        """Multipliers of the program (for a cost scale of 1); those of the links are not known and zero."""
+        """Multipliers of the program (for a cost scale of 1) from those of the statements and the costates."""
         pairs = [part.pack_multipliers(m, c) for part, m, c in zip(self.parts, multipliers, costates, strict=True)]
-        links = np.zeros(sum(rows.lower.size for rows in self.link_rows))
-        return np.concatenate([a for a, _ in pairs]), np.concatenate([*(b for _, b in pairs), links])
+        links = []
+        for link, part, (state, matrices) in zip(self.links, self.parts[1:], costates[1:], strict=True):
+            for kind, entries in _linked(link, part).items():
+                start = (state if kind == "link_x" else matrices)[0, entries]
+                links.append(-start * _scale(part.scales, kind, entries))
+        return np.concatenate([own for own, _ in pairs]), np.concatenate([*(own for _, own in pairs), *links])
 
     def unpack(self, w: Array, parameters: Arrays) -> tuple[Trajectories, dict[str, Any]]:
         """The trajectories, the cost terms of each part and together, and all constraint values, of some variables."""
