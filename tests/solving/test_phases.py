@@ -245,9 +245,9 @@ def test_an_unstable_plant_in_three_phases_costs_what_it_costs_in_one() -> None:
         ocp.minimize(running=u**2 + x**2 + E[x, x])
         return ocp
 
-    whole = co.solve(part("whole", 6.0, first=True, last=True), grid=np.linspace(0, 1, 91), **QUIET)
-    pieces = [part("a", 2.0, first=True, last=False), part("b", 2.0, first=False, last=False)]
-    cut = co.solve(co.Phases([*pieces, part("c", 2.0, first=False, last=True)]), grid=np.linspace(0, 1, 31), **QUIET)
+    whole = co.solve(part("whole", 3.0, first=True, last=True), grid=np.linspace(0, 1, 61), **QUIET)
+    pieces = [part("a", 1.0, first=True, last=False), part("b", 1.0, first=False, last=False)]
+    cut = co.solve(co.Phases([*pieces, part("c", 1.0, first=False, last=True)]), grid=np.linspace(0, 1, 21), **QUIET)
     assert cut.cost == pytest.approx(whole.cost, rel=1e-6)
 
 
