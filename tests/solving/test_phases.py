@@ -47,6 +47,10 @@ def test_measurements_at_instants_one_of_them_where_phases_meet(form: str) -> No
     cut = co.solve(co.Phases(parts), intervals=[40, 60], **options)
     assert cut.cost == pytest.approx(whole.cost, rel=1e-10)
     np.testing.assert_allclose(cut["B"].values["E"][-1], whole.values["E"][-1], rtol=1e-7)
+    for side in ("before", "after"):
+        for t in (2.0, 4.0, 7.0):
+            known = whole.at(t, side=side)["E"]
+            np.testing.assert_allclose(cut.at(t, side=side)["E"], known, rtol=1e-6, err_msg=f"{side} {t}")
 
 
 def test_a_matrix_of_the_users_goes_on() -> None:

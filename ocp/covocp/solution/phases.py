@@ -146,8 +146,8 @@ class PhasesSolution:
 
         Args:
             t: a time or an array of times [s], within [0, duration].
-            side: where two phases meet: "after" (what the later one starts with) or "before" (what the earlier one
-                ends with).
+            side: where two phases meet, and where something is measured at an instant: "after" (what the later one
+                starts with) or "before" (what the earlier one ends with).
 
         Returns:
             What `[name]` gives the values of; NaN in phases that have no such name. Matrices whose size differs
@@ -171,7 +171,7 @@ class PhasesSolution:
         for k, phase in enumerate(self.phases):
             chosen = np.flatnonzero(found == k)
             local = np.clip(times[chosen] - self.starts[k], 0.0, phase.duration)
-            samples.append((chosen, phase.at(local if chosen.size else np.zeros(1)).values))
+            samples.append((chosen, phase.at(local if chosen.size else np.zeros(1), side=side).values))
         values = _merged(samples, times)
         if np.ndim(t) == 0:
             values = {name: value[0] for name, value in values.items()}
