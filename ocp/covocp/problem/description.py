@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices
@@ -45,6 +46,7 @@ def sections(problem: Problem) -> list[Section]:
         _values("parameter", [(q, [number(v) for v in q.value]) for q in problem.parameters], "value"),
         _values("control", [(q, _ranges(q.lower, q.upper)) for q in problem.controls], "bounds"),
         _matrices(problem, written),
+        _data(problem),
         _rates(problem, written),
         _integrals(problem, written),
         _measurements(problem, written),
@@ -75,7 +77,12 @@ class _Written:
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
-        found = formulas(list(expressions.values()), symbols, names)
+        data = problem.declarations.data
+        plain = [ca.MX.sym(entry.name, entry.size) for entry in data]
+        called = list(expressions.values())
+        if data and called:
+            called = ca.graph_substitute(called, [entry.expression for entry in data], plain)
+        found = formulas(called, [*symbols, *plain], [*names, *(entry_names((entry,)) for entry in data)])
         return _Written(entries=dict(zip(expressions, found.entries, strict=True)), definitions=found.definitions)
 
     def __call__(self, kind: str, name: str = "") -> list[str]:
@@ -200,6 +207,17 @@ def _decisions(problem: Problem) -> Section:
 def _integrals(problem: Problem, written: _Written) -> Section:
     rows = [[q.name, q.unit, *written("rate", q.name)] for q in integrals_of(problem.declarations)]
     return _table(["integral", "unit", "of"], rows)
+
+
+def _data(problem: Problem) -> Section:
+    """Data over time: how many values, over which times, in which range."""
+    rows = []
+    for q in problem.declarations.data:
+        times, values = q.course.times, q.course.values
+        knots = f"{q.course.kind}, {times.size} values from {number(times[0])} to {number(times[-1])} s"
+        spans = _ranges(values.min(axis=0), values.max(axis=0))
+        rows += _shortened([[name, q.unit, knots, span] for name, span in zip(entry_names((q,)), spans, strict=True)])
+    return _table(["data", "unit", "over time", "range"], rows)
 
 
 def _unknowns(problem: Problem, written: _Written) -> Section:

@@ -447,6 +447,8 @@ def _intervals(count: int, stats: Mapping[str, Any]) -> str:
     asked, added = stats.get("intervals_asked"), stats.get("nodes_added")
     if asked is None or added is None:
         return _counted(count, "interval")
+    if not any(added):
+        return f"{_counted(asked, 'interval')} asked for, {count} between the instants that are nodes"
     places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
     return f"{_counted(asked, 'interval')}, graded to {count} {places}"
 
