@@ -11,11 +11,11 @@
     print(co.solve(ocp))
 
 To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback), `table` (numbers over
-one to three variables); expressions are CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several methods), `evaluate` (a given control),
-`methods`. To judge a solution: `certify` (is it the global minimum?), `worth` (does the combined design pay?),
-`simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To keep and to fly it:
-`Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`,
-`SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
+one to three variables); expressions are CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several
+methods), `evaluate` (a given control), `methods`. To judge a solution: `certify` (is it the global minimum?), `worth`
+(does the combined design pay?), `simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To
+keep and to fly it: `Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said
+by `ProblemError`, `SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
 
 `help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
 """
