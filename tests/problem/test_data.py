@@ -196,3 +196,20 @@ def test_data_in_a_model_of_the_literature_change_nothing_where_they_are_constan
     running, terminal = model.declarations.cost
     changed = co.Problem.of(replace(model.declarations, cost=(running * one, terminal)))
     assert co.solve(changed, intervals=30, progress=False).cost == pytest.approx(cost, rel=1e-8)
+
+
+@pytest.mark.parametrize("count", [4, 101])
+def test_data_at_the_end_are_those_of_the_duration(count):
+    """min u^2 T + (x - r(T))^2 with x(T) = u T: x(T) = r T / (1 + T)."""
+    times = np.linspace(0.0, 3.0, count)
+    ocp = co.Problem(duration=2.5)
+    r = ocp.data("r", times, times**2)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    wrong = co.Problem.of(ocp.declarations)
+    wrong.minimize(running=u**2, terminal=(x - r) ** 2)
+    refused(wrong.statement, "'time'", "casadi.substitute(data, problem.time")
+    last = ca.substitute(r, ocp.time, ca.MX(ocp.duration))
+    ocp.minimize(running=u**2, terminal=(x - last) ** 2)
+    exact = np.interp(2.5, times, times**2) * 2.5 / 3.5
+    assert co.solve(ocp, intervals=20, progress=False)[x][-1] == pytest.approx(exact, rel=1e-7)

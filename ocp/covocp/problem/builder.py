@@ -454,7 +454,7 @@ class Problem:
                 that are not finite or of another shape, unknown kind.
         """
         self._declare(name, 1)
-        return self._add("data", data_over_time(self._declarations, name, times, values, kind, unit)).expression
+        return self._add("data", data_over_time(self._declarations, name, times, values, kind, unit)).course.expression
 
     @checked(unit=text, relative=truth)
     def measurement(

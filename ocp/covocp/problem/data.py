@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -29,26 +29,27 @@ def data_over_time(
     blocks = later("blocks.tables")  # with scipy, which takes longer to import than all of covocp
     tables = [blocks.table(name, knots, column, kind=kind) for column in columns.T]
     _check_covered(own, name, knots)
-    course = TimeData(name=name, unit=unit, kind=kind, times=np.array(knots), values=columns)
-    function = _looked_up(course)
+    function = _looked_up(name, knots, columns, DEGREES[kind])
     if knots.size - 1 <= blocks.SMALL_CELLS:
         t = ca.SX.sym("t")
         function = ca.Function(_identifier(name), [t], [ca.vertcat(*(entry(t) for entry in tables))])
-    return Data(course=course, function=function, expression=function(own.time), where=caller())
+    expression: Any = function(own.time)
+    course = TimeData(name=name, unit=unit, kind=kind, times=np.array(knots), values=columns, expression=expression)
+    return Data(course=course, function=function, where=caller())
 
 
-def _looked_up(data: TimeData) -> ca.Function:
+def _looked_up(name: str, times: Array, values: Array, degree: int) -> ca.Function:
     """Data as a function that looks its piece up: one call, also where all else is written out in scalars.
 
     Beyond its knots a B-spline is zero: what rounding leads there is taken at the outermost ones.
     """
     from scipy.interpolate import make_interp_spline  # here: importing scipy takes longer than all of covocp
 
-    spline = make_interp_spline(data.times, data.values, k=DEGREES[data.kind])
-    count, first, last = data.values.shape[1], float(data.times[0]), float(data.times[-1])
+    spline = make_interp_spline(times, values, k=degree)
+    count, first, last = values.shape[1], float(times[0]), float(times[-1])
     pieces = ca.Function.bspline("spline", [spline.t.tolist()], spline.c.ravel().tolist(), [spline.k], count)
     t = ca.MX.sym("t")
-    return ca.Function(_identifier(data.name), [t], [pieces(ca.fmin(ca.fmax(t, first), last))], {"never_inline": True})
+    return ca.Function(_identifier(name), [t], [pieces(ca.fmin(ca.fmax(t, first), last))], {"never_inline": True})
 
 
 def used_data(problem: Declarations) -> tuple[TimeData, ...]:

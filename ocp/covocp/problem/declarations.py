@@ -308,11 +308,10 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Data:
-    """Data over time: their numbers, the table of them as a function of the time, and that at the running time."""
+    """Data over time, and the table of them as a function of the time."""
 
     course: TimeData
     function: ca.Function
-    expression: ca.MX
     where: str
 
     __repr__ = short_repr
@@ -325,7 +324,7 @@ class Data:
     @property
     def size(self) -> int:
         """Number of entries."""
-        return int(self.expression.numel())
+        return int(self.course.values.shape[1])
 
     @property
     def unit(self) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices
@@ -16,6 +15,7 @@ from covocp.problem.decisions import decisions_of
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entries_of, entry_names, half_names
+from covocp.statement.time_data import in_words
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
@@ -78,10 +78,7 @@ class _Written:
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
         data = problem.declarations.data
-        plain = [ca.MX.sym(entry.name, entry.size) for entry in data]
-        called = list(expressions.values())
-        if data and called:
-            called = ca.graph_substitute(called, [entry.expression for entry in data], plain)
+        called, plain = in_words((entry.course for entry in data), list(expressions.values()))
         found = formulas(called, [*symbols, *plain], [*names, *(entry_names((entry,)) for entry in data)])
         return _Written(entries=dict(zip(expressions, found.entries, strict=True)), definitions=found.definitions)
 

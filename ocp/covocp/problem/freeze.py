@@ -171,7 +171,8 @@ def _check_symbols(problem: Declarations) -> None:
                 f"The terminal cost contains '{entry.name}'.",
                 expected="states, matrix states, parameters and the duration",
                 received=str(terminal_cost)[:200],
-                remedy="use Problem.duration for the terminal time; controls belong into the running cost",
+                remedy="use Problem.duration for the terminal time, of data casadi.substitute(data, problem.time, "
+                "casadi.MX(problem.duration)); controls belong into the running cost",
             )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
@@ -18,6 +21,7 @@ class TimeData:
     """Values over time, interpolated between.
 
     times: rising, shape (K,) [s]; values: shape (K, m); kind: "linear" or "cubic".
+    expression: their value at the running time in the user's expressions, shape (m, 1).
     """
 
     name: str
@@ -25,6 +29,7 @@ class TimeData:
     kind: str
     times: Array
     values: Array
+    expression: ca.MX
 
     __repr__ = short_repr
 
@@ -40,6 +45,15 @@ class TimeData:
         line = (1 - share) * self.values[:-2] + share * self.values[2:]
         bent = np.abs(self.values[1:-1] - line) > STRAIGHT * np.ptp(self.values, axis=0)
         return np.asarray(self.times[1:-1][bent.any(axis=1)])
+
+
+def in_words(data: Iterable[TimeData], expressions: Sequence[ca.MX]) -> tuple[list[Any], list[Any]]:
+    """Expressions with symbols of their names in place of data, and these symbols."""
+    known = list(data)
+    symbols = [ca.MX.sym(entry.name, entry.values.shape[1]) for entry in known]
+    if not known or not expressions:
+        return list(expressions), symbols
+    return list(ca.graph_substitute(list(expressions), [entry.expression for entry in known], symbols)), symbols
 
 
 def kinks(data: TimeData, duration: float) -> tuple[float, ...]:
