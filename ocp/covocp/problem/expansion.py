@@ -53,12 +53,12 @@ def _drift(problem: Declarations, at: Moved, rates: Expr) -> Any:
 
 
 def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
-    """M and U of all measurements."""
-    if not problem.measurements:
+    """M and U of the continuous measurements."""
+    if not problem.continuous:
         return ca.MX(0, size), ca.MX(0, 0)
-    value = ca.vertcat(*(m.expression for m in problem.measurements))
+    value = ca.vertcat(*(m.expression for m in problem.continuous))
     at = moved(problem.augmented)
-    return at.at_rest(_slope(at.write(value), at.by)), ca.diagcat(*(m.noise for m in problem.measurements))
+    return at.at_rest(_slope(at.write(value), at.by)), ca.diagcat(*(m.noise for m in problem.continuous))
 
 
 def _slope(expression: Expr, symbols: list[Any]) -> Any:

@@ -45,7 +45,7 @@ def stiffness(statement: Statement, options: Options, parameters: Array) -> Stif
             slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
             matrices = max(matrices, _largest(_eigenvalues(slope)))
             break
-        if block.estimation and isinstance(options.grid, Graded):
+        if block.estimation and isinstance(options.grid, Graded) and options.grid.stiffness is not None:
             matrices = max(matrices, options.grid.stiffness / longest)
             continue
         drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))
