@@ -37,10 +37,11 @@ from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statemen
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import best_of, cost_of, from_starts
+from covocp.solving.attempts import best_of, cost_of, counted, from_starts, with_stats
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
+from covocp.solving.refining import FIRST, first_options, method_tolerance, refine_mesh, solved_first
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -58,6 +59,8 @@ ESCAPES = (1.0, -1.0)
 STARTS, MOST_STARTS = 8, 10**6
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
+# Control intervals where none are asked for.
+INTERVALS = 100
 NOMINALS = ("combined", "deterministic")
 # Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
 # so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
@@ -98,11 +101,11 @@ class Solver:
     Args:
         problem: what to solve.
         method: a name in `methods()`.
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, and 24 of the first mesh with `refine`.
         nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
             the cost without noise (quadratic synthesis), filter and feedback around it.
-        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`) and
-            of the method.
+        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`,
+            `refine`) and of the method.
 
     Raises:
         ProblemError: unknown method or option, or a statement that is wrong.
@@ -114,7 +117,7 @@ class Solver:
         problem: Problem,
         method: str = "ipopt",
         *,
-        intervals: int = 100,
+        intervals: int | None = None,
         nominal: str = "combined",
         **options: Any,
     ) -> None:
@@ -143,19 +146,27 @@ class Solver:
         self.nominal = nominal
         self.statement: Statement = problem.statement()
         self._problem, self._classical = problem, cast("Solver | None", None)
-        asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        refine = options.get("refine")
+        count = INTERVALS if refine is None else FIRST
+        given = {k: v for k, v in options.items() if k in known}
+        asked = Options(intervals=count if intervals is None else intervals, **given)
+        if refine is not None:
+            asked = self._refinable(asked)
         best = with_best_gain_problems(problem)
-        mesh = {field.name: getattr(asked, field.name) for field in fields(Options)}
+        mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
-        self._own_steps = self._options.substeps == "auto"
+        self._own_steps = self._options.substeps == "auto" and refine is None
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
+        if asked.refine is not None:
+            self._own = method_tolerance(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
+        self._first = self._options, self._prepared
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
@@ -190,6 +201,8 @@ class Solver:
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
+        if self._options.refine is not None:
+            self._keep(*self._first)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
         first = self._best_gain(parameters, guess)
@@ -208,11 +221,12 @@ class Solver:
                         outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start)
                 outcome = self._with_finer_steps(outcome, values, reporter)
+                outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
-            outcome = _with_stats(outcome, **gain_counts(self._problem))
+            outcome = with_stats(outcome, **gain_counts(self._problem))
             return self._beside_classical(self._finish(outcome, allow_failure), values)
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
@@ -254,7 +268,8 @@ class Solver:
             return solution
         try:
             if self._classical is None:
-                mesh = {field.name: getattr(self._options, field.name) for field in fields(Options)}
+                names = [field.name for field in fields(Options) if field.name != "refine"]
+                mesh = {name: getattr(self._options, name) for name in names}
                 self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
             with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
@@ -294,7 +309,7 @@ class Solver:
                 raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
-        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **_counted(solution, outcome)})
+        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
 
     def _solve_values(self, values: Array) -> float | None:
         """Cost of the classical design for stacked parameters; None where it was not found."""
@@ -348,7 +363,7 @@ class Solver:
         warn_user(
             "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
-        return _with_stats(min(better, key=cost_of), left_saddle=True)
+        return with_stats(min(better, key=cost_of), left_saddle=True)
 
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
@@ -377,16 +392,53 @@ class Solver:
                 break
             if not again.converged:
                 break
-            outcome = _with_stats(again, **{**outcome.stats, **again.stats, **_counted(outcome, again)})
+            outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
             self._keep(finer, prepared)
         return outcome
+
+    def _refinable(self, options: Options) -> Options:
+        """The options of the first mesh.
+
+        Raises:
+            ProblemError: the nominal is another problem's, whose cost is not the one that would be measured.
+        """
+        if self.nominal != "combined":
+            raise ProblemError(
+                "The option 'refine' does not go with nominal='deterministic'.",
+                expected="one of both: the error is that of the cost that is minimised",
+                received=f"refine={options.refine!r}, nominal={self.nominal!r}",
+                remedy="leave one of them out, or give a grid=",
+            )
+        return first_options(self.statement, options, points=self.method == "ipopt")
+
+    def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """The outcome on a mesh whose error is small enough, where that is asked for."""
+        options = self._options
+        if options.refine is None or reporter.stop:
+            return outcome
+
+        def cold(options: Options) -> tuple[Prepared, Outcome]:
+            prepared = cast(Prepared, self._prepare(self._solved, options, **self._own))
+            return prepared, from_starts(prepared, values, make_guesses(self._solved, prepared.mesh, values, None), reporter)[0]
+
+        def warm(options: Options, start: Outcome) -> tuple[Prepared, Outcome]:
+            prepared = cast(Prepared, self._prepare(self._solved, options, **self._own))
+            guess = make_guess(self._solved, prepared.mesh, values, Solution.of(start, self.method))
+            return prepared, prepared.solve(values, guess, reporter)
+
+        first = solved_first(options, self._prepared, outcome, self._solved, values, cold)
+        if not first.outcome.converged:
+            return first.outcome
+        found = refine_mesh(first, self._solved, warm, reporter)
+        self._keep(found.options, found.prepared)
+        return found.outcome
 
     def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
         if impossible:
             outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(_with_stats(outcome, **self._options.grading), self.method)
+        solution = Solution.of(with_stats(outcome, **self._options.grading), self.method)
         if not outcome.converged:
             if allow_failure:
                 return solution
@@ -428,17 +480,6 @@ def is_roundoff(cost: float, statement: Statement, options: Options, parameters:
     return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
 
 
-def _counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
-    """Iterations and times of two runs together."""
-    names = ("iterations", "build_seconds", "solve_seconds")
-    both = [name for name in names if name in first.stats and name in second.stats]
-    return {name: first.stats[name] + second.stats[name] for name in both}
-
-
-def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
-    return replace(outcome, stats={**outcome.stats, **stats})
-
-
 def _noted(solution: Solution, **stats: Any) -> Solution:
     return replace(solution, stats={**solution.stats, **stats})
 
@@ -449,7 +490,7 @@ def solve(
     problem: Problem,
     method: str = "ipopt",
     *,
-    intervals: int = 100,
+    intervals: int | None = None,
     guess: Given = None,
     nominal: str = "combined",
     progress: bool = True,
@@ -462,7 +503,7 @@ def solve(
     Args:
         problem: what to solve.
         method: a name in `methods()`.
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, and 24 of the first mesh with `refine`.
         guess: where to start; see `Solver.solve`.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
         progress: whether to show the iterations on a terminal.
