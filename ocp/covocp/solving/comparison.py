@@ -172,7 +172,7 @@ def compare(
         problem: what to solve.
         methods: names of methods, or (label, method, options) for a formulation of its own, such as
             ("states", "ipopt", {"covariances": "states"}).
-        intervals: number of control intervals; None: 100, and 24 of the first mesh with `refine`.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         guess: where all runs start; see `Solver.solve`.
         progress: whether to show the iterations on a terminal.
         method_options: options by method.

@@ -27,36 +27,43 @@ from covocp.transcription.grading import graded
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Graded, Options
 from covocp.transcription.remeshing import divided, jumps_of, remeshed
+from covocp.transcription.stiffness import nominal_along, stiffness
 
 # Intervals of the first mesh where none are given, and how often they are doubled where it is not solved.
-FIRST, DOUBLED = 24, 2
+FIRST, DOUBLED = 16, 2
 # Most meshes, and most intervals of one.
 MOST_MESHES, MOST_INTERVALS = 15, 3000
 # What the error that is left is, at most, in the change by a finer mesh: a jump of a control whose ramp is half as
 # long costs a quarter. Where errors of both signs cancel, this share of their sum counts.
 LEFT, CANCELLED = 4 / 3, 0.25
-# The next mesh aims at this share of what is allowed.
-AIMED = 0.3
+# The next mesh aims at this share of what is allowed, and at no less than this share of the error of the one before.
+AIMED, BOLD = 0.3, 1e-3
 # Meshes without a better one among them, after which a tolerance counts as out of reach, and how much better.
 PATIENCE, BETTER = 3, 0.7
-# Tolerance of the method beside that of the mesh, where none is given, and its limits.
-SOLVED, LOOSEST, STRICTEST = 1e-2, 1e-7, 1e-11
+# Tolerance of the method beside that of the mesh, where none is given, and its limits; times its tolerance the error
+# that no comparison of meshes shows. The gradient method has one of its own for conditions, which costs are linear in.
+SOLVED, LOOSEST, STRICTEST, UNSEEN = 1e-2, 1e-7, 1e-11, 10.0
+VIOLATION = "violation_tolerance"
+# Length of an interval in times of the nominal above which the first mesh is graded at its ends, and in which ratio.
+LONG, LAYER_RATIO = 30.0, 2.0
 # Points of an interval at which limits along the path are imposed: with one a control may swing from node to node.
 POINTS = 2
 # Power of the length with which the error of an interval falls: of controls that are linear, or constant over it.
 ORDERS = {"linear": 5, "constant": 3}
 
+Cold = Callable[[Options], tuple[Prepared, Outcome]]
 Run = Callable[[Options, Outcome], tuple[Prepared, Outcome]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured:
-    """A mesh with its solution and the estimated relative error of its cost."""
+    """A mesh with its solution, the estimated relative error of its cost, and what of it no comparison shows."""
 
     options: Options
     prepared: Prepared
     outcome: Outcome
     error: float
+    least: float
 
     __repr__ = short_repr
 
@@ -73,44 +80,85 @@ def first_options(statement: Statement, options: Options, points: bool) -> Optio
     return options
 
 
-def method_tolerance(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[str, Any]:
-    """The method's own options with a tolerance that goes with that of the mesh, where none is given.
+def with_layers(statement: Statement, options: Options, parameters: Array) -> Options:
+    """The options with nodes closer and closer to both ends, where the nominal is fast beside an interval.
+
+    What it does over a long time it does at the ends, and begins there within its own time.
+
+    Args:
+        statement: the problem.
+        options: of the first mesh; a grid that was given stays as it is.
+        parameters: of the statement.
+    """
+    if not (options.grid is None or isinstance(options.grid, Graded)):
+        return options
+    fast = stiffness(statement, options, parameters).nominal
+    if fast <= LONG:
+        return options
+    nodes = options.nodes()
+    longest = float(np.diff(nodes).max())
+    layer = longest / fast * LAYER_RATIO ** np.arange(np.ceil(np.log(fast) / np.log(LAYER_RATIO)))
+    whole = completed(statement, np.union1d(np.unique(nodes), np.concatenate([layer, 1.0 - layer])))
+    known = options.grid.stiffness if isinstance(options.grid, Graded) else None
+    return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known))
+
+
+def method_options_for(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[str, Any]:
+    """The method's own options with tolerances that go with that of the mesh, where none are given.
 
     Args:
         known: options of the method, with their defaults.
         own: those that are given.
         refine: relative error of the cost that is allowed.
     """
-    if "tolerance" not in known or own.get("tolerance") is not None or own.get("plugin", "ipopt") != "ipopt":
+    share = float(np.clip(SOLVED * refine, STRICTEST, LOOSEST))
+    if VIOLATION in known:
+        return {VIOLATION: share, **own}
+    if own.get("plugin", "ipopt") != "ipopt":
         return own
-    return {**own, "tolerance": float(np.clip(SOLVED * refine, STRICTEST, LOOSEST))}
+    result = dict(own) if own.get("tolerance") is not None else {**own, "tolerance": share}
+    given = dict(own.get("plugin_options") or {})
+    # bounds that are passed by a share of themselves make the cost less on every mesh
+    inner = {"bound_relax_factor": min(1e-8, SOLVED * refine), **given.get("ipopt", {})}
+    return {**result, "plugin_options": {**given, "ipopt": inner}}
 
 
-def solved_first(
-    options: Options,
-    prepared: Prepared,
-    outcome: Outcome,
-    statement: Statement,
-    parameters: Array,
-    cold: Callable[[Options], tuple[Prepared, Outcome]],
-) -> Measured:
-    """The first mesh; one with more intervals where it was too coarse to be solved.
+def unseen(own: dict[str, Any]) -> float:
+    """What the tolerances of the method leave of the cost on every mesh alike, relative."""
+    return UNSEEN * float(own.get(VIOLATION) or own.get("tolerance") or LOOSEST)
+
+
+def refined(first: Measured, statement: Statement, parameters: Array, cold: Cold, run: Run, stop: Progress) -> Measured:
+    """The mesh whose error is small enough, from a first one; from one with more intervals where that is too coarse.
 
     Args:
-        options, prepared, outcome: of the mesh that was tried first.
+        first: the first mesh and what came of it.
         statement: the problem.
         parameters: of the statement.
         cold: solves on a mesh from the problem's own start.
+        run: solves on a mesh from an outcome on another.
+        stop: the progress, which a Ctrl-C stops.
+
+    Returns:
+        As `refine_mesh`; where nothing was solved, or nothing measured, an outcome that did not converge.
     """
-    tried = Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan)
-    for doubled in range(1, DOUBLED + 1):
-        if tried.outcome.converged or isinstance(options.grid, np.ndarray):
-            break
-        more = replace(options, intervals=2**doubled * options.intervals, grid=None)
-        more = graded(statement, more, parameters)
-        prepared, outcome = cold(more)
-        tried = Measured(options=more, prepared=prepared, outcome=outcome, error=np.nan)
-    return tried
+    found, tried = first, first
+    for doubled in range(DOUBLED + 1):
+        if doubled:
+            if stop.stop or not (first.options.grid is None or isinstance(first.options.grid, Graded)):
+                break
+            options = replace(first.options, intervals=2**doubled * first.options.intervals, grid=None)
+            options = with_layers(statement, graded(statement, options, parameters), parameters)
+            try:
+                prepared, outcome = cold(options)
+            except CovocpError:  # what the first one lacked is told
+                continue
+            tried = Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan, least=first.least)
+        if tried.outcome.converged:
+            found = refine_mesh(tried, statement, run, stop)
+            if found.outcome.converged:
+                break
+    return found
 
 
 def refine_mesh(first: Measured, statement: Statement, run: Run, reporter: Progress) -> Measured:
@@ -137,7 +185,8 @@ def refine_mesh(first: Measured, statement: Statement, run: Run, reporter: Progr
             reason = f"the finer mesh that tells the error of {current.intervals} intervals was not solved ({why})"
             break
         errors = local_errors(current.outcome.extremal, finer.outcome.extremal)
-        current = replace(current, error=_error(current.outcome, finer.outcome, errors))
+        error = max(current.least, _error(current.outcome, finer.outcome, errors))
+        current = replace(current, error=error)
         done.append(current)
         if current.error <= allowed:
             break
@@ -158,7 +207,9 @@ def _solved(
 ) -> tuple[Measured | None, str]:
     """A solution on other nodes, not measured; None and the reason where there is none."""
     whole = completed(statement, nodes)
-    options = replace(start.options, grid=Graded(nodes=whole, asked=whole.size - 1))
+    known = start.outcome.extremal
+    stiff = nominal_along(statement, whole, known.columns(), known.mesh.nodes, known.trajectory.duration)
+    options = replace(start.options, grid=Graded(nodes=whole, asked=whole.size - 1, nominal=stiff))
     try:
         prepared, outcome = run(options, start.outcome)
     except CovocpError as error:
@@ -166,7 +217,7 @@ def _solved(
     runs.append(outcome)
     if not outcome.converged:
         return None, outcome.message
-    return Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan), ""
+    return Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan, least=start.least), ""
 
 
 def _finer_nodes(measured: Measured) -> Array:
@@ -191,7 +242,7 @@ def _next_nodes(statement: Statement, coarse: Measured, fine: Measured, errors: 
         np.unique(mesh.nodes),
         errors,
         ORDERS[mesh.control],
-        AIMED * allowed * cost,
+        max(AIMED * allowed, BOLD * coarse.error) * cost,
         _jumps(found),
         np.array(statement.instants),
     )
@@ -211,6 +262,8 @@ def _given_up(done: list[Measured]) -> str:
     """Why no further mesh is tried; empty where one is."""
     if len(done) >= MOST_MESHES:
         return f"{MOST_MESHES} meshes were tried"
+    if done[-1].error <= done[-1].least:
+        return "the rest is what the tolerance of the method leaves on every mesh"
     before = [entry.error for entry in done[:-PATIENCE]]
     if before and min(entry.error for entry in done[-PATIENCE:]) > BETTER * min(before):
         return f"{PATIENCE} further meshes were no better: this is what the tolerance of the method and roundoff leave"

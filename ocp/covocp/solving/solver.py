@@ -41,7 +41,7 @@ from covocp.solving.attempts import best_of, cost_of, counted, from_starts, with
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
-from covocp.solving.refining import FIRST, first_options, method_tolerance, refine_mesh, solved_first
+from covocp.solving.refining import FIRST, Measured, first_options, method_options_for, refined, unseen, with_layers
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -101,7 +101,7 @@ class Solver:
     Args:
         problem: what to solve.
         method: a name in `methods()`.
-        intervals: number of control intervals; None: 100, and 24 of the first mesh with `refine`.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
             the cost without noise (quadratic synthesis), filter and feedback around it.
         options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`,
@@ -156,6 +156,8 @@ class Solver:
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
+        if refine is not None:
+            self._options = with_layers(self.statement, self._options, self.statement.values)
         self._own_steps = self._options.substeps == "auto" and refine is None
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
@@ -164,7 +166,7 @@ class Solver:
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
         if asked.refine is not None:
-            self._own = method_tolerance(method_options(method), self._own, asked.refine)
+            self._own = method_options_for(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
         self._first = self._options, self._prepared
         mention_forgotten(problem)
@@ -417,19 +419,20 @@ class Solver:
         if options.refine is None or reporter.stop:
             return outcome
 
+        def prepared(options: Options) -> Prepared:
+            return cast(Prepared, self._prepare(self._solved, options, **self._own))
+
         def cold(options: Options) -> tuple[Prepared, Outcome]:
-            prepared = cast(Prepared, self._prepare(self._solved, options, **self._own))
-            return prepared, from_starts(prepared, values, make_guesses(self._solved, prepared.mesh, values, None), reporter)[0]
+            made = prepared(options)
+            return made, from_starts(made, values, make_guesses(self._solved, made.mesh, values, None), reporter)[0]
 
         def warm(options: Options, start: Outcome) -> tuple[Prepared, Outcome]:
-            prepared = cast(Prepared, self._prepare(self._solved, options, **self._own))
-            guess = make_guess(self._solved, prepared.mesh, values, Solution.of(start, self.method))
-            return prepared, prepared.solve(values, guess, reporter)
+            made = prepared(options)
+            guess = make_guess(self._solved, made.mesh, values, Solution.of(start, self.method))
+            return made, made.solve(values, guess, reporter)
 
-        first = solved_first(options, self._prepared, outcome, self._solved, values, cold)
-        if not first.outcome.converged:
-            return first.outcome
-        found = refine_mesh(first, self._solved, warm, reporter)
+        first = Measured(options=options, prepared=self._prepared, outcome=outcome, error=np.nan, least=unseen(self._own))
+        found = refined(first, self._solved, values, cold, warm, reporter)
         self._keep(found.options, found.prepared)
         return found.outcome
 
@@ -503,7 +506,7 @@ def solve(
     Args:
         problem: what to solve.
         method: a name in `methods()`.
-        intervals: number of control intervals; None: 100, and 24 of the first mesh with `refine`.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         guess: where to start; see `Solver.solve`.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
         progress: whether to show the iterations on a terminal.

@@ -43,13 +43,14 @@ class Graded:
 
     nodes: of t/T, twice where a measurement is taken; asked: intervals that the user asked for; added: nodes added at
         the start and at the end; stiffness: largest h times rate of the filter on its intervals, None where it was not
-        looked at.
+        looked at; nominal: that of the nominal along a solution, None where only its start is known.
     """
 
     nodes: Array
     asked: int
     added: tuple[int, int] = (0, 0)
     stiffness: float | None = None
+    nominal: Stiffness | None = None
 
     __repr__ = short_repr
 
