@@ -1,6 +1,6 @@
 """Ten plain problems without covariances whose optima are known in closed form, or by a quadrature.
 
-Each is a function that states the problem for covocp, and an optimum computed apart from any solver; `PLAIN` lists them.
+Each is a function that states the problem for covocp, and an optimum that no solver computed; `PLAIN` lists them.
 
     layers          x' = u, int (x^2 + eps^2 u^2)/2, eps = 0.01: boundary layers at both ends
     hypersensitive  x' = -x^3 + u, int (x^2 + u^2)/2 over 10 000 s (Rao and Mease 2000): H = 0 along the long way

@@ -41,7 +41,7 @@ def local_errors(coarse: Extremal, fine: Extremal) -> Array:
 def _spread(result: Array, ends: Array, places: Array, values: Array) -> None:
     """Add values at some places to the intervals where they are; at a node half of it to each side."""
     for side in ("left", "right"):
-        k = np.clip(np.searchsorted(ends, places, side=side) - 1, 0, result.size - 1)  # type: ignore[call-overload]
+        k = np.clip(np.searchsorted(ends, places, side=side) - 1, 0, result.size - 1)
         np.add.at(result, k, 0.5 * values)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import OutsideDomainError
+from covocp.base.errors import Interrupted, OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
@@ -106,3 +106,14 @@ def counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
 def with_stats(outcome: Outcome, **stats: Any) -> Outcome:
     """The outcome with more that is told of it."""
     return replace(outcome, stats={**outcome.stats, **stats})
+
+
+def interrupted(solution: Solution) -> Interrupted:
+    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
+    starts = solution.stats.get("starts")
+    if starts is None:
+        found = "the last iterate" if not solution.converged else "a solution"
+    else:
+        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
+        found += "" if solution.converged else ", of which none converged"
+    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import CovocpError, warn_user
+from covocp.base.errors import CovocpError, ProblemError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -21,7 +21,9 @@ from covocp.extremal.extremal import Extremal, Outcome, Prepared
 from covocp.extremal.local_errors import local_errors
 from covocp.extremal.mesh_error import NO_COST
 from covocp.extremal.path_limits import limited_along
-from covocp.solving.attempts import cost_of, counted, with_stats
+from covocp.solution.solution import Solution
+from covocp.solving.attempts import cost_of, from_starts
+from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import completed
@@ -51,19 +53,53 @@ POINTS = 2
 # Power of the length with which the error of an interval falls: of controls that are linear, or constant over it.
 ORDERS = {"linear": 5, "constant": 3}
 
-Cold = Callable[[Options], tuple[Prepared, Outcome]]
-Run = Callable[[Options, Outcome], tuple[Prepared, Outcome]]
+INTERRUPTED = "interrupted"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """How a problem is solved on any mesh.
+
+    Args:
+        statement: the problem.
+        parameters: of the statement.
+        method: its name.
+        prepare: makes the method ready for the options of a mesh.
+        progress: of the iterations; a Ctrl-C stops it.
+    """
+
+    statement: Statement
+    parameters: Array
+    method: str
+    prepare: Callable[[Options], Any]
+    progress: Progress
+
+    __repr__ = short_repr
+
+    def cold(self, options: Options, least: float) -> Measured:
+        """From the problem's own start."""
+        prepared: Prepared = self.prepare(options)
+        guesses = make_guesses(self.statement, prepared.mesh, self.parameters, None)
+        outcome, _ = from_starts(prepared, self.parameters, guesses, self.progress)
+        return Measured(options, prepared, outcome, least)
+
+    def warm(self, options: Options, start: Measured) -> Measured:
+        """From a solution on another mesh."""
+        prepared: Prepared = self.prepare(options)
+        solution = Solution.of(start.outcome, self.method)
+        guess = make_guess(self.statement, prepared.mesh, self.parameters, solution)
+        return Measured(options, prepared, prepared.solve(self.parameters, guess, self.progress), start.least)
+
+
+@dataclass(frozen=True, eq=False)
 class Measured:
     """A mesh with its solution, the estimated relative error of its cost, and what of it no comparison shows."""
 
     options: Options
     prepared: Prepared
     outcome: Outcome
-    error: float
     least: float
+    error: float = np.nan
 
     __repr__ = short_repr
 
@@ -73,8 +109,19 @@ class Measured:
         return int(np.unique(self.prepared.mesh.nodes).size - 1)
 
 
-def first_options(statement: Statement, options: Options, points: bool) -> Options:
-    """The options of the first mesh: limits are imposed at the middles of the intervals too, where that is possible."""
+def first_options(statement: Statement, options: Options, nominal: str, points: bool) -> Options:
+    """The options of the first mesh: limits are imposed at the middles of the intervals too, where that is possible.
+
+    Raises:
+        ProblemError: the nominal is another problem's, whose cost is not the one that would be measured.
+    """
+    if nominal != "combined":
+        raise ProblemError(
+            "The option 'refine' does not go with nominal='deterministic'.",
+            expected="one of both: the error is that of the cost that is minimised",
+            received=f"refine={options.refine!r}, nominal={nominal!r}",
+            remedy="leave one of them out, or give a grid=",
+        )
     if points and options.points == "auto" and options.substeps == "auto" and limited_along(statement):
         return replace(options, points=POINTS)
     return options
@@ -103,7 +150,7 @@ def with_layers(statement: Statement, options: Options, parameters: Array) -> Op
     return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known))
 
 
-def method_options_for(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[str, Any]:
+def adapted(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[str, Any]:
     """The method's own options with tolerances that go with that of the mesh, where none are given.
 
     Args:
@@ -128,96 +175,82 @@ def unseen(own: dict[str, Any]) -> float:
     return UNSEEN * float(own.get(VIOLATION) or own.get("tolerance") or LOOSEST)
 
 
-def refined(first: Measured, statement: Statement, parameters: Array, cold: Cold, run: Run, stop: Progress) -> Measured:
+def refined(first: Measured, runs: Runs) -> Measured:
     """The mesh whose error is small enough, from a first one; from one with more intervals where that is too coarse.
 
     Args:
         first: the first mesh and what came of it.
-        statement: the problem.
-        parameters: of the statement.
-        cold: solves on a mesh from the problem's own start.
-        run: solves on a mesh from an outcome on another.
-        stop: the progress, which a Ctrl-C stops.
+        runs: how the problem is solved on others.
 
     Returns:
         As `refine_mesh`; where nothing was solved, or nothing measured, an outcome that did not converge.
     """
     found, tried = first, first
+    given = not (first.options.grid is None or isinstance(first.options.grid, Graded))
     for doubled in range(DOUBLED + 1):
         if doubled:
-            if stop.stop or not (first.options.grid is None or isinstance(first.options.grid, Graded)):
+            if runs.progress.stop or given:
                 break
             options = replace(first.options, intervals=2**doubled * first.options.intervals, grid=None)
-            options = with_layers(statement, graded(statement, options, parameters), parameters)
+            options = graded(runs.statement, options, runs.parameters)
             try:
-                prepared, outcome = cold(options)
+                tried = runs.cold(with_layers(runs.statement, options, runs.parameters), first.least)
             except CovocpError:  # what the first one lacked is told
                 continue
-            tried = Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan, least=first.least)
         if tried.outcome.converged:
-            found = refine_mesh(tried, statement, run, stop)
+            found = refine_mesh(tried, runs)
             if found.outcome.converged:
                 break
     return found
 
 
-def refine_mesh(first: Measured, statement: Statement, run: Run, reporter: Progress) -> Measured:
+def refine_mesh(first: Measured, runs: Runs) -> Measured:
     """Meshes made from the local errors of the one before, until the error of one is measured to be small enough.
 
     Args:
         first: the first mesh with a solution that converged; its error is not known.
-        statement: the problem.
-        run: solves on a mesh, from an outcome on another.
-        reporter: of the progress.
+        runs: how the problem is solved on others.
 
     Returns:
         The first mesh whose error is allowed; where none is, the best (a warning says what was reached and why). Among
         its counts are all meshes and their errors.
     """
-    allowed = first.options.refine
-    assert allowed is not None
+    allowed = float(first.options.refine or 0.0)
     done: list[Measured] = []
-    runs = [first.outcome]
+    made = [first.outcome]
     current, reason = first, ""
-    while not reporter.stop:
-        finer, why = _solved(statement, _finer_nodes(current), current, run, runs)
+    while not runs.progress.stop:
+        finer, why = _solved(_finer_nodes(current), current, runs, made)
         if finer is None:
             reason = f"the finer mesh that tells the error of {current.intervals} intervals was not solved ({why})"
             break
         errors = local_errors(current.outcome.extremal, finer.outcome.extremal)
-        error = max(current.least, _error(current.outcome, finer.outcome, errors))
-        current = replace(current, error=error)
+        current = replace(current, error=max(current.least, _error(current.outcome, finer.outcome, errors)))
         done.append(current)
-        if current.error <= allowed:
+        reason = "" if current.error <= allowed else _given_up(done)
+        if current.error <= allowed or reason:
             break
-        reason = _given_up(done)
-        if reason:
-            break
-        nodes = _next_nodes(statement, current, finer, errors, allowed)
+        nodes = _next_nodes(runs.statement, current, finer, errors, allowed)
         if nodes.size > MOST_INTERVALS + 1:
             reason = f"the next mesh would have more than {MOST_INTERVALS} intervals"
             break
-        following, _ = _solved(statement, nodes, finer, run, runs)
+        following, _ = _solved(nodes, finer, runs, made)
         current = finer if following is None else following
-    return _best(done, first, runs, reason if not reporter.stop else "interrupted")
+    return _best(done, first, made, INTERRUPTED if runs.progress.stop else reason)
 
 
-def _solved(
-    statement: Statement, nodes: Array, start: Measured, run: Run, runs: list[Outcome]
-) -> tuple[Measured | None, str]:
+def _solved(nodes: Array, start: Measured, runs: Runs, made: list[Outcome]) -> tuple[Measured | None, str]:
     """A solution on other nodes, not measured; None and the reason where there is none."""
-    whole = completed(statement, nodes)
+    whole = completed(runs.statement, nodes)
     known = start.outcome.extremal
-    stiff = nominal_along(statement, whole, known.columns(), known.mesh.nodes, known.trajectory.duration)
+    stiff = nominal_along(runs.statement, whole, known.columns(), known.mesh.nodes, known.trajectory.duration)
     options = replace(start.options, grid=Graded(nodes=whole, asked=whole.size - 1, nominal=stiff))
     try:
-        prepared, outcome = run(options, start.outcome)
+        found = runs.warm(options, start)
     except CovocpError as error:
         return None, str(error).partition("\n")[0]
-    runs.append(outcome)
-    if not outcome.converged:
-        return None, outcome.message
-    return Measured(options=options, prepared=prepared, outcome=outcome, error=np.nan, least=start.least), ""
+    made.append(found.outcome)
+    return (found, "") if found.outcome.converged else (None, found.outcome.message)
 
 
 def _finer_nodes(measured: Measured) -> Array:
@@ -270,17 +303,16 @@ def _given_up(done: list[Measured]) -> str:
     return ""
 
 
-def _best(done: list[Measured], first: Measured, runs: list[Outcome], reason: str) -> Measured:
+def _best(done: list[Measured], first: Measured, made: list[Outcome], reason: str) -> Measured:
     """The mesh to return, with the counts of all runs."""
-    allowed = first.options.refine
-    assert allowed is not None
+    allowed = float(first.options.refine or 0.0)
     best = min(done, key=lambda entry: entry.error) if done else first
     if best.error <= allowed:
         reason = ""
     counts: dict[str, Any] = dict(best.outcome.stats)
     for name in ("iterations", "build_seconds", "solve_seconds"):
-        if all(name in run.stats for run in runs):
-            counts[name] = sum(run.stats[name] for run in runs)
+        if all(name in run.stats for run in made):
+            counts[name] = sum(run.stats[name] for run in made)
     counts |= {
         "refine": allowed,
         "mesh_intervals": tuple(entry.intervals for entry in done),
@@ -288,10 +320,13 @@ def _best(done: list[Measured], first: Measured, runs: list[Outcome], reason: st
     }
     outcome = replace(best.outcome, stats=counts)
     if not done:
-        return replace(best, outcome=replace(outcome, converged=False, message=f"the error of no mesh is known: {reason}"))
-    if reason:
+        return replace(
+            best, outcome=replace(outcome, converged=False, message=f"the error of no mesh is known: {reason}")
+        )
+    if reason and reason != INTERRUPTED:
         warn_user(
-            f"The error asked for was not reached: refine={allowed:.3g} was asked, the cost on {best.intervals} intervals "
-            f"is off by about {best.error:.2g} (relative), measured on the best of {len(done)} meshes; {reason}."
+            f"The error asked for was not reached: refine={allowed:.3g} was asked, the cost on {best.intervals} "
+            f"intervals is off by about {best.error:.2g} (relative), measured on the best of {len(done)} meshes; "
+            f"{reason}."
         )
     return replace(best, outcome=outcome)

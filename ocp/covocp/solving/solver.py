@@ -6,6 +6,7 @@ import importlib
 import inspect
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -37,11 +38,11 @@ from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statemen
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import best_of, cost_of, counted, from_starts, with_stats
+from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
-from covocp.solving.refining import FIRST, Measured, first_options, method_options_for, refined, unseen, with_layers
+from covocp.solving.refining import FIRST, Measured, Runs, adapted, first_options, refined, unseen, with_layers
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -151,7 +152,7 @@ class Solver:
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
-            asked = self._refinable(asked)
+            asked = first_options(self.statement, asked, nominal, points=method == "ipopt")
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
@@ -166,7 +167,7 @@ class Solver:
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
         if asked.refine is not None:
-            self._own = method_options_for(method_options(method), self._own, asked.refine)
+            self._own = adapted(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
         self._first = self._options, self._prepared
         mention_forgotten(problem)
@@ -398,41 +399,13 @@ class Solver:
             self._keep(finer, prepared)
         return outcome
 
-    def _refinable(self, options: Options) -> Options:
-        """The options of the first mesh.
-
-        Raises:
-            ProblemError: the nominal is another problem's, whose cost is not the one that would be measured.
-        """
-        if self.nominal != "combined":
-            raise ProblemError(
-                "The option 'refine' does not go with nominal='deterministic'.",
-                expected="one of both: the error is that of the cost that is minimised",
-                received=f"refine={options.refine!r}, nominal={self.nominal!r}",
-                remedy="leave one of them out, or give a grid=",
-            )
-        return first_options(self.statement, options, points=self.method == "ipopt")
-
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """The outcome on a mesh whose error is small enough, where that is asked for."""
-        options = self._options
-        if options.refine is None or reporter.stop:
+        if self._options.refine is None or reporter.stop:
             return outcome
-
-        def prepared(options: Options) -> Prepared:
-            return cast(Prepared, self._prepare(self._solved, options, **self._own))
-
-        def cold(options: Options) -> tuple[Prepared, Outcome]:
-            made = prepared(options)
-            return made, from_starts(made, values, make_guesses(self._solved, made.mesh, values, None), reporter)[0]
-
-        def warm(options: Options, start: Outcome) -> tuple[Prepared, Outcome]:
-            made = prepared(options)
-            guess = make_guess(self._solved, made.mesh, values, Solution.of(start, self.method))
-            return made, made.solve(values, guess, reporter)
-
-        first = Measured(options=options, prepared=self._prepared, outcome=outcome, error=np.nan, least=unseen(self._own))
-        found = refined(first, self._solved, values, cold, warm, reporter)
+        runs = Runs(self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter)
+        first = Measured(self._options, self._prepared, outcome, least=unseen(self._own))
+        found = refined(first, runs)
         self._keep(found.options, found.prepared)
         return found.outcome
 
@@ -457,17 +430,6 @@ class Solver:
         mention_doubts(solution)
         mention_limits(solution)
         return solution
-
-
-def interrupted(solution: Solution) -> Interrupted:
-    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
-    starts = solution.stats.get("starts")
-    if starts is None:
-        found = "the last iterate" if not solution.converged else "a solution"
-    else:
-        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
-        found += "" if solution.converged else ", of which none converged"
-    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)
 
 
 def _is_worse(solution: Solution, classical: float) -> bool:

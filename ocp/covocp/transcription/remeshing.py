@@ -92,7 +92,7 @@ def remeshed(
     count = nodes.size - 1
 
     def gathered(values: Array) -> Array:
-        return np.bincount(owner, weights=values, minlength=count)
+        return np.bincount(owner, weights=values, minlength=count).astype(float)
 
     whole = gathered(pieces)
     total = float((whole ** (1 / order)).sum())
@@ -150,7 +150,7 @@ def _jumps(nodes: Array, u: Array, constant: bool) -> list[Jump]:
 
 
 def _placed(nodes: Array, u: Array, first: int, last: int, constant: bool) -> Jump | None:
-    """The jump between two nodes, from the lines before and after it; None where it is a steep slope, or lies outside."""
+    """The jump between two nodes, from the lines before and after it; None where there is none."""
     h = np.diff(nodes)
     before = 0.0 if first == 0 or constant else (u[first] - u[first - 1]) / h[first - 1]
     after = 0.0 if last == h.size or constant else (u[last + 1] - u[last]) / h[last]

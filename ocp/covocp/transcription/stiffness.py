@@ -77,8 +77,7 @@ def nominal_along(
     """
     values = state_jacobian(statement).map(places.size)(*columns)
     slopes = stacked(values, places.size)
-    finite = np.isfinite(slopes).all(axis=(1, 2))
-    rates = np.linalg.eigvals(np.where(finite[:, None, None], slopes, 0.0)).astype(complex)
+    rates = np.linalg.eigvals(np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)).astype(complex)
     sizes = np.abs(rates)
     kinds = {
         "nominal": sizes,
