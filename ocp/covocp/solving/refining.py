@@ -23,6 +23,7 @@ from covocp.extremal.mesh_error import NO_COST
 from covocp.extremal.path_limits import limited_along
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import cost_of, from_starts
+from covocp.solving.between_nodes import mention_between, more_points, worst_between
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
@@ -175,6 +176,26 @@ def unseen(own: dict[str, Any]) -> float:
     return UNSEEN * float(own.get(VIOLATION) or own.get("tolerance") or LOOSEST)
 
 
+def remade(first: Measured, runs: Runs) -> Measured:
+    """The mesh whose error is small enough, where that is asked for, and whose limits hold between the nodes.
+
+    Args:
+        first: the first mesh and what came of it.
+        runs: how the problem is solved on others.
+
+    Returns:
+        As `refined` and `held_between`; what was not reached is warned of.
+    """
+    found = held_between(first, runs) if first.options.refine is None else refined(first, runs)
+    if found.outcome.converged and not runs.progress.stop:
+        passed = worst_between(found.outcome.extremal, found.options.refine)
+        if passed is not None:
+            more = more_points(found.options, found.prepared.mesh)
+            reason = "there can be no more of them" if more is None else "with more of them it was not solved"
+            mention_between(passed, found.prepared.mesh.points, reason)
+    return found
+
+
 def refined(first: Measured, runs: Runs) -> Measured:
     """The mesh whose error is small enough, from a first one; from one with more intervals where that is too coarse.
 
@@ -227,8 +248,14 @@ def refine_mesh(first: Measured, runs: Runs) -> Measured:
         errors = local_errors(current.outcome.extremal, finer.outcome.extremal)
         current = replace(current, error=max(current.least, _error(current.outcome, finer.outcome, errors)))
         done.append(current)
-        reason = "" if current.error <= allowed else _given_up(done)
-        if current.error <= allowed or reason:
+        if current.error <= allowed:
+            following = _with_more_points(current, runs, made)
+            if following is None:
+                break
+            current = following
+            continue
+        reason = _given_up(done)
+        if reason:
             break
         nodes = _next_nodes(runs.statement, current, finer, errors, allowed)
         if nodes.size > MOST_INTERVALS + 1:
@@ -237,6 +264,35 @@ def refine_mesh(first: Measured, runs: Runs) -> Measured:
         following, _ = _solved(nodes, finer, runs, made)
         current = finer if following is None else following
     return _best(done, first, made, INTERRUPTED if runs.progress.stop else reason)
+
+
+def held_between(first: Measured, runs: Runs) -> Measured:
+    """Limits imposed at more points of the intervals of a mesh, until those that must hold between the nodes do.
+
+    Args:
+        first: the mesh with its solution.
+        runs: how the problem is solved on others.
+
+    Returns:
+        The last mesh that was solved.
+    """
+    current, made = first, [first.outcome]
+    while current.outcome.converged and not runs.progress.stop:
+        following = _with_more_points(current, runs, made)
+        if following is None:
+            break
+        current = following
+    return replace(current, outcome=replace(current.outcome, stats=_counts(current.outcome, made)))
+
+
+def _with_more_points(current: Measured, runs: Runs, made: list[Outcome]) -> Measured | None:
+    """A solution whose limits are imposed at more points; None where they hold, or there are no more."""
+    if worst_between(current.outcome.extremal, current.options.refine) is None:
+        return None
+    options = more_points(current.options, current.prepared.mesh)
+    if options is None:
+        return None
+    return _solved(np.unique(current.prepared.mesh.nodes), replace(current, options=options), runs, made)[0]
 
 
 def _solved(nodes: Array, start: Measured, runs: Runs, made: list[Outcome]) -> tuple[Measured | None, str]:
@@ -303,17 +359,24 @@ def _given_up(done: list[Measured]) -> str:
     return ""
 
 
+def _counts(outcome: Outcome, made: list[Outcome]) -> dict[str, Any]:
+    """What is told of an outcome, with the iterations and times of all runs."""
+    counts: dict[str, Any] = dict(outcome.stats)
+    for name in ("iterations", "build_seconds", "solve_seconds"):
+        if all(name in run.stats for run in made):
+            counts[name] = sum(run.stats[name] for run in made)
+    return counts
+
+
 def _best(done: list[Measured], first: Measured, made: list[Outcome], reason: str) -> Measured:
     """The mesh to return, with the counts of all runs."""
     allowed = float(first.options.refine or 0.0)
     best = min(done, key=lambda entry: entry.error) if done else first
+    if done and done[-1].error <= allowed:  # the earlier ones may pass limits between the nodes
+        best = done[-1]
     if best.error <= allowed:
         reason = ""
-    counts: dict[str, Any] = dict(best.outcome.stats)
-    for name in ("iterations", "build_seconds", "solve_seconds"):
-        if all(name in run.stats for run in made):
-            counts[name] = sum(run.stats[name] for run in made)
-    counts |= {
+    counts = _counts(best.outcome, made) | {
         "refine": allowed,
         "mesh_intervals": tuple(entry.intervals for entry in done),
         "mesh_errors": tuple(float(entry.error) for entry in done),

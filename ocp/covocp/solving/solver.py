@@ -39,10 +39,11 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
+from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
-from covocp.solving.refining import FIRST, Measured, Runs, adapted, first_options, refined, unseen, with_layers
+from covocp.solving.refining import FIRST, Measured, Runs, adapted, first_options, remade, unseen, with_layers
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -146,6 +147,7 @@ class Solver:
         self.method = method
         self.nominal = nominal
         self.statement: Statement = problem.statement()
+        check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
         refine = options.get("refine")
         count = INTERVALS if refine is None else FIRST
@@ -169,7 +171,7 @@ class Solver:
         if asked.refine is not None:
             self._own = adapted(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
-        self._first = self._options, self._prepared
+        self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
@@ -204,7 +206,7 @@ class Solver:
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
-        if self._options.refine is not None:
+        if self._remade:
             self._keep(*self._first)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
@@ -400,12 +402,11 @@ class Solver:
         return outcome
 
     def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """The outcome on a mesh whose error is small enough, where that is asked for."""
-        if self._options.refine is None or reporter.stop:
+        """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
+        if not self._remade or reporter.stop:
             return outcome
         runs = Runs(self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter)
-        first = Measured(self._options, self._prepared, outcome, least=unseen(self._own))
-        found = refined(first, runs)
+        found = remade(Measured(self._options, self._prepared, outcome, least=unseen(self._own)), runs)
         self._keep(found.options, found.prepared)
         return found.outcome
 

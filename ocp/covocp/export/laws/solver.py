@@ -110,7 +110,7 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
             received=f"method={method!r}",
             remedy="'sqpmethod' needs nothing else; the others are linked",
         )
-    known = {entry.name for entry in fields(Options) if entry.name != "refine"} | {"plugin_options"}  # one mesh
+    known = {entry.name for entry in fields(Options)} | {"plugin_options"}
     allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
     for name in options:
         if name not in known:
