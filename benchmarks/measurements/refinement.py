@@ -2,7 +2,7 @@
 
     python benchmarks/measurements/refinement.py
 
-Prints a table of the plain problems of `benchmarks/peers/plain_problems.py`, whose optima no solver computed, and one of
+Prints a table of the plain problems of `benchmarks/peers/plain_problems.py`, whose optima no solver computed, and
 the ratio of the true error of the cost to the estimated one, for several tolerances and both forms of the control.
 """
 
