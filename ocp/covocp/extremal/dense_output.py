@@ -207,8 +207,9 @@ class _Steps:
     def advance(self, k: Expr, c: Array, d: Array, z: Array) -> Array:
         """The entries at the share d from those at c."""
         s, after = self.place(k, c), self.place(k, d)
-        common = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :], *self.fixed(c.size))
-        common = (*common, np.zeros((self.extremal.statement.readings, c.size)))
+        ends = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :])
+        nothing = np.zeros((self.extremal.statement.readings, c.size))
+        common = (*ends, *self.fixed(c.size), nothing)
         st, mesh = self.extremal.statement, self.extremal.mesh
         function = _advance(st, mesh.step, mesh.linear_solver, tuple(self.rows), self.states is not None)
         if self.states is None:

@@ -98,6 +98,7 @@ class _Simulation:
         self.plan, self.first, self.runs = plan, first, last - first
         width = self.width = padded(self.runs)
         self.step = vectorise(plan.step, width, (3,))
+        self.read = None if plan.read is None else vectorise(plan.read, width, (3,))
         self.observe = vectorise(plan.observe, width, (2,))
         kind = (1,) if plan.pilot else ()
         self.streams = [
@@ -147,10 +148,13 @@ class _Simulation:
         before[:] = self.observe.outputs[0][: 2 * plan.size]
         last = plan.steps.shape[0]
         for k, noise in self._noises(last, stop):
-            w[:] = noise
-            coefficients[:] = plan.steps[k]
-            step.evaluate()
-            z[:] = after
+            if self.read is not None and plan.reads[k]:
+                moved[:] = self._read(noise, k)
+            else:
+                w[:] = noise
+                coefficients[:] = plan.steps[k]
+                step.evaluate()
+                z[:] = after
             np.less_equal(np.abs(moved, size), domain, inside)  # false for NaN
             if not inside.all():
                 self._leave(~inside.all(axis=0), plan.times[k])
@@ -161,12 +165,23 @@ class _Simulation:
                 self._store(where[k + 1])
         return self._batch()
 
+    def _read(self, noise: Array, k: int) -> Array:
+        """Let all runs read what is read in a step of no length; their deviations and estimates after it."""
+        assert self.read is not None
+        z, w, own, coefficients = self.read.inputs
+        z[:], w[:], own[:] = self.step.inputs[0], noise, self.own
+        coefficients[:] = self.plan.steps[k]
+        self.read.evaluate()
+        self.step.inputs[0][:] = self.read.outputs[0]
+        return self.read.outputs[1]
+
     def _sample(self, number: int) -> None:
         """Step the laws of the runs that are inside the domain; the mean of what was measured starts anew."""
         flown, spans, z = self.plan.flown, self.plan.spans, self.step.inputs[0]
         assert flown is not None
         measured, controls = z[spans["measured"]], self.plan.fed_back
         mean = measured / flown.period if number else np.full_like(measured, np.nan)
+        mean = np.vstack([mean, z[spans["read"]]])
         for i in np.flatnonzero(np.isinf(self.left[: self.runs])).tolist():
             time, estimates = float(flown.times[number]), flown.estimates * self.plan.size
             result = stepped(self.laws[i], mean[:, i].copy(), time, controls, estimates, self.first + i)
@@ -175,7 +190,7 @@ class _Simulation:
             z[spans["held"], i] = result[:controls]
             if flown.estimates:
                 z[spans["estimate"], i] = result[controls:]
-        measured[:] = 0.0
+        measured[:], z[spans["read"]] = 0.0, np.nan
 
     def _leave(self, gone: Given, time: float) -> None:
         """Note when runs leave the domain, and where they were before."""

@@ -36,9 +36,9 @@ from covocp.transcription.stiffness import nominal_along, stiffness
 FIRST, DOUBLED = 16, 2
 # Most meshes, and most intervals of one.
 MOST_MESHES, MOST_INTERVALS = 15, 3000
-# What the error is in the change by a finer mesh: a jump of a control whose ramp is half as long costs a quarter. A kink
-# close to the end of an interval over which the control is constant costs nearly as much with halves of it. Where errors
-# of both signs cancel, this share of their sum counts.
+# What the error is in the change by a finer mesh: a jump of a control whose ramp is half as long costs a quarter. A
+# kink close to the end of an interval over which the control is constant costs nearly as much with halves of it. Where
+# errors of both signs cancel, this share of their sum counts.
 LEFT, CANCELLED = {"linear": 4 / 3, "constant": 2.0}, 0.25
 # The next mesh aims at this share of what is allowed, and at no less than this share of the error of the one before.
 AIMED, BOLD = 0.3, 1e-4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -35,6 +35,9 @@ EXPLICIT_SUBSTEPS = 8
 # Implicit steps an interval, at most: what happens faster than these has died out. DC motor with a time constant of
 # 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
 IMPLICIT_SUBSTEPS = 4
+
+# Share of the terminal time by which a time may miss an instant and mean it.
+SAME_TIME = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,7 +147,7 @@ class Mesh:
     step: StepKind
     linear_solver: str = LINEAR_SOLVER
     points: int = 1
-    readings: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    readings: Annotated[Array, "any intervals or none"] = field(default_factory=lambda: np.zeros((0, 0)))
 
     __repr__ = short_repr
 
@@ -170,6 +173,15 @@ class Mesh:
     def instants(self) -> list[int]:
         """Intervals of no length, at which measurements are taken."""
         return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
+
+    def placed(self, s: Array) -> Array:
+        """Normalised times within [0, 1]; what rounding parts from an instant is the instant."""
+        s, instants = np.clip(s, 0.0, 1.0), self.nodes[self.instants]
+        if instants.size:
+            k = np.clip(np.searchsorted(instants, s), 1, instants.size) - 1
+            for near in (instants[k], instants[np.minimum(k + 1, instants.size - 1)]):
+                s = np.where(np.abs(s - near) <= SAME_TIME, near, s)
+        return s
 
     @cached
     def stand_ins(self) -> list[int]:

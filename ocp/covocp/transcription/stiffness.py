@@ -86,6 +86,7 @@ def nominal_along(
     }
     first = np.clip(np.searchsorted(places, nodes[:-1], side="right") - 1, 0, places.size - 1)
     last = np.clip(np.searchsorted(places, nodes[1:]), 0, places.size - 1)
+    first, last = np.minimum(first, last), np.maximum(first, last)  # of an interval without length
     h = duration * np.diff(nodes)
     largest = {name: value.max(axis=1, initial=0.0) for name, value in kinds.items()}
     found = {
