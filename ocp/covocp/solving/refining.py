@@ -36,10 +36,10 @@ from covocp.transcription.stiffness import nominal_along, stiffness
 FIRST, DOUBLED = 16, 2
 # Most meshes, and most intervals of one.
 MOST_MESHES, MOST_INTERVALS = 15, 3000
-# What the error is in the change by a finer mesh: a jump of a control whose ramp is half as long costs a quarter. A
-# kink close to the end of an interval over which the control is constant costs nearly as much with halves of it. Where
-# errors of both signs cancel, this share of their sum counts.
-LEFT, CANCELLED = {"linear": 4 / 3, "constant": 2.0}, 0.25
+# What the error is, at most, in the change by a finer mesh: a jump of a control whose ramp is half as long costs a
+# quarter, but a kink close to the end of an interval costs half with halves of it. Where errors of both signs cancel,
+# this share of their sum counts.
+LEFT, CANCELLED = 2.0, 0.25
 # The next mesh aims at this share of what is allowed, and at no less than this share of the error of the one before.
 AIMED, BOLD = 0.3, 1e-4
 # Meshes without a better one among them, after which a tolerance counts as out of reach, and how much better.
@@ -319,7 +319,7 @@ def _finer_nodes(measured: Measured) -> Array:
 def _error(coarse: Outcome, fine: Outcome, errors: Array) -> float:
     """Estimated relative error of the cost of the coarser mesh."""
     change = max(abs(cost_of(coarse) - cost_of(fine)), CANCELLED * float(errors.sum()))
-    return LEFT[coarse.extremal.mesh.control] * change / max(abs(cost_of(fine)), NO_COST)
+    return LEFT * change / max(abs(cost_of(fine)), NO_COST)
 
 
 def _next_nodes(statement: Statement, coarse: Measured, fine: Measured, errors: Array, allowed: float) -> Array:
