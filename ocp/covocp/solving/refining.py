@@ -7,17 +7,18 @@ decides where the nodes of the next mesh go.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from covocp.base.errors import CovocpError, ProblemError, warn_user
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
-from covocp.extremal.extremal import Extremal, Outcome, Prepared
+from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.local_errors import local_errors
 from covocp.extremal.mesh_error import NO_COST
 from covocp.extremal.path_limits import limited_along
@@ -28,8 +29,9 @@ from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import completed
-from covocp.transcription.mesh import Graded, Options
+from covocp.transcription.mesh import Graded, Mesh, Options
 from covocp.transcription.remeshing import divided, jumps_of, remeshed
+from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import nominal_along, stiffness
 
 # Intervals of the first mesh where none are given, and how often they are doubled where it is not solved.
@@ -49,7 +51,7 @@ PATIENCE, BETTER = 3, 0.7
 SOLVED, LOOSEST, STRICTEST, UNSEEN = 1e-2, 1e-7, 1e-11, 10.0
 VIOLATION = "violation_tolerance"
 # Length of an interval in times of the nominal above which the first mesh is graded at its ends, and in which ratio.
-LONG, LAYER_RATIO = 30.0, 2.0
+LONG, LAYER_RATIO = 30.0, 1.7
 # Points of an interval at which limits along the path are imposed: with one a control may swing from node to node.
 POINTS = 2
 # Power of the length with which the error of an interval falls: of controls that are linear, or constant over it.
@@ -81,7 +83,7 @@ class Runs:
     def cold(self, options: Options, least: float) -> Measured:
         """From the problem's own start."""
         prepared: Prepared = self.prepare(options)
-        guesses = make_guesses(self.statement, prepared.mesh, self.parameters, None)
+        guesses = first_guesses(options, self.statement, prepared.mesh, self.parameters, None)
         outcome, _ = from_starts(prepared, self.parameters, guesses, self.progress)
         return Measured(options, prepared, outcome, least)
 
@@ -149,7 +151,20 @@ def with_layers(statement: Statement, options: Options, parameters: Array) -> Op
     layer = longest / fast * LAYER_RATIO ** np.arange(np.ceil(np.log(fast) / np.log(LAYER_RATIO)))
     whole = completed(statement, np.union1d(np.unique(nodes), np.concatenate([layer, 1.0 - layer])))
     known = options.grid.stiffness if isinstance(options.grid, Graded) else None
-    return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known))
+    return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known, layered=True))
+
+
+def first_guesses(
+    options: Options, statement: Statement, mesh: Mesh, parameters: Array, guess: Given
+) -> Iterator[Guess]:
+    """Guesses on the mesh of some options, as `make_guesses`.
+
+    On one with layers the problem's own start comes first, as it is: the others are ranked by runs over the whole time,
+    which tell little of a nominal that is fast beside it, and take long.
+    """
+    if guess is None and isinstance(options.grid, Graded) and options.grid.layered:
+        yield Guess(trajectory=own_start(statement, mesh, parameters).trajectory)
+    yield from make_guesses(statement, mesh, parameters, guess)
 
 
 def adapted(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[str, Any]:

@@ -38,12 +38,12 @@ from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statemen
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
+from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
 from covocp.solving.random_starts import random_guesses
-from covocp.solving.refining import FIRST, Measured, Runs, adapted, first_options, remade, unseen, with_layers
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -150,17 +150,17 @@ class Solver:
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
         refine = options.get("refine")
-        count = INTERVALS if refine is None else FIRST
+        count = INTERVALS if refine is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
-            asked = first_options(self.statement, asked, nominal, points=method == "ipopt")
+            asked = refining.first_options(self.statement, asked, nominal, points=method == "ipopt")
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
         if refine is not None:
-            self._options = with_layers(self.statement, self._options, self.statement.values)
+            self._options = refining.with_layers(self.statement, self._options, self.statement.values)
         self._own_steps = self._options.substeps == "auto" and refine is None
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
@@ -169,7 +169,7 @@ class Solver:
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
         if asked.refine is not None:
-            self._own = adapted(method_options(method), self._own, asked.refine)
+            self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
@@ -219,7 +219,7 @@ class Solver:
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
-                    guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
+                    guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
                     outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     if first is not None and guess is not first and not outcome.converged and not reporter.stop:
                         guesses = make_guesses(self._solved, self._prepared.mesh, values, first)
@@ -405,8 +405,12 @@ class Solver:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
         if not self._remade or reporter.stop:
             return outcome
-        runs = Runs(self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter)
-        found = remade(Measured(self._options, self._prepared, outcome, least=unseen(self._own)), runs)
+        runs = refining.Runs(
+            self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter
+        )
+        found = refining.remade(
+            refining.Measured(self._options, self._prepared, outcome, least=refining.unseen(self._own)), runs
+        )
         self._keep(found.options, found.prepared)
         return found.outcome
 

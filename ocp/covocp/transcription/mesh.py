@@ -46,7 +46,8 @@ class Graded:
 
     nodes: of t/T, twice where a measurement is taken; asked: intervals that the user asked for; added: nodes added at
         the start and at the end; stiffness: largest h times rate of the filter on its intervals, None where it was not
-        looked at; nominal: that of the nominal along a solution, None where only its start is known.
+        looked at; nominal: that of the nominal along a solution, None where only its start is known; layered: whether
+        nodes were added for what the nominal does at its ends within a small part of an interval.
     """
 
     nodes: Array
@@ -54,6 +55,7 @@ class Graded:
     added: tuple[int, int] = (0, 0)
     stiffness: float | None = None
     nominal: Stiffness | None = None
+    layered: bool = False
 
     __repr__ = short_repr
 
