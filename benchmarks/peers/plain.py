@@ -3,7 +3,8 @@
     python benchmarks/peers/plain.py           every tool on every problem, medians of five runs in random order
     python benchmarks/peers/plain.py --quick   one run of each
 
-Each case runs in a process of its own; times are those of a first solve, building included, imports left out. Tools
+Each case runs in a process of its own; times are those of the processor for a first solve, building included, imports
+left out: on an idle machine what a user waits, all run on one thread. Tools
 without a refinement of their own have 100 intervals, or 10 segments of 10 points (yapss). rockit and yapss are left out
 where they are not installed.
 """

@@ -149,8 +149,7 @@ class Solver:
         self.statement: Statement = problem.statement()
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
-        refine = options.get("refine")
-        count = INTERVALS if refine is None else refining.FIRST
+        count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
