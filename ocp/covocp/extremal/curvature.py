@@ -345,7 +345,10 @@ def held_jacobian(extremal: Extremal) -> Array:
     tangents = tangents_along(extremal, everything, feedback=False)
     rows = np.asarray(jacobian(*arguments(fine, _costates(fine, through=True))).full())
     slopes = _between(extremal, fine).backward(*_split(fine, rows))
-    return _by_v(tangents, *slopes, np.eye(tangents.size))
+    by_v = _by_v(tangents, *slopes, np.eye(tangents.size))
+    result = np.zeros((by_v.shape[0], everything.size))
+    result[:, everything.ravel()] = by_v
+    return result
 
 
 def mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:

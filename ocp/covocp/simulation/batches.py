@@ -17,6 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.simulation.flown import own_copy, stepped
 from covocp.simulation.plan import Plan
+from covocp.simulation.run_parts import UNREAD
 from covocp.simulation.vectorised import LANES, padded, vectorise
 
 # Steps whose random numbers are drawn together: they are most of the memory of a batch.
@@ -141,7 +142,7 @@ class _Simulation:
         domain = plan.domain[:, None]
         where = {int(k): i for i, k in enumerate(plan.stored)}
         sampled = {int(k): i for i, k in enumerate(plan.samples)}
-        if sampled:
+        if 0 in sampled:
             self._sample(0)
         self._store(where[0])
         before = self.before
@@ -181,7 +182,8 @@ class _Simulation:
         assert flown is not None
         measured, controls = z[spans["measured"]], self.plan.fed_back
         mean = measured / flown.period if number else np.full_like(measured, np.nan)
-        mean = np.vstack([mean, z[spans["read"]]])
+        read = z[spans["read"]]
+        mean = np.vstack([mean, np.where(read < UNREAD, read, np.nan)])
         for i in np.flatnonzero(np.isinf(self.left[: self.runs])).tolist():
             time, estimates = float(flown.times[number]), flown.estimates * self.plan.size
             result = stepped(self.laws[i], mean[:, i].copy(), time, controls, estimates, self.first + i)
@@ -190,7 +192,7 @@ class _Simulation:
             z[spans["held"], i] = result[:controls]
             if flown.estimates:
                 z[spans["estimate"], i] = result[controls:]
-        measured[:], z[spans["read"]] = 0.0, np.nan
+        measured[:], read[:] = 0.0, UNREAD
 
     def _leave(self, gone: Given, time: float) -> None:
         """Note when runs leave the domain, and where they were before."""

@@ -22,7 +22,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.updates import updating
-from covocp.simulation.run_parts import Run, control_of, estimate_of, factor, part, read_at, replaced, system_at
+from covocp.simulation.run_parts import UNREAD, Run, control_of, estimate_of, factor, part, read_at, replaced, system_at
 from covocp.simulation.schedule import by_rows, read_gain
 
 # Less than any share of a reading that is taken.
@@ -79,7 +79,7 @@ def read_now(run: Run, c: dict[str, Any], noise: Given, reading: Given) -> Any:
     value = actual.h + scatter
     if setting.flown:
         before = z[run.spans["read"]]
-        known = ca.if_else(before == before, before, 0)  # NaN is none
+        known = ca.if_else(before < UNREAD, before, 0)
         return replaced(z, run.spans["read"], ca.if_else(taken > 0, known + taken * value, before))
     y = z[run.spans["estimate"]]
     if setting.filter == "perturbation":

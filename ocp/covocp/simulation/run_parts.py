@@ -20,6 +20,8 @@ from covocp.solution.solution import Solution
 
 # A pivot of a factorisation counts as zero below this share of its diagonal entry.
 PIVOT = 1e-12
+# What stands for nothing read: comparisons with NaN are simplified away in expressions.
+UNREAD = 1e300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +70,7 @@ class Run:
 
     z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "measured" (what a law has
     measured since its last step, an integral), "cost", "asked" and "violated" (flags), "held" (control of a law),
-    "read" (what a law has read since its last step, NaN where nothing).
+    "read" (what a law has read since its last step, UNREAD where nothing).
     noisy: states with process noise; watched: number of inequalities along the path.
     """
 

@@ -31,7 +31,17 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
 from covocp.simulation.constraints import Place, beyond, counted_rows, violations
 from covocp.simulation.filtering import corrected, moved_covariance, read_now
-from covocp.simulation.run_parts import Run, control_of, deviations, estimate_of, factor, part, replaced, system_at
+from covocp.simulation.run_parts import (
+    UNREAD,
+    Run,
+    control_of,
+    deviations,
+    estimate_of,
+    factor,
+    part,
+    replaced,
+    system_at,
+)
 
 
 def start_of(run: Run) -> Array:
@@ -41,7 +51,7 @@ def start_of(run: Run) -> Array:
     z[run.spans["x"]] = run.setting.actual.start[: design.entries]
     if run.setting.flown:
         z[run.spans["held"]] = solution.controls[0, : design.fed_back]
-        z[run.spans["read"]] = np.nan
+        z[run.spans["read"]] = UNREAD
     if run.setting.filter == "extended":
         z[run.spans["estimate"]] = design.start
         z[run.spans["E"]] = solution.trajectory.e[0][design.covariance]

@@ -93,7 +93,7 @@ def _along(
     given = Options(intervals=intervals, **_known(options))
     if isinstance(nominal, Solution) and not options:
         own = nominal.mesh
-        given = replace(given, grid=own.nodes, control=own.control)  # type: ignore[arg-type]
+        given = replace(given, grid=np.unique(own.nodes), control=own.control)  # type: ignore[arg-type]
     given = graded(st, given, values)
     mesh = evaluation_mesh(st, given, values)
     u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))

@@ -38,6 +38,8 @@ IMPLICIT_SUBSTEPS = 4
 
 # Share of the terminal time by which a time may miss an instant and mean it.
 SAME_TIME = 1e-9
+# The same of a node: what dividing and multiplying by the terminal time leave.
+SAME_NODE = 4 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,12 +179,13 @@ class Mesh:
         return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
 
     def placed(self, s: Array) -> Array:
-        """Normalised times within [0, 1]; what rounding parts from an instant is the instant."""
-        s, instants = np.clip(s, 0.0, 1.0), self.nodes[self.instants]
-        if instants.size:
-            k = np.clip(np.searchsorted(instants, s), 1, instants.size) - 1
-            for near in (instants[k], instants[np.minimum(k + 1, instants.size - 1)]):
-                s = np.where(np.abs(s - near) <= SAME_TIME, near, s)
+        """Normalised times within [0, 1]; what rounding parts from a node is the node, more so from an instant."""
+        s = np.clip(s, 0.0, 1.0)
+        for places, same in ((self.nodes, SAME_NODE), (self.nodes[self.instants], SAME_TIME)):
+            if places.size:
+                k = np.clip(np.searchsorted(places, s), 1, places.size) - 1
+                for near in (places[k], places[np.minimum(k + 1, places.size - 1)]):
+                    s = np.where(np.abs(s - near) <= same, near, s)
         return s
 
     @cached

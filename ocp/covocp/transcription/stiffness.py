@@ -13,6 +13,7 @@ from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
+from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
 from covocp.transcription.steps import KEPT
 
@@ -22,6 +23,7 @@ DAMPED = -0.5
 
 def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
+    options = with_instants(statement, options)
     stiff = stiffness(statement, options, parameters)
     return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
 
