@@ -160,7 +160,7 @@ def compare(
     problem: Problem,
     methods: Sequence[Any] = DEFAULT,
     *,
-    intervals: int = 100,
+    intervals: int | None = None,
     guess: Given = None,
     progress: bool = True,
     method_options: Mapping[str, Mapping[str, Any]] | None = None,
@@ -172,7 +172,7 @@ def compare(
         problem: what to solve.
         methods: names of methods, or (label, method, options) for a formulation of its own, such as
             ("states", "ipopt", {"covariances": "states"}).
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         guess: where all runs start; see `Solver.solve`.
         progress: whether to show the iterations on a terminal.
         method_options: options by method.
