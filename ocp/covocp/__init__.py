@@ -38,8 +38,8 @@ from covocp.problem.declarations import Gain as Gain
 from covocp.problem.phases import Phases as Phases
 from covocp.solution.solution import Solution as Solution
 from covocp.solving.evaluation import evaluate as evaluate
+from covocp.solving.methods import methods as methods
 from covocp.solving.solver import Solver as Solver
-from covocp.solving.solver import methods as methods
 from covocp.solving.solver import solve as solve
 
 __all__ = [

@@ -120,6 +120,7 @@ def test_jumps_that_do_not_fit_are_refused() -> None:
         ({"guess": {"third": None}}, "There is no phase 'third'"),
         ({"intervals": [2]}, "'intervals' has a value that does not apply"),
         ({"parameters": {"z": 1.0}}, "There is no parameter 'z'"),
+        ({"refine": 1e-6}, "The meshes of phases do not refine themselves"),
         ({"colour": 1}, "has no option 'colour'"),
     ],
 )

@@ -22,7 +22,7 @@ from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
-from covocp.solving.solver import STARTS, method_options
+from covocp.solving.solver import INTERVALS, STARTS, method_options
 from covocp.transcription.mesh import Options
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
@@ -158,7 +158,7 @@ def _common(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the model; may be repeated"
     )
-    parser.add_argument("--intervals", type=_whole, default=100, metavar="N", help="control intervals (100)")
+    parser.add_argument("--intervals", type=_whole, metavar="N", help="control intervals (100)")
     parser.add_argument(
         "--option", action="append", default=[], metavar="NAME=VALUE", help="an option of the solver; may be repeated"
     )
@@ -269,7 +269,7 @@ def _export(arguments: argparse.Namespace) -> int:
     code = 0
     if arguments.solver:
         shared, _ = _options(arguments.option, ())
-        settings |= {**shared, "intervals": arguments.intervals}
+        settings |= {**shared, "intervals": arguments.intervals or INTERVALS}
     else:
         what, code = _solved(what, arguments)
         if code:
@@ -291,7 +291,7 @@ def _solved(problem: Given, arguments: argparse.Namespace, nominal: Given = None
     try:
         if isinstance(nominal, Mapping):  # given, not solved for: only the mesh matters
             mesh = {name: value for name, value in options.items() if name in {f.name for f in fields(Options)}}
-            return co.evaluate(problem, nominal=nominal, intervals=arguments.intervals, **mesh), 0
+            return co.evaluate(problem, nominal=nominal, intervals=arguments.intervals or INTERVALS, **mesh), 0
         if nominal is not None:
             options["nominal"] = nominal
         solution = co.solve(

@@ -11,6 +11,7 @@ from covocp.base.matrices import Array
 from covocp.extremal.dense_output import OF_RANGE, Dense, mapped
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import repeated
+from covocp.statement.statement import Statement
 
 # Points that are looked at together: what bounds the memory.
 TOGETHER = 1 << 15
@@ -37,8 +38,12 @@ class Passed:
 
 def limited(extremal: Extremal) -> bool:
     """Whether a state or an expression has a limit along the path."""
-    st = extremal.statement
-    return bool(st.path.size) or bool(np.isfinite(st.state_bounds).any())
+    return limited_along(extremal.statement)
+
+
+def limited_along(statement: Statement) -> bool:
+    """The same of a problem."""
+    return bool(statement.path.size) or bool(np.isfinite(statement.state_bounds).any())
 
 
 def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed, ...]:

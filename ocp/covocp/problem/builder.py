@@ -550,6 +550,7 @@ class Problem:
         upper: Given = None,
         at: Place | None = None,
         name: str | None = None,
+        between: Literal["auto"] | None = None,
     ) -> None:
         """Require lower <= expression <= upper.
 
@@ -564,12 +565,14 @@ class Problem:
             upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
             at: "path", "initial" or "final"; None: "path", and "final" for integrals and for decisions alone.
             name: appears in every diagnostic; "constraint k" by default.
+            between: "auto": imposed at more and more points of each interval, until the largest violation between them
+                is below 1e-4 of the limit (with `refine`, its tolerance, where that is smaller, but for 2e-5).
 
         Raises:
             ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an integral
                 elsewhere than at the end.
         """
-        self._change(with_constraint(self._declarations, expression, lower, upper, at, name))
+        self._change(with_constraint(self._declarations, expression, lower, upper, at, name, between))
 
     def statement(self) -> Statement:
         """The frozen problem that solvers read; built once and kept until something is added.

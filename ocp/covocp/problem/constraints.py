@@ -18,7 +18,13 @@ PLACES = ("path", "initial", "final")
 
 
 def with_constraint(
-    own: Declarations, expression: Given, lower: Given, upper: Given, at: Given, name: str | None
+    own: Declarations,
+    expression: Given,
+    lower: Given,
+    upper: Given,
+    at: Given,
+    name: str | None,
+    between: Given = None,
 ) -> Declarations:
     """The declarations with one more constraint; arguments and errors as of `Problem.subject_to`."""
     label = name if name is not None else f"constraint {len(own.constraints) + 1}"
@@ -36,7 +42,15 @@ def with_constraint(
     place = _place(own, label, value, at)
     check_name(label, list(own.named))
     low, high = limit_columns(label, lower, upper, check_size(label, value.shape[0]))
-    entry = Constraint(name=label, expression=value, lower=low, upper=high, at=place, where=caller())
+    if not (between is None or (isinstance(between, str) and between == "auto")) or (between and place != "path"):
+        raise ProblemError(
+            f"'{label}' has a wrong between=.",
+            expected="None, or 'auto' for a constraint along the path",
+            received=f"between={between!r}, at='{place}'",
+            remedy="correct between=, or leave it out",
+        )
+    own_place: dict[str, Any] = {"at": place, "where": caller(), "between": between is not None}
+    entry = Constraint(name=label, expression=value, lower=low, upper=high, **own_place)
     return own.adding(constraints=entry)
 
 

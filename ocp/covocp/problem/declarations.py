@@ -334,7 +334,7 @@ class Data:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
-    """lower <= expression <= upper along the path, at the start or at the end."""
+    """lower <= expression <= upper along the path, at the start or at the end; between: not at the nodes alone."""
 
     name: str
     expression: ca.MX
@@ -342,6 +342,7 @@ class Constraint:
     upper: Array
     at: Place
     where: str
+    between: bool = False
 
     __repr__ = short_repr
 

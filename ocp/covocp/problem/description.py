@@ -361,6 +361,6 @@ def _constraints(problem: Problem, written: _Written) -> Section:
             right = f" = {number(high)}" if low == high else f" <= {number(high)}" if np.isfinite(high) else ""
             if not right:
                 left, right = "", f" >= {number(low)}"
-            own.append([name, places[q.at], f"{left}{text}{right}"])
+            own.append([name, places[q.at] + (", between the nodes too" if q.between else ""), f"{left}{text}{right}"])
         rows += _shortened(own)
     return _table(["constraint", "", ""], rows, code=(2,))

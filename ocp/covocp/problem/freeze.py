@@ -382,6 +382,7 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Condition
         function=stacked.function(f"{at}_conditions", [values]),
         realised=realised,
         names=tuple(names),
+        between=tuple(c.between for c in chosen for _ in range(c.lower.size)),
         lower=np.concatenate([np.zeros(0), *(c.lower for c in chosen)]),
         upper=np.concatenate([np.zeros(0), *(c.upper for c in chosen)]),
         uses_matrices=bool(chosen and problem.matrices and ca.depends_on(values, stacked.inputs[2])),

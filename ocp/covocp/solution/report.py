@@ -438,7 +438,7 @@ def _effort(solution: Solution) -> Section:
         effort.append("started again from a saddle")
     if "starts" in stats:
         effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
-    lines = [Sentence("mesh: " + ", ".join(words))]
+    lines = [Sentence("mesh: " + ", ".join(words)), *_refinement(stats)]
     return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
@@ -452,6 +452,21 @@ def _intervals(count: int, instants: int, stats: Mapping[str, Any]) -> str:
     elif asked is not None and asked != count:
         words = f"{_counted(asked, 'interval')} asked for, {count} between the instants"
     return words + (f", measurements taken at {_counted(instants, 'instant')}" if instants else "")
+
+
+def _refinement(stats: Mapping[str, Any]) -> list[Sentence]:
+    """The meshes that were tried, with their errors; nothing where the mesh was given."""
+    meshes, errors, asked = (stats.get(name) for name in ("mesh_intervals", "mesh_errors", "refine"))
+    if not meshes or not errors or asked is None:
+        return []
+    tried = ", ".join(f"{count} ({error:.1e})" for count, error in zip(meshes, errors, strict=False))
+    reached = "" if min(errors) <= asked else ", NOT REACHED"
+    return [
+        Sentence(
+            f"refined: {len(meshes)} mesh{'' if len(meshes) == 1 else 'es'}, intervals (error of the cost, "
+            f"relative, measured on a finer one): {tried}; asked for {asked:.3g}{reached}"
+        )
+    ]
 
 
 def _starts(costs: Given) -> str:

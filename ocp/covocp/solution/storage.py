@@ -50,6 +50,9 @@ STATS: dict[str, Any] = {
     "classical_cost": float | None,
     "intervals_asked": int | None,
     "nodes_added": tuple[int, int] | None,
+    "refine": float,
+    "mesh_intervals": tuple[int, ...],
+    "mesh_errors": tuple[float, ...],
     **MEAN_EFFECT,
 }
 SECONDS = "seconds"

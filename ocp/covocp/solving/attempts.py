@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import OutsideDomainError
+from covocp.base.errors import Interrupted, OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.solution.solution import Solution
 
 # Starts that are tried where a method loses its way.
 TRIED = 4
@@ -92,3 +94,26 @@ def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: 
 def cost_of(outcome: Outcome) -> float:
     """All terms together."""
     return float(sum(outcome.cost_terms.values()))
+
+
+def counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
+    """Iterations and times of two runs together."""
+    names = ("iterations", "build_seconds", "solve_seconds")
+    both = [name for name in names if name in first.stats and name in second.stats]
+    return {name: first.stats[name] + second.stats[name] for name in both}
+
+
+def with_stats(outcome: Outcome, **stats: Any) -> Outcome:
+    """The outcome with more that is told of it."""
+    return replace(outcome, stats={**outcome.stats, **stats})
+
+
+def interrupted(solution: Solution) -> Interrupted:
+    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
+    starts = solution.stats.get("starts")
+    if starts is None:
+        found = "the last iterate" if not solution.converged else "a solution"
+    else:
+        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
+        found += "" if solution.converged else ", of which none converged"
+    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)

@@ -20,7 +20,8 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
 from covocp.solution.solution import Solution
-from covocp.solving.solver import METHODS, Solver, check_problem, method_options
+from covocp.solving.methods import METHODS, method_options
+from covocp.solving.solver import Solver, check_problem
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def compare(
     problem: Problem,
     methods: Sequence[Any] = DEFAULT,
     *,
-    intervals: int = 100,
+    intervals: int | None = None,
     guess: Given = None,
     progress: bool = True,
     method_options: Mapping[str, Mapping[str, Any]] | None = None,
@@ -172,7 +173,7 @@ def compare(
         problem: what to solve.
         methods: names of methods, or (label, method, options) for a formulation of its own, such as
             ("states", "ipopt", {"covariances": "states"}).
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         guess: where all runs start; see `Solver.solve`.
         progress: whether to show the iterations on a terminal.
         method_options: options by method.

@@ -144,7 +144,11 @@ def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
     """Options of the mesh; others mean nothing here."""
-    known = {field.name for field in fields(Options)} - {"intervals", "points"}  # nothing is imposed here
+    known = {field.name for field in fields(Options)} - {
+        "intervals",
+        "points",
+        "refine",
+    }  # nothing is imposed or solved here
     for name in options:
         if name not in known:
             raise no_option("evaluate()", name, options[name], known)

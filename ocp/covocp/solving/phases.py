@@ -23,6 +23,7 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import TRIED
+from covocp.solving.between_nodes import watched
 from covocp.solving.unused import mention_lengths
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.chain import Chain, started_at
@@ -32,6 +33,7 @@ from covocp.transcription.mesh import Options
 from covocp.transcription.stiffness import resolve_mesh
 
 Arrays = tuple[Array, ...]
+INTERVALS = 100  # of each phase, where none are asked for
 
 
 def solve_phases(
@@ -53,7 +55,7 @@ def solve_phases(
         phases: what to solve.
         method: name of the method.
         module: that has it.
-        intervals: of each phase, or one number for each.
+        intervals: of each phase, or one number for each; None: 100.
         guess: None; a `PhasesSolution`; or, by name of the phase or one for each, what `solve` takes for one problem.
         nominal: "combined".
         progress: whether to show the iterations on a terminal.
@@ -76,6 +78,7 @@ def solve_phases(
             remedy="leave the option out",
         )
     chain = phases.chain()
+    _check_refinement(chain, options.get("refine"))
     known = [field.name for field in fields(Options)]
     own = _method_options(prepare)
     for name in options:
@@ -95,6 +98,22 @@ def solve_phases(
     return _finished(solution, allow_failure)
 
 
+def _check_refinement(chain: Chain, refine: Given) -> None:
+    """Meshes of phases stay as they are, and limits hold where they are imposed.
+
+    Raises:
+        ProblemError: something else is asked for.
+    """
+    between = [name for st in chain.statements for name in watched(st)]
+    if refine is not None or between:
+        raise ProblemError(
+            "The meshes of phases do not refine themselves.",
+            expected="intervals= for each phase, and points= for limits inside the intervals",
+            received=f"refine={refine!r}" if refine is not None else f"between='auto' for {', '.join(between)}",
+            remedy="leave it out, and take more intervals or points",
+        )
+
+
 def _method_options(prepare: Any) -> tuple[str, ...]:
     """Options of a method besides those of the mesh."""
     import inspect
@@ -105,6 +124,7 @@ def _method_options(prepare: Any) -> tuple[str, ...]:
 def _intervals(chain: Chain, intervals: Given) -> list[int]:
     """Number of control intervals of each phase; one number is that of each."""
     count = len(chain.statements)
+    intervals = INTERVALS if intervals is None else intervals
     listed = list(intervals) if isinstance(intervals, (list, tuple, np.ndarray)) else [intervals] * count
     if len(listed) != count or not all(is_whole(n) for n in listed):
         raise ProblemError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
@@ -36,13 +37,12 @@ from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import best_of, cost_of, from_starts
+from covocp.solving import refining
+from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
+from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import far_away
 from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
-from covocp.solving.methods import METHODS as METHODS
-from covocp.solving.methods import check_method as check_method
-from covocp.solving.methods import method_options as method_options
-from covocp.solving.methods import methods as methods
+from covocp.solving.methods import METHODS, check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import make_guess, make_guesses
@@ -62,6 +62,8 @@ ESCAPES = (1.0, -1.0)
 STARTS, MOST_STARTS = 8, 10**6
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
+# Control intervals where none are asked for.
+INTERVALS = 100
 NOMINALS = ("combined", "deterministic")
 # Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
 # so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
@@ -91,11 +93,11 @@ class Solver:
     Args:
         problem: what to solve.
         method: a name in `methods()`.
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
         nominal: of an expected cost: "combined", chosen together with filter and feedback, or "deterministic", from
             the cost without noise (quadratic synthesis), filter and feedback around it.
-        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`) and
-            of the method.
+        options: of the mesh (`control`, `substeps`, `grid`, `segments`, `covariances`, `covariance_step`, `points`,
+            `refine`) and of the method.
 
     Raises:
         ProblemError: unknown method or option, or a statement that is wrong.
@@ -107,7 +109,7 @@ class Solver:
         problem: Problem,
         method: str = "ipopt",
         *,
-        intervals: int = 100,
+        intervals: int | None = None,
         nominal: str = "combined",
         **options: Any,
     ) -> None:
@@ -129,20 +131,30 @@ class Solver:
         self.method = method
         self.nominal = nominal
         self.statement: Statement = problem.statement()
+        check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
-        asked = Options(intervals=intervals, **{k: v for k, v in options.items() if k in known})
+        count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
+        given = {k: v for k, v in options.items() if k in known}
+        asked = Options(intervals=count if intervals is None else intervals, **given)
+        if refine is not None:
+            asked = refining.first_options(self.statement, asked, nominal, points=method == "ipopt")
         best = with_best_gain_problems(problem)
-        mesh = {field.name: getattr(asked, field.name) for field in fields(Options)}
+        mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
-        self._own_steps = self._options.substeps == "auto"
+        if refine is not None:
+            self._options = refining.with_layers(self.statement, self._options, self.statement.values)
+        self._own_steps = self._options.substeps == "auto" and refine is None
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
+        if asked.refine is not None:
+            self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
+        self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
@@ -177,6 +189,8 @@ class Solver:
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
+        if self._remade:
+            self._keep(*self._first)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
         first = self._best_gain(parameters, guess)
@@ -188,18 +202,19 @@ class Solver:
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
-                    guesses = make_guesses(self._solved, self._prepared.mesh, values, guess)
+                    guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
                     outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     if first is not None and guess is not first and not outcome.converged and not reporter.stop:
                         guesses = make_guesses(self._solved, self._prepared.mesh, values, first)
                         outcome, start = from_starts(self._prepared, values, guesses, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start)
                 outcome = self._with_finer_steps(outcome, values, reporter)
+                outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
-            outcome = _with_stats(outcome, **gain_counts(self._problem))
+            outcome = with_stats(outcome, **gain_counts(self._problem))
             return self._beside_classical(self._finish(outcome, allow_failure), values)
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
@@ -241,7 +256,8 @@ class Solver:
             return solution
         try:
             if self._classical is None:
-                mesh = {field.name: getattr(self._options, field.name) for field in fields(Options)}
+                names = [field.name for field in fields(Options) if field.name != "refine"]
+                mesh = {name: getattr(self._options, name) for name in names}
                 self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
             with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
@@ -281,7 +297,7 @@ class Solver:
                 raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
-        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **_counted(solution, outcome)})
+        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
 
     def _solve_values(self, values: Array) -> float | None:
         """Cost of the classical design for stacked parameters; None where it was not found."""
@@ -335,7 +351,7 @@ class Solver:
         warn_user(
             "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
-        return _with_stats(min(better, key=cost_of), left_saddle=True)
+        return with_stats(min(better, key=cost_of), left_saddle=True)
 
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
@@ -364,16 +380,29 @@ class Solver:
                 break
             if not again.converged:
                 break
-            outcome = _with_stats(again, **{**outcome.stats, **again.stats, **_counted(outcome, again)})
+            outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
             self._keep(finer, prepared)
         return outcome
+
+    def _refined(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
+        if not self._remade or reporter.stop:
+            return outcome
+        runs = refining.Runs(
+            self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter
+        )
+        found = refining.remade(
+            refining.Measured(self._options, self._prepared, outcome, least=refining.unseen(self._own)), runs
+        )
+        self._keep(found.options, found.prepared)
+        return found.outcome
 
     def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
         if impossible:
             outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(_with_stats(outcome, **self._options.grading), self.method)
+        solution = Solution.of(with_stats(outcome, **self._options.grading), self.method)
         if not outcome.converged:
             if allow_failure:
                 return solution
@@ -391,17 +420,6 @@ class Solver:
         return solution
 
 
-def interrupted(solution: Solution) -> Interrupted:
-    """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
-    starts = solution.stats.get("starts")
-    if starts is None:
-        found = "the last iterate" if not solution.converged else "a solution"
-    else:
-        found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
-        found += "" if solution.converged else ", of which none converged"
-    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)
-
-
 def _is_worse(solution: Solution, classical: float) -> bool:
     """Whether a combined design costs more than the classical one, by more than the mesh leaves open."""
     return bool(solution.cost - classical > (WORSE + solution.mesh_error) * abs(classical))
@@ -413,17 +431,6 @@ def is_roundoff(cost: float, statement: Statement, options: Options, parameters:
     start = make_guess(statement, mesh, parameters, None).trajectory
     outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
     return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
-
-
-def _counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
-    """Iterations and times of two runs together."""
-    names = ("iterations", "build_seconds", "solve_seconds")
-    both = [name for name in names if name in first.stats and name in second.stats]
-    return {name: first.stats[name] + second.stats[name] for name in both}
-
-
-def _with_stats(outcome: Outcome, **stats: Any) -> Outcome:
-    return replace(outcome, stats={**outcome.stats, **stats})
 
 
 def _noted(solution: Solution, **stats: Any) -> Solution:
@@ -444,7 +451,7 @@ def solve(
     problem: Problem | Phases,
     method: str = "ipopt",
     *,
-    intervals: Given = 100,
+    intervals: Given = None,
     guess: Given = None,
     nominal: str = "combined",
     progress: bool = True,
@@ -457,7 +464,8 @@ def solve(
     Args:
         problem: what to solve; `Phases`: by the method "ipopt".
         method: a name in `methods()`.
-        intervals: number of control intervals; of phases that of each, or a list of one for each.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of each,
+            or a list of one for each.
         guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
             or a dict by name of the phase.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.

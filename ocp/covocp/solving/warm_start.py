@@ -76,21 +76,24 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
     _check_common(statement, solution)
     duration = solution.duration if statement.duration.free else statement.duration.guess
-    own = solution.mesh
+    own, sizes = solution.mesh, mesh.nodes.size
     same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
     sample = solution.at(mesh.nodes * solution.duration)
     at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
     ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
-    plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
     gain = free_gain_block(statement) if solution.loop is not None else None
-    x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     t, m = solution.trajectory, solution.multipliers
+    blocks = (*statement.states, *statement.controls, *statement.matrices)
+    others = {(b.name, b.kind, b.size): b for b in solution.blocks}
+    found = [others.get((b.name, b.kind, b.size)) for b in blocks]
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
-    for block in (*statement.states, *statement.controls, *statement.matrices):
-        other = next(
-            (b for b in solution.blocks if (b.name, b.kind, b.size) == (block.name, block.kind, block.size)), None
-        )
-        matched = matched and other is not None and other.offset == block.offset
+    matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, found, strict=True))
+    if matched:  # nothing of it stays
+        x, u, e = (np.zeros((n, v.shape[1])) for n, v in ((sizes, t.x), (mesh.control_nodes, t.u), (sizes, t.e)))
+    else:
+        plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
+        x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
+    for block, other in zip(blocks, found, strict=True):
         if other is None:
             if block == gain:
                 at = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)

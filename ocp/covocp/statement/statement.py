@@ -105,7 +105,7 @@ class Conditions:
 
     `function` takes (state, control, matrices, time, duration, parameters); `names` has one entry for each row.
     `realised` is the same of one run, whose spread is none: the covariance X of the closed loop is zero in it; None
-    where no row contains X.
+    where no row contains X. `between` tells the rows that must hold at all times, whatever it takes.
     """
 
     function: ca.Function
@@ -114,6 +114,7 @@ class Conditions:
     upper: Array
     uses_matrices: bool
     realised: ca.Function | None = None
+    between: tuple[bool, ...] = ()
 
     __repr__ = short_repr
 

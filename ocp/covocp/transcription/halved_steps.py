@@ -25,12 +25,14 @@ class Refined:
     Attributes:
         jumps: at the ends of the segments, (segments, nx, or nx + ne where the matrices are variables).
         running: running cost.
+        costs: running cost of each interval, (N,).
         states: at the nodes, (N + 1, nx); those at which a segment starts are as given.
         matrices: half-vectors at the nodes, (N + 1, ne); the same where they are variables.
     """
 
     jumps: Array
     running: float
+    costs: Array
     states: Array
     matrices: Array
 
@@ -60,7 +62,10 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
     values = shoot(statement, divided, start)
     jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
     states, matrices = (np.asarray(ca.DM(values[name][:, ::parts]).full()).T for name in ("x", "e"))
-    return Refined(jumps=jumps, running=float(ca.DM(ca.sum2(values["cost"]))), states=states, matrices=matrices)
+    costs = np.asarray(ca.DM(values["cost"]).full()).reshape(mesh.intervals, parts).sum(axis=1)
+    return Refined(
+        jumps=jumps, running=float(ca.DM(ca.sum2(values["cost"]))), costs=costs, states=states, matrices=matrices
+    )
 
 
 def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Array:

@@ -42,15 +42,15 @@ def with_instants(statement: Statement, options: Options) -> Options:
     return replace(options, grid=Graded(nodes=completed(statement, nodes, asked), asked=asked))
 
 
-def completed(statement: Statement, nodes: Array, asked: int) -> Array:
+def completed(statement: Statement, nodes: Array, asked: int | None = None) -> Array:
     """Some nodes with the instants among them; twice where a measurement is taken.
 
     Args:
         statement: the problem.
         nodes: rising.
-        asked: number of intervals that the mesh was asked to have.
+        asked: number of intervals that the mesh was asked to have; None: those between the nodes.
     """
-    needed = _needed(statement, asked)
+    needed = _needed(statement, np.unique(nodes).size - 1 if asked is None else asked)
     if not needed.size:
         return nodes
     others = np.unique(nodes)

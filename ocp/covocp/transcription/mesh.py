@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from covocp.base.arguments import is_number
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
@@ -47,13 +48,16 @@ class Graded:
 
     nodes: of t/T, twice where a measurement is taken; asked: intervals that the user asked for; added: nodes added at
         the start and at the end; stiffness: largest h times rate of the filter on its intervals, None where it was not
-        looked at.
+        looked at; nominal: that of the nominal along a solution, None where only its start is known; layered: whether
+        nodes were added for what the nominal does at its ends within a small part of an interval.
     """
 
     nodes: Array
     asked: int
     added: tuple[int, int] = (0, 0)
     stiffness: float | None = None
+    nominal: Stiffness | None = None
+    layered: bool = False
 
     __repr__ = short_repr
 
@@ -71,6 +75,7 @@ class Options:
     covariance_step: Literal["auto", "gauss", "strang", "rk4"] = "auto"
     step: Literal["auto", "rk4", "rodas"] = "auto"
     points: int | Literal["auto"] = "auto"
+    refine: float | None = None
 
     __repr__ = short_repr
 
@@ -84,6 +89,13 @@ class Options:
         for name, value in (("substeps", self.substeps), ("segments", self.segments), ("points", self.points)):
             if not (isinstance(value, str) and value == "auto"):
                 _whole(name, value, "'auto' or 1, 2, 3, ...")
+        if self.refine is not None and not (is_number(self.refine) and 0 < float(self.refine) < 1):
+            raise ProblemError(
+                "The option 'refine' must be a relative error of the cost.",
+                expected="None, or a number between 0 and 1, such as 1e-6",
+                received=repr(self.refine),
+                remedy="correct refine=",
+            )
 
     def nodes(self) -> Array:
         """Nodes of the normalised time, from 0 to 1.

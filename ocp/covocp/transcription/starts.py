@@ -306,8 +306,9 @@ class _Judged:
 
 def _judged(run: Run, fixed: tuple[int, ...], target: Array, shape: Array, flat: Array, steps: int) -> _Judged:
     """Controls near a shape, brought to the final values with little energy."""
-    u, miss = least_energy(run, fixed, target, shape, flat, steps) if fixed else (shape, 0.0)
-    cost, violation = _merit(run, u)
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable nominal grows beyond what can be squared
+        u, miss = least_energy(run, fixed, target, shape, flat, steps) if fixed else (shape, 0.0)
+        cost, violation = _merit(run, u)
     violation = max(violation, miss)
     return _Judged(u=u, cost=cost, violation=violation if violation > FEASIBLE else 0.0)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.matrices import Array, unpack
+from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
@@ -30,7 +31,7 @@ def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> M
 def stiffness(statement: Statement, options: Options, parameters: Array) -> Stiffness:
     """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
 
-    A graded mesh knows that of the filter on each of its intervals.
+    A graded mesh knows that of the filter on each of its intervals, or that of the nominal along a solution.
     """
     nodes, control = options.nodes(), options.control
     u = controls_guess(statement, nodes[:2], control)[0]
@@ -54,12 +55,47 @@ def stiffness(statement: Statement, options: Options, parameters: Array) -> Stif
         with np.errstate(invalid="ignore"):  # a density that is zero: refused by its name later
             filtered = drift - unpack(e[block.span], block.size) @ information
         matrices = max(matrices, 2 * _largest(_eigenvalues(filtered)))
+    if isinstance(options.grid, Graded) and options.grid.nominal is not None:
+        return replace(options.grid.nominal, matrices=longest * matrices)
     return Stiffness(
         nominal=longest * _largest(rates),
         oscillating=longest * _largest(rates[rates.real >= DAMPED * np.abs(rates)]),
         decaying=longest * _largest(rates[rates.real <= 0.0]),
         matrices=longest * matrices,
     )
+
+
+def nominal_along(
+    statement: Statement, nodes: Array, columns: tuple[Array | float, ...], places: Array, duration: float
+) -> Stiffness:
+    """The stiffness of the nominal along a solution, for the intervals of another mesh; that of matrices is left out.
+
+    Args:
+        statement: the problem.
+        nodes: of the other mesh, t/T.
+        columns: the six arguments at the nodes of the solution, a column each (`Extremal.columns`).
+        places: t/T of these.
+        duration: T [s].
+    """
+    values = state_jacobian(statement).map(places.size)(*columns)
+    slopes = stacked(values, places.size)
+    rates = np.linalg.eigvals(np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)).astype(complex)
+    sizes = np.abs(rates)
+    kinds = {
+        "nominal": sizes,
+        "oscillating": np.where(rates.real >= DAMPED * sizes, sizes, 0.0),
+        "decaying": np.where(rates.real <= 0.0, sizes, 0.0),
+    }
+    first = np.clip(np.searchsorted(places, nodes[:-1], side="right") - 1, 0, places.size - 1)
+    last = np.clip(np.searchsorted(places, nodes[1:]), 0, places.size - 1)
+    first, last = np.minimum(first, last), np.maximum(first, last)  # of an interval without length
+    h = duration * np.diff(nodes)
+    largest = {name: value.max(axis=1, initial=0.0) for name, value in kinds.items()}
+    found = {
+        name: float(np.max([h[k] * value[first[k] : last[k] + 1].max() for k in range(h.size)], initial=0.0))
+        for name, value in largest.items()
+    }
+    return Stiffness(**found)
 
 
 def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:

@@ -1,0 +1,71 @@
+"""Plain problems of known optimum to a relative error of 1e-6: covocp's refined meshes against other tools and by hand.
+
+    python benchmarks/peers/plain.py           every tool on every problem, medians of five runs in random order
+    python benchmarks/peers/plain.py --quick   one run of each
+
+Each case runs in a process of its own; times are those of the processor for a first solve, building included, imports
+left out: on an idle machine what a user waits, all run on one thread. Tools
+without a refinement of their own have 100 intervals, or 10 segments of 10 points (yapss). rockit and yapss are left out
+where they are not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+from collections.abc import Sequence
+
+from cases import Case, measure
+from plain_problems import PLAIN
+
+REFINE, INTERVALS, REPEATS = 1e-6, 100, 5
+CODES = ("covocp, refined", "covocp, 100 intervals", "by hand", "rockit", "yapss")
+
+
+def cases() -> list[Case]:
+    """Every tool that is there, on every problem."""
+    own = {
+        "covocp, refined": {"function": "plain_codes.covocp_solve", "refine": REFINE},
+        "covocp, 100 intervals": {"function": "plain_codes.covocp_solve"},
+        "by hand": {"function": "plain_codes.hand", "intervals": INTERVALS},
+        "rockit": {"function": "plain_codes.rockit", "intervals": INTERVALS},
+        "yapss": {"function": "plain_codes.yapss", "intervals": INTERVALS},
+    }
+    there = [code for code in CODES if code not in ("rockit", "yapss") or importlib.util.find_spec(code)]
+    return [Case(part=name, code=code, options={**own[code], "problem": name}) for name in PLAIN for code in there]
+
+
+def table(measured: Sequence[Case]) -> str:
+    """Error, intervals and seconds of each, a row for each problem."""
+    codes = list(dict.fromkeys(case.code for case in measured))
+    lines = ["| problem | " + " | ".join(codes) + " |", "|---" * (1 + len(codes)) + "|"]
+    for name in PLAIN:
+        row = []
+        for code in codes:
+            case = next(entry for entry in measured if (entry.part, entry.code) == (name, code))
+            off, seconds = case.median("off"), case.median()
+            row.append("failed" if off is None or seconds is None else f"{off:.0e}, {seconds:.2f} s")
+        lines.append(f"| {name} | " + " | ".join(row) + " |")
+    reached = []
+    for code in codes:
+        own = [(case.median("off"), case.median()) for case in measured if case.code == code]
+        count = sum((off if off is not None else math.inf) <= REFINE for off, _ in own)
+        fast = sum((off or 0.0) <= REFINE and (s or math.inf) <= 1.0 for off, s in own if off is not None)
+        reached.append(f"**{count} of {len(own)}**, {fast} within 1 s")
+    lines.append("| error at most 1e-6 | " + " | ".join(reached) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one run of each")
+    options = parser.parse_args()
+    every = cases()
+    measure(every, 1 if options.quick else REPEATS)
+    print(table(every))
+
+
+if __name__ == "__main__":
+    main()
