@@ -22,7 +22,8 @@ from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
-from covocp.solving.solver import INTERVALS, STARTS, method_options
+from covocp.solving.methods import method_options
+from covocp.solving.solver import INTERVALS, STARTS
 from covocp.transcription.mesh import Options
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130

@@ -464,8 +464,8 @@ def solve(
     Args:
         problem: what to solve; `Phases`: by the method "ipopt".
         method: a name in `methods()`.
-        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of each,
-            or a list of one for each.
+        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of
+            each, or a list of one for each.
         guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
             or a dict by name of the phase.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
