@@ -304,8 +304,40 @@ class Measurement:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Chance:
+    """lower <= expression <= upper of the actual system with a probability.
+
+    probability: of each row, or of all rows together where they are joint; smallest: to which its standard deviations
+    are rounded. slopes: by the augmented state and by the controls that scatter, and spread: the name of the matrix
+    that is their covariance (None: X of the closed loop), once they are known.
+    """
+
+    name: str
+    expression: ca.MX
+    lower: Array
+    upper: Array
+    probability: float
+    joint: bool
+    smallest: float
+    at: Place
+    where: str
+    slopes: tuple[ca.MX, ca.MX] | None = None
+    spread: str | None = None
+
+    __repr__ = short_repr
+
+    @property
+    def each(self) -> float:
+        """Probability of each row: where they are joint each takes an equal share of the risk, by Boole's bound."""
+        return 1.0 - (1.0 - self.probability) / self.lower.size if self.joint else self.probability
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
-    """lower <= expression <= upper along the path, at the start or at the end."""
+    """lower <= expression <= upper along the path, at the start or at the end.
+
+    chance: the condition on probabilities that it stands for, with this name; else None.
+    """
 
     name: str
     expression: ca.MX
@@ -313,6 +345,7 @@ class Constraint:
     upper: Array
     at: Place
     where: str
+    chance: Chance | None = None
 
     __repr__ = short_repr
 
@@ -392,7 +425,7 @@ class Declarations:
 
     time, duration: symbols of the running and of the terminal time; the duration is a number where it is fixed.
     rates: by the name of the state or the matrix. expansion: of an expected cost that was derived. spread: the symbol
-    of the covariance of the closed loop.
+    of the covariance of the closed loop. chances: that are not yet constraints, because the cost is not known.
     """
 
     name: str
@@ -407,6 +440,7 @@ class Declarations:
     rates: Mapping[str, Dynamics] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    chances: tuple[Chance, ...] = ()
     cost: tuple[ca.MX, ca.MX] | None = None
     expected: Expected | None = None
     expansion: Expansion | None = None
@@ -418,7 +452,7 @@ class Declarations:
     def named(self) -> tuple[Any, ...]:
         """All declarations that have a name."""
         symbols = (*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices)
-        return (*symbols, *self.measurements, *self.constraints)
+        return (*symbols, *self.measurements, *self.constraints, *self.chances)
 
     @property
     def taken(self) -> tuple[Any, ...]:

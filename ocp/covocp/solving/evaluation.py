@@ -222,7 +222,7 @@ def _under(solution: Solution, truth: Given) -> Solution:
         cost_terms=dict(loop.cost),
         loop=loop,
         stored_optimality=None,
-    )
+    ).with_chances()
 
 
 def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
