@@ -205,8 +205,8 @@ def _check_scatters(own: Declarations, entry: Chance, fed_back: bool) -> None:
         if i not in rows:
             raise ProblemError(
                 f"Nothing in '{entry.name}'{f', component {i},' if entry.lower.size > 1 else ''} scatters.",
-                expected="a state or an unknown" + (" or a control" if fed_back else
-                ": without feedback the controls are those of the nominal"),
+                expected="a state or an unknown"
+                + (" or a control" if fed_back else ": without feedback the controls are those of the nominal"),
                 received=str(entry.expression[i])[:200],
                 remedy="use subject_to() for what does not scatter",
             )
