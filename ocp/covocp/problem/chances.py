@@ -1,15 +1,15 @@
 """Conditions on probabilities: what the actual system meets with a given probability, by its linearised spread.
 
-An expression y of states, unknowns and controls scatters about its value along the nominal by the variance s^2 = J X J',
-J its slopes. With a feedback X is the covariance of the closed loop, E + Xhat and that of the controls. Without one
-nothing that is measured changes what the system does: X is then the covariance that nobody measures,
+An expression y of states, unknowns and controls scatters about its value along the nominal by the variance
+s^2 = J X J', J its slopes. With a feedback X is the covariance of the closed loop, E + Xhat and that of the controls.
+Without one nothing that is measured changes what the system does: X is then the covariance that nobody measures,
 
     dX/dt = F X + X F' + Q,      X(0) = E(0),
 
 not that of the filter's error. It is a matrix of the problem; where nothing is measured it is E itself.
 
-With one limit the condition is y + q s <= upper, q the quantile; with two it is exact (`base.normal`). Several rows keep
-their limits together where each takes an equal share of the risk (Boole's bound: no joint law is needed).
+With one limit the condition is y + q s <= upper, q the quantile; with two it is exact (`base.normal`). Several rows
+keep their limits together where each takes an equal share of the risk (Boole's bound: no joint law is needed).
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _check_scatters(own: Declarations, entry: Chance, fed_back: bool) -> None:
                 received=str(entry.expression[i])[:200],
                 remedy="use subject_to() for what does not scatter",
             )
-    uncertain = [q.variance for q in own.augmented] + [m.initial for m in own.matrices if m.estimation]
+    uncertain: list[Any] = [q.variance for q in own.augmented] + [m.initial for m in own.matrices if m.estimation]
     uncertain += [rate.noise for rate in own.rates.values() if rate.noise is not None]
     if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
         raise ProblemError(

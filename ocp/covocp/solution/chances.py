@@ -112,7 +112,7 @@ def chance_section(entries: tuple[Reached, ...]) -> Section:
         rows.append([q.name, shown_probability(q.asked), shown_probability(q.reached), *numbers, number(q.time, 4)])
         rows[-1].append(place if q.met else f"{place}, NOT MET")
     note = (
-        "Reached: by the linearised spread, at each node by itself; margin: what each limit could be drawn in by at the "
-        "tightest node. simulate() counts the runs."
+        "Reached: by the linearised spread, at each node by itself; margin: what each limit could be drawn in by at "
+        "the tightest node. simulate() counts the runs."
     )
     return [Table(columns=columns, rows=rows, words=(0, len(columns) - 1)), Sentence(note, "")]

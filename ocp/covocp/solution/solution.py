@@ -120,11 +120,7 @@ class Solution:
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             loop=loop,
         )
-        return read_only(solution.with_chances())
-
-    def with_chances(self) -> Solution:
-        """The same with what its covariances reach of the conditions on probabilities."""
-        return replace(self, chances=reached(self)) if self.statement is not None and self.statement.chances else self
+        return read_only(replace(solution, chances=reached(solution)))
 
     @property
     def mesh(self) -> Mesh:
