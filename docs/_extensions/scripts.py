@@ -42,6 +42,7 @@ GALLERY = (
             "designed_excitation",
             "attitude_slew",
             "bought_sensor",
+            "position_fixes",
         ),
     ),
     (

@@ -76,6 +76,10 @@ def control_metric(mesh: Mesh, duration: float, weights: Array) -> Any:
         columns.append((nu * (np.arange(n) + j)[:, None] + inner_columns).ravel())
         values.append(block.reshape(-1))
     size = mesh.control_nodes * nu
+    idle = (nu * np.array(mesh.idle, dtype=int)[:, None] + np.arange(nu)).ravel()  # nothing moves these
+    rows.append(idle)
+    columns.append(idle)
+    values.append(np.ones(idle.size))
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.coo_array(entries, shape=(size, size)).tocsc()
 

@@ -37,7 +37,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
-from covocp.extremal.costates import backward_interval, forward_costates
+from covocp.extremal.costates import backward_interval, forward_costates, reading_slopes
 from covocp.extremal.hamiltonian import hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import Interval, repeated
@@ -266,6 +266,16 @@ def quadrature_interval(statement: Statement, pairs: int, influences: int, *, ma
         by_cost = points(ca.DM.zeros(size, 1), *at[i])[0]
         parts = ((1 - c) * by_control, c * by_control, by_duration, (1 - c) * by_cost, c * by_cost)
         totals = [total + area * part for total, part in zip(totals, parts, strict=True)]
+    if statement.samples is not None:
+        for j in range(pairs):
+            part = common.part(j / pairs, (j + 1) / pairs)
+            read = [
+                reading_slopes(statement, part, z[:, 2 * j], column, cost=k == 0)[1:]
+                for k, column in enumerate(ca.horzsplit(ends[j + 1]))
+            ]
+            by_control, by_duration = (ca.horzcat(*values) for values in zip(*read, strict=True))
+            by_cost = reading_slopes(statement, part, z[:, 2 * j], ca.DM.zeros(size))[1]
+            totals[0], totals[2], totals[3] = totals[0] + by_control, totals[2] + by_duration, totals[3] + by_cost
     return ca.Function("quadrature", [after, passed, z, *common], totals)
 
 
@@ -393,7 +403,7 @@ def _slopes(sweeps: Sweeps, u: Array, duration: float, parameters: Array, middle
         offset = int(sweeps.mesh.control == "linear")
         total[:, :n] += one.reshape(nu, n, count).transpose(2, 1, 0)
         total[:, offset : offset + n] += two.reshape(nu, n, count).transpose(2, 1, 0)
-        return total
+        return np.array([sweeps.mesh.gathered(own) for own in total])
 
     return Slopes(
         control=gather(first, second, width),

@@ -362,7 +362,8 @@ class Space:
         final += bounds[-1]
         bounds[-1] = 0.0
         controls = held[: self.controls].reshape(zero.controls.shape)
-        return Multipliers(
+        return replace(
+            zero,
             final=final[: st.nx],
             final_matrices=final[st.nx :],
             end=end,

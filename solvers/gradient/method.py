@@ -227,7 +227,8 @@ class GradientSolver:
     def _trajectory(self, iterate: Iterate) -> Trajectory:
         """The run of an iterate as data."""
         run, nx = iterate.run, self._statement.nx
-        return Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
+        u = self._mesh.acting(run.u.T).T
+        return Trajectory(x=run.z[:, :nx], u=u, e=run.z[:, nx:], duration=run.duration)
 
     def _outcome(self, space: Space, end: End, stats: dict[str, Any]) -> Outcome:
         """The last iterate as data."""

@@ -12,7 +12,7 @@ so that the multiplier m is found without d growing without bound (M. J. D. Powe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -27,6 +27,7 @@ from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
+from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import at_nodes
 
 Indices = NDArray[np.intp]
@@ -104,8 +105,7 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
         exact: rows of the final conditions that influence functions meet, not penalties.
     """
     n = mesh.intervals
-    steps = np.diff(mesh.nodes) * statement.duration.guess
-    shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    shares = quadrature_weights(replace(mesh, control="linear")) * statement.duration.guess
     every, once = np.arange(n + 1), np.ones(1)
     (lower, upper), bounded = limits(statement), limited(statement)
     names = (*statement.state_names, *statement.matrix_names)

@@ -7,7 +7,7 @@ import pytest
 from covocp.models import unknown_lag
 from covocp.statement.interval import SIDE, Interval, one_sided
 
-WHOLE = Interval(start=1.0, end=3.0, s=0.2, ds=0.5, duration=10.0, parameters=7.0)
+WHOLE = Interval(start=1.0, end=3.0, s=0.2, ds=0.5, duration=10.0, parameters=7.0, reading=1.0)
 
 
 def test_control_and_time_inside():

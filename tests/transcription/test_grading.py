@@ -173,7 +173,7 @@ def test_both_forms_of_the_running_cost_telescope():
     """Over one interval of a smooth loop they agree to the order of Simpson's rule, and are not the same."""
     solution = at_rest(accurate(variance=0.02), grid=np.linspace(0, 1, 401))
     st, t, k = solution.statement, solution.trajectory, 200
-    common = (t.u[k], t.u[k + 1], *(solution.mesh.nodes[k], 1 / 400), t.duration, solution.parameters)
+    common = (t.u[k], t.u[k + 1], *(solution.mesh.nodes[k], 1 / 400), t.duration, solution.parameters, [])
     x, e = np.stack([t.x[k], t.x[k]]).T, t.e[[k, k + 1]]
     middle = 0.5 * (e[0] + e[1])  # linear over so short an interval but for h^2
     values = [

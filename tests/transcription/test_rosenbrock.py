@@ -39,7 +39,7 @@ def test_order_four_in_state_and_running_cost(count):
     true = solve_ivp(rate, (0, 2), [*start, 0.0], **TIGHT).y[:, -1]
     errors = []
     for substeps in (32, 64, 128):
-        end, _, cost = implicit_interval(statement, substeps, GAUSS_NODES)(start, 0.3, 1.0, 0, 1, 2.0, [])
+        end, _, cost = implicit_interval(statement, substeps, GAUSS_NODES)(start, 0.3, 1.0, 0, 1, 2.0, [], [])
         errors.append([np.abs(np.ravel(end.full()) - true[:-1]).max(), abs(float(cost) - true[-1])])
     order = np.log2(np.array(errors)[:-1] / np.array(errors)[1:])
     assert (order > 3.6).all()
@@ -51,8 +51,8 @@ def test_inside_a_step_the_polynomial_is_of_order_three_and_turning_round_change
     for h in (0.2, 0.1, 0.05):
         true = solve_ivp(rate, (0, h), [1.0, 0.5, 0.0], dense_output=True, **TIGHT).sol
         after, s = true(h)[:2], h / 2
-        ahead = between(statement, (0.3, 0.7))([1.0, 0.5], after, 0.3, 0.3 + 0.35 * h, 0, s, 2.0, [])
-        turned = between(statement, (0.3, 0.7))(after, [1.0, 0.5], 0.3 + 0.35 * h, 0.3, s, -s, 2.0, [])
+        ahead = between(statement, (0.3, 0.7))([1.0, 0.5], after, 0.3, 0.3 + 0.35 * h, 0, s, 2.0, [], [])
+        turned = between(statement, (0.3, 0.7))(after, [1.0, 0.5], 0.3 + 0.35 * h, 0.3, s, -s, 2.0, [], [])
         np.testing.assert_allclose(turned.full()[:, ::-1], ahead.full(), rtol=1e-13)
         errors.append(np.abs(ahead.full() - np.column_stack([true(0.3 * h)[:2], true(0.7 * h)[:2]])).max())
     assert (np.log2(np.array(errors)[:-1] / np.array(errors)[1:]) > 3.7).all()  # of one step: an order more
@@ -64,7 +64,7 @@ def test_what_decays_fast_is_gone_after_a_step_and_follows_its_equilibrium(rate)
     x, u = problem.state("x", initial=5.0), problem.control("u")
     problem.dynamics(x, -rate * (x - u))
     problem.minimize(running=u**2)
-    end = float(implicit_step(problem.statement(), ())([5.0], 1.0, 1.0, 0, 1, 1.0, [])[0])
+    end = float(implicit_step(problem.statement(), ())([5.0], 1.0, 1.0, 0, 1, 1.0, [], [])[0])
     assert abs(end - 1.0) < 4.0 * 20 / rate  # stability function: of the order of 1/z where z is large
 
 

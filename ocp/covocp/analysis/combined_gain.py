@@ -129,7 +129,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
     else:
         classical = evaluate(problem, nominal=nominal, intervals=intervals, **options)
     size, extremal = abs(classical.cost), classical.extremal
-    mesh = Options(grid=extremal.mesh.nodes, control=classical.mesh.control)  # type: ignore[arg-type]
+    mesh = Options(grid=np.unique(extremal.mesh.nodes), control=classical.mesh.control)  # type: ignore[arg-type]
     if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
         still = np.zeros_like(extremal.trajectory.u)
         return Worth(classical=classical, first_order=0.0, gain=0.0, direction=still, step=0.0)
@@ -155,7 +155,7 @@ def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
     plain = np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), np.diag(scale**-2.0)))
     metric = plain if given is None else given
     lower, upper = st.control_bounds
-    free = np.ones(u.size, dtype=bool)
+    free = ~np.repeat(np.isin(np.arange(mesh.control_nodes), mesh.idle), st.nu)
     for _ in range(u.size):
         solved = np.linalg.solve(metric[np.ix_(free, free)], np.column_stack([slopes.ravel()[free], rows[:, free].T]))
         gram = rows[:, free] @ solved[:, 1:]

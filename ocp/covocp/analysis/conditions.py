@@ -57,6 +57,8 @@ def _kind(statement: Statement) -> str:
         return f"the problem has decisions or integrals: {others}"
     if statement.coupled:
         return "the nominal depends on the estimation covariance"
+    if statement.samples is not None:
+        return "measurements are taken at instants: " + ", ".join(block.name for block in statement.samples.blocks)
     if statement.measurement is None:
         return "nothing is measured"
     if not statement.nu:

@@ -5,6 +5,7 @@ design, K = E M' U^-1 and C, and by the true statistics E0(0), Q0, U0 (appendix 
 
     de = (F - K M) e dt + K dv - dn,      dy = (F - G C) y dt - K M e dt + K dv.
 
+and with jumps where something is read at an instant (`readings`).
 Their joint covariance [E Z; Z' Xhat] obeys a Lyapunov equation, stepped by the two-stage Gauss method: it is positive
 semidefinite at any step size. Where the statistics are the design's, Z = 0 and E is the design's. The cost is had from
 it by (E-1), extended by Z (6.11), and from E and S of the design by (E-20).
@@ -28,6 +29,7 @@ from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
+from covocp.extremal.readings import Readings, readings_along
 from covocp.statement.interval import Interval, model_symbols, one_sided
 from covocp.statement.statement import Loop, Statement
 from covocp.transcription.steps import KEPT
@@ -46,11 +48,13 @@ class Statistics:
     """What is truly uncertain: covariance of the initial deviation, densities of process and measurement noise.
 
     initial: (n, n); density: (state, control, time, duration, parameters) -> Q (n, n), U (m, m); parameters: its own.
+    variance: (state, control, time, duration, parameters) -> R of what is read at instants; None where nothing is.
     """
 
     initial: Array
     density: ca.Function
     parameters: Array
+    variance: ca.Function | None = None
 
     __repr__ = short_repr
 
@@ -160,11 +164,26 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
     step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
+    jumps = {entry.interval: _jump(extremal, entry, statistics) for entry in readings_along(extremal)}
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
     values[0, :size, :size] = statistics.initial
     for k, D in enumerate(stacked(step, n * m)):
         values[k + 1] = lyapunov_after(D, values[k])
+        if k % m == m - 1 and k // m in jumps:
+            transition, noise = jumps[k // m]
+            values[k + 1] = transition @ values[k + 1] @ transition.T + noise
     return values
+
+
+def _jump(extremal: Extremal, readings: Readings, statistics: Statistics) -> tuple[Array, Array]:
+    """Transition and noise of [E Z; Z' Xhat] where something is read, under the true variance of it."""
+    variance = readings.R
+    if statistics.variance is not None:
+        k = readings.interval
+        x, u, _, *rest = (np.asarray(column)[:, k] for column in extremal.columns())
+        own = statistics.variance(x, u, *rest[:2], statistics.parameters)
+        variance = np.asarray(own.full())[np.ix_(readings.rows, readings.rows)]
+    return readings.jump(variance)
 
 
 def loop_substeps(extremal: Extremal) -> int:
@@ -200,6 +219,7 @@ def design_statistics(extremal: Extremal) -> Statistics:
         initial=unpack(start_covariance(st, extremal, extremal.parameters)[block.span], block.size),
         density=densities(st),
         parameters=extremal.parameters,
+        variance=variances(st),
     )
 
 
@@ -212,6 +232,16 @@ def densities(statement: Statement) -> ca.Function:
     measured = statement.measurement
     density = ca.DM(0, 0) if measured is None else measured(*arguments)[2]
     return ca.Function("densities", arguments, [noise, ca.densify(density)])
+
+
+@lru_cache(maxsize=KEPT)
+def variances(statement: Statement) -> ca.Function | None:
+    """(state, control, time, duration, parameters) -> variance of what is read at instants; None where nothing is."""
+    if statement.samples is None:
+        return None
+    x, u, _, *rest = model_symbols(statement)
+    variance = statement.samples.measurement(x, u, *rest)[2]
+    return ca.Function("variances", [x, u, *rest], [ca.densify(variance)])
 
 
 def _loop(statement: Statement) -> Loop:

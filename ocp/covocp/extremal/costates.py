@@ -122,7 +122,7 @@ def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array,
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start.T
     slopes[int(mesh.control == "linear") :][:n] += by_end.T
-    return np.vstack([values.T, last]), slopes, float(by_duration.sum())
+    return np.vstack([values.T, last]), mesh.gathered(slopes), float(by_duration.sum())
 
 
 def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
@@ -238,8 +238,41 @@ def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = T
         z, full = points[round(2 * (1 - c))], _with(costate, behind, given[round(2 * (1 - c))])
         return slope(*pair.at(1 - c, z[:nx], z[nx:]), full[:nx], full[nx:])
 
-    before = _with(classical_step(rate, after, pair.h), behind, given[0])
-    return ca.Function("backward", [after, *points, *given, *pair], [before])
+    before = classical_step(rate, after, pair.h)
+    if statement.samples is not None and matrices:
+        before = ca.densify(reading_slopes(statement, pair, points[0], before, cost=cost)[0])
+    return ca.Function("backward", [after, *points, *given, *pair], [_with(before, behind, given[0])])
+
+
+def reading_slopes(
+    statement: Statement, part: Interval, z: Expr, costate: Expr, *, cost: bool = True
+) -> tuple[Any, ...]:
+    """Costates before what a part of an interval reads, from those after it; slopes there by its controls and by T.
+
+    Args:
+        statement: with measurements at instants.
+        part: symbols of it.
+        z: x and e stacked before it.
+        costate: of both after it.
+        cost: whether what it adds to the running cost counts.
+    """
+    assert statement.samples is not None
+    nx = statement.nx
+    symbolic: Any = type(z)
+    point = symbolic.sym("z", nx + statement.ne)
+    control, duration, time = symbolic.sym("u", statement.nu), symbolic.sym("T"), symbolic.sym("t")
+    later = symbolic.sym("later", nx + statement.ne)
+    reading, p = symbolic.sym("reading", statement.readings), symbolic.sym("p", statement.np)
+    inputs = [point, control, time, duration, p, reading, later]
+    after, added = statement.samples.update(point[:nx], control, point[nx:], time, duration, p, reading)
+    value = ca.dot(later[nx:], after) + ca.dot(later[:nx], point[:nx]) + (added if cost else 0)
+    by_time = ca.gradient(value, time)
+    slopes = [ca.gradient(value, point), ca.gradient(value, control), by_time, ca.gradient(value, duration)]
+    function = ca.Function("reading_slopes", inputs, [ca.densify(slope) for slope in slopes])
+    by_z, by_u, by_t, by_duration = function(
+        z, part.start, part.time(0.0), part.duration, part.parameters, part.reading, costate
+    )
+    return by_z, by_u, part.place(0.0) * by_t + by_duration
 
 
 def _behind(statement: Statement) -> list[int]:
@@ -280,6 +313,9 @@ def forward_costates(statement: Statement, pairs: int) -> ca.Function:
     h, slope_there = interval.h / pairs, rate(0, start, 0.0)
     for j in range(pairs):
         after = classical_step(partial(rate, j), value, h, slope_there)
+        if statement.samples is not None:
+            part, still = interval.part(j / pairs, (j + 1) / pairs), ca.MX.zeros(nx + statement.ne)
+            after = after - reading_slopes(statement, part, z[:, 2 * j], still)[0][behind]
         before, slope_there = slope_there, rate(j, after, 1.0)
         points += [hermite(value, after, h * before, h * slope_there, 0.5), after]
         value = after

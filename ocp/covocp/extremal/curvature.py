@@ -199,7 +199,9 @@ class _Reduced:
         held = held_by(fine)
         fine = held.bare(fine)
         own, touching = held.controls[:: mesh.points], held.touching[:: mesh.points]  # those between follow from them
-        tangents = tangents_along(extremal, own == 0, _free_start(extremal))
+        free = own == 0
+        free[mesh.idle] = False  # what moves them acts for no time
+        tangents = tangents_along(extremal, free, _free_start(extremal))
         if not tangents.size:
             return None
         between = _between(extremal, fine)
@@ -339,10 +341,14 @@ def held_jacobian(extremal: Extremal) -> Array:
     fine = held.bare(fine)
     _, jacobian = second_order(fine.statement, fine.mesh, held.strictly)
     everything = np.ones(extremal.trajectory.u.shape, dtype=bool)
+    everything[extremal.mesh.idle] = False
     tangents = tangents_along(extremal, everything, feedback=False)
     rows = np.asarray(jacobian(*arguments(fine, _costates(fine, through=True))).full())
     slopes = _between(extremal, fine).backward(*_split(fine, rows))
-    return _by_v(tangents, *slopes, np.eye(tangents.size))
+    by_v = _by_v(tangents, *slopes, np.eye(tangents.size))
+    result = np.zeros((by_v.shape[0], everything.size))
+    result[:, everything.ravel()] = by_v
+    return result
 
 
 def mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:

@@ -52,7 +52,8 @@ class Dense:
     """States and half-vectors as piecewise cubic polynomials of the normalised time.
 
     Args:
-        knots: normalised times, (P + 1,), rising from 0 to 1; the nodes of the mesh are among them.
+        knots: normalised times, (P + 1,), rising from 0 to 1; the nodes of the mesh are among them, twice where a
+            measurement is taken: the piece between has no length.
         values: x and e stacked there, (P + 1, nx + ne).
         first: slopes by the normalised time at the starts of the pieces, (P, nx + ne).
         last: slopes at their ends, which differ where a rate jumps.
@@ -65,14 +66,20 @@ class Dense:
 
     __repr__ = short_repr
 
-    def at(self, s: Array) -> Array:
-        """x and e stacked at some normalised times, (K, nx + ne)."""
-        k = np.clip(np.searchsorted(self.knots, s, side="right") - 1, 0, self.knots.size - 2)
+    def at(self, s: Array, *, before: bool = False) -> Array:
+        """x and e stacked at some normalised times, (K, nx + ne); before or after what is read there."""
+        side: Any = "left" if before else "right"
+        k = np.clip(np.searchsorted(self.knots, s, side=side) - 1, 0, self.knots.size - 2)
         h = (self.knots[k + 1] - self.knots[k])[:, None]
-        c = (s[:, None] - self.knots[k][:, None]) / h
+        c = np.where(h > 0, (s[:, None] - self.knots[k][:, None]) / _lengths(h), float(not before))
         return np.asarray(
             hermite(self.values[k], self.values[k + 1], h * self.first[k], h * self.last[k], c), dtype=float
         )
+
+
+def _lengths(h: Array) -> Array:
+    """Lengths of pieces, to divide by: 1 of those that have none."""
+    return np.where(h > 0, h, 1.0)
 
 
 def dense_output(extremal: Extremal, *, matrices: bool = True) -> Dense:
@@ -200,7 +207,9 @@ class _Steps:
     def advance(self, k: Expr, c: Array, d: Array, z: Array) -> Array:
         """The entries at the share d from those at c."""
         s, after = self.place(k, c), self.place(k, d)
-        common = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :], *self.fixed(c.size))
+        ends = (self.control(k, c).T, self.control(k, d).T, s[None, :], (after - s)[None, :])
+        nothing = np.zeros((self.extremal.statement.readings, c.size))
+        common = (*ends, *self.fixed(c.size), nothing)
         st, mesh = self.extremal.statement, self.extremal.mesh
         function = _advance(st, mesh.step, mesh.linear_solver, tuple(self.rows), self.states is not None)
         if self.states is None:
@@ -316,13 +325,21 @@ class _Pieces:
         return whole.chosen(np.lexsort((whole.c, whole.k)))
 
 
+def _read(steps: _Steps, k: Expr) -> _Pieces:
+    """The intervals without length: from the values before what is read to those after it."""
+    still, zero = np.zeros((k.size, len(steps.rows))), np.zeros(k.size)
+    return _Pieces(k=k, c=zero, d=zero + 1.0, low=steps.start[k], high=steps.goal[k], first=still, last=still)
+
+
 def _march(steps: _Steps) -> Dense:
     """All intervals from their start to their end by steps of their own lengths; one that is lost is left cubic."""
     n = steps.extremal.mesh.intervals
     c, h, z = np.zeros(n), np.ones(n), steps.start.copy()
     slope = steps.slope(np.arange(n), c, h, z)
-    found: list[_Pieces] = []
-    active = np.arange(n)
+    read = np.array(steps.extremal.mesh.instants, dtype=np.intp)
+    found = [_read(steps, read)] if read.size else []
+    c[read] = 1.0
+    active = np.flatnonzero(c < 1.0)
     for _ in range(MOST_ROUNDS):
         k, at = active, c[active]
         to = np.where(h[k] >= 1.0 - at, 1.0, at + h[k])
@@ -396,7 +413,7 @@ def _table(steps: _Steps, pieces: _Pieces) -> Dense:
     missed = _corrections(steps, pieces, missed)[k]
     low, high = pieces.low - pieces.c[:, None] * missed, pieces.high - pieces.d[:, None] * missed
     high[arrived] = steps.goal
-    length = np.diff(nodes)[k][:, None]
+    length = _lengths(np.diff(nodes)[k][:, None])
     first, last = (pieces.first - missed) / length, (pieces.last - missed) / length
     places = steps.place(k, pieces.c), steps.place(k, pieces.d)
     if steps.backward:
@@ -452,14 +469,15 @@ def _union(nodes: Array, groups: list[Array]) -> Array:
     k = np.clip(np.searchsorted(nodes, inside) - 1, 0, nodes.size - 2)
     near = SAME * np.diff(nodes)[k]
     inside = inside[(inside - nodes[k] > near) & (nodes[k + 1] - inside > near)]
-    apart = np.diff(inside, prepend=-1.0) > SAME * np.diff(nodes).min()
-    return np.union1d(nodes, inside[apart])
+    apart = np.diff(inside, prepend=-1.0) > SAME * _lengths(np.diff(nodes)).min()
+    return np.sort(np.concatenate([nodes, inside[apart]]))
 
 
 def _restricted(dense: Dense, knots: Array) -> tuple[Array, Array, Array]:
     """Values and slopes of the same polynomials at other knots."""
     j = np.clip(np.searchsorted(dense.knots, 0.5 * (knots[1:] + knots[:-1])) - 1, 0, dense.knots.size - 2)
-    h = (dense.knots[j + 1] - dense.knots[j])[:, None]
+    j[np.diff(knots) == 0] = np.flatnonzero(np.diff(dense.knots) == 0)  # the same instants in both
+    h = _lengths((dense.knots[j + 1] - dense.knots[j])[:, None])
     a, b, slopes = dense.values[j], dense.values[j + 1], (h * dense.first[j], h * dense.last[j])
 
     def value(at: Array) -> Array:
@@ -483,5 +501,5 @@ def _straighten(dense: Dense, block: Block, offset: int) -> None:
     looks = hermite(*ends, h * dense.first[:, None, rows], h * dense.last[:, None, rows], c)
     bad = ~_semidefinite(looks, block.size)
     pieces = np.flatnonzero(bad.any(axis=1) & ~bad[:, 0] & ~bad[:, -1])
-    chord = (dense.values[pieces + 1, rows] - dense.values[pieces, rows]) / h[pieces, 0]
+    chord = (dense.values[pieces + 1, rows] - dense.values[pieces, rows]) / _lengths(h[pieces, 0])
     dense.first[pieces, rows] = dense.last[pieces, rows] = chord

@@ -67,6 +67,13 @@ class Extremal:
         u = self.controls
         return np.asarray(u[k] if self.mesh.control == "constant" else u[k] + c[:, None] * (u[k + 1] - u[k]))
 
+    def controls_at(self, s: Array, *, before: bool = False) -> Array:
+        """Controls at some normalised times, (K, nu); where they jump those after it, or before it."""
+        nodes = self.mesh.nodes
+        k = np.clip(np.searchsorted(nodes, s, side="left" if before else "right") - 1, 0, nodes.size - 2)
+        h = nodes[k + 1] - nodes[k]
+        return self.control(k, np.where(h > 0, (s - nodes[k]) / np.where(h > 0, h, 1.0), float(not before)))
+
     def columns(self) -> tuple[Array | float, ...]:
         """Arguments (x, u, e, t, T, p) at the nodes, a column each, for a mapped function of the statement."""
         return (

@@ -43,6 +43,7 @@ def evaluate_controls(
     """
     x0, e0 = starts(statement, mesh, parameters)
     x0, e0 = statement.started(x0 if start is None else start, parameters, e0)
+    u = np.asarray(mesh.acting(u.T)).T
     symbols = [
         ca.MX.sym("u", statement.nu, mesh.control_nodes),
         ca.MX.sym("x0", statement.nx),

@@ -6,8 +6,9 @@ The expected cost expands L and k to second order in the deviations, and takes r
     d' = F d - G C y + q/2,    y' = (F - G C) y + K (M (d - y) + r/2),
     q_i = tr(f_i,zz Z),  r_i = tr(h_i,zz Z),  z = (augmented state, control),  Z = < dz dz' >,  du = -C dx',
 
-which to the same order adds k_x d(T) + int (L_x d - L_u C y) dt to the cost. Integrated along the nodes by the
-trapezoidal rule, which no gain makes unstable.
+and where something is read at an instant y jumps by K (H (d - y) + r/2). To the same order this adds
+k_x d(T) + int (L_x d - L_u C y) dt to the cost. Integrated along the nodes by the trapezoidal rule, which no gain makes
+unstable.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,6 +27,7 @@ from covocp.base.matrices import Array, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.readings import Readings, readings_along
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
@@ -75,7 +77,13 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
         return None
     state, h, cost = np.zeros(2 * n), np.diff(extremal.time), 0.0
     states = np.zeros((count + 1, 2 * n))
+    jumps = {
+        entry.interval: (entry.gain @ entry.H, entry.gain @ bent) for entry, bent in _bent_readings(extremal, loop)
+    }
     for k in range(count):
+        if k in jumps:
+            fed, forced = jumps[k]
+            state[n:] += fed @ (state[:n] - state[n:]) + forced
         (A, a, c), (B, b, e) = ((drift[k], forcing[k], slope[k]) for drift, forcing, slope in sides)
         right = state + h[k] / 2 * (A @ state + a + b)
         try:
@@ -91,6 +99,33 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
     return MeanEffect(mean=states[:, :n], estimate=states[:, n:], cost=cost + float(slope @ states[-1, :n]))
 
 
+def _bent_readings(extremal: Extremal, loop: ClosedLoop) -> list[tuple[Readings, Array]]:
+    """What is read at each instant, and r/2 of its curvature."""
+    found = readings_along(extremal)
+    if not found:
+        return []
+    function = _curved_readings(extremal.statement)
+    columns = [np.asarray(column) for column in extremal.columns()]
+    spread = _spread(loop)
+    return [
+        (
+            entry,
+            np.asarray(function(*(c[:, entry.interval] for c in columns), spread[entry.interval]).full())[
+                entry.rows, 0
+            ],
+        )
+        for entry in found
+    ]
+
+
+def _spread(loop: ClosedLoop) -> Array:
+    """< (d, y)(d, y)' > at the nodes, (K, 2n, 2n)."""
+    with_estimate = loop.Xhat - loop.Z  # <d y'> of the deviation d = y - e
+    return np.concatenate(
+        [np.dstack([loop.X, with_estimate]), np.dstack([with_estimate.transpose(0, 2, 1), loop.Xhat])], 1
+    )
+
+
 def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, Array, Array]:
     """Drift (N, 2n, 2n) of (d, y), its forcing (N, 2n), slope (N, 2n) of L by it, at one end of all intervals."""
     st, count = extremal.statement, extremal.mesh.intervals
@@ -101,32 +136,66 @@ def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, A
     columns = [np.asarray(value)[:, part] for value in (x, u, e, t, duration, p)]
     if held:
         columns[1] = np.asarray(u)[:, :count]
-    with_estimate = loop.Xhat - loop.Z  # <d y'> of the deviation d = y - e
-    spread = np.concatenate(
-        [np.dstack([loop.X, with_estimate]), np.dstack([with_estimate.transpose(0, 2, 1), loop.Xhat])], 1
-    )
+    spread = _spread(loop)
     values = _curved(st).map(count)(*columns, spread[part].transpose(1, 0, 2).reshape(2 * n, -1))
     drift, forcing, slope = (stacked(v, count) for v in values)
     return drift, forcing[:, :, 0], slope[:, :, 0]
+
+
+class _Around(NamedTuple):
+    """Symbols z of the augmented state and the controls that are fed back, and the arguments of the model in them."""
+
+    six: list[Any]
+    z: Any
+    at: tuple[Any, ...]
+    value: Any
+
+    @classmethod
+    def of(cls, st: Statement, m: int) -> _Around:
+        """Of m controls that are fed back; `value` is z on the trajectory."""
+        n, unknowns = len(st.augmented), st.unknowns
+        symbolic: Any = st.symbolic
+        x, u, _, t, duration, p = six = model_symbols(st)
+        z = symbolic.sym("z", n + m)
+        states, own, fed = ca.vertsplit(z, [0, n - unknowns, n, n + m])
+        state = ca.vertcat(states, ca.vertsplit(x, [0, n - unknowns, st.nx])[1])
+        control = ca.vertcat(fed, ca.vertsplit(u, [0, m, st.nu])[1])
+        known, means = ca.vertsplit(p, [0, st.np - unknowns, st.np])
+        value = ca.vertcat(ca.vertsplit(x, [0, n - unknowns, st.nx])[0], means, ca.vertsplit(u, [0, m, st.nu])[0])
+        return cls(six, z, (state, control, t, duration, ca.vertcat(known, own)), value)
+
+
+@lru_cache(maxsize=KEPT)
+def _curved_readings(st: Statement) -> ca.Function:
+    """(all six, < (d, y)(d, y)' > (2n, 2n)) -> r/2 of all values that can be read at instants."""
+    symbolic: Any = st.symbolic
+    assert st.loop is not None
+    assert st.samples is not None
+    n, m = len(st.augmented), int(st.loop.gain.size1_out(0))
+    around, spread = _Around.of(st, m), symbolic.sym("spread", 2 * n, 2 * n)
+    seen = _seen(st.loop.gain(*around.six), symbolic)
+    bent = _bend(st.samples.measurement(*around.at)[0], around.z, seen @ spread @ seen.T) / 2
+    inner = ca.Function("bent", [around.z, *around.six, spread], [ca.densify(bent)])
+    return ca.Function("bent", [*around.six, spread], [inner(around.value, *around.six, spread)])
+
+
+def _seen(gain: Expr, symbolic: Any) -> Any:
+    """z of (d, y): the augmented state, and the controls that the estimate moves."""
+    m, n = gain.shape
+    return ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -gain]])
 
 
 @lru_cache(maxsize=KEPT)
 def _curved(st: Statement) -> ca.Function:
     """(all six, < (d, y)(d, y)' > (2n, 2n)) -> drift of (d, y), forcing q/2 and K r/2, slope of L by (d, y)."""
     symbolic: Any = st.symbolic
-    loop, n = st.loop, len(st.augmented)
+    loop, n, unknowns = st.loop, len(st.augmented), st.unknowns
     assert loop is not None
     assert st.nominal is not None
     m = int(loop.gain.size1_out(0))
-    x, u, e, t, duration, p = six = model_symbols(st)
     spread = symbolic.sym("spread", 2 * n, 2 * n)
-    unknowns = sum(b.size for b in st.of_kind("unknown"))
-    z = symbolic.sym("z", n + m)  # augmented state and the controls that are fed back
-    states, own, fed = ca.vertsplit(z, [0, n - unknowns, n, n + m])
-    state = ca.vertcat(states, ca.vertsplit(x, [0, n - unknowns, st.nx])[1])
-    control = ca.vertcat(fed, ca.vertsplit(u, [0, m, st.nu])[1])
-    known = ca.vertsplit(p, [0, st.np - unknowns, st.np])[0]
-    at = (state, control, t, duration, ca.vertcat(known, own))
+    six, z, at, value = _Around.of(st, m)
+    e = six[2]
     rate = ca.vertcat(st.nominal(*at)[0][: n - unknowns], symbolic.zeros(unknowns))
     measured, M, U = symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0)
     if st.measurement is not None:
@@ -134,7 +203,7 @@ def _curved(st: Statement) -> ca.Function:
     E = unpack_symbolic(e[st.estimation.span], n)
     K = kalman_gain(E, M, U)
     C = loop.gain(*six)
-    seen = ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -C]])
+    seen = _seen(C, symbolic)
     both = ca.vertcat(rate, measured)
     bent = _bend(both, z, seen @ spread @ seen.T) / 2
     of_rate, of_measured = ca.vertsplit(ca.jacobian(both, z), [0, n, n + measured.shape[0]])
@@ -147,12 +216,7 @@ def _curved(st: Statement) -> ca.Function:
     cost = ca.vertcat(of_state, -(C.T @ of_control))
     values = [ca.densify(value) for value in (drift, forcing, cost)]
     inner = ca.Function("curved", [z, *six, spread], values)
-    augmented = ca.vertcat(
-        ca.vertsplit(x, [0, n - unknowns, st.nx])[0],
-        ca.vertsplit(p, [0, st.np - unknowns, st.np])[1],
-        ca.vertsplit(u, [0, m, st.nu])[0],
-    )
-    return ca.Function("curved", [*six, spread], inner.call([augmented, *six, spread]))
+    return ca.Function("curved", [*six, spread], inner.call([value, *six, spread]))
 
 
 def _columns(slopes: Expr, states: int, controls: int) -> tuple[Any, Any]:

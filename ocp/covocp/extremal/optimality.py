@@ -20,6 +20,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
 from covocp.extremal.mesh_error import node_error
+from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import model_symbols, repeated
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
@@ -130,6 +131,7 @@ def assess(
     control_slope, control_error = 0.0, 0.0
     if st.nu and free is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
+        free = free & ~_read_through(extremal)[:, None]
         if not st.path.size:
             control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
             control_error = _control_error(extremal, costates, free[:-1] & free[1:])
@@ -137,7 +139,7 @@ def assess(
         stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
         control_slope=control_slope / scale,
         costate_difference=_costate_difference(extremal, costates),
-        hamiltonian_variation=_variation(values) if st.autonomous else None,
+        hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
         transversality=_transversality(extremal, costates, values) if st.duration.free else None,
         mesh_error=mesh_error,
         node_error=node_error(extremal),
@@ -336,9 +338,19 @@ def _explicit_pairs(extremal: Extremal) -> int | None:
     return int(np.ceil(needed)) if needed <= LARGEST_SUBSTEPS else None
 
 
-def _variation(values: Array) -> float:
-    """Variation of H relative to its terms."""
-    return float(np.ptp(values[:, 0]) / max(float(values[:, 1].max()), np.finfo(float).tiny))
+def _variation(extremal: Extremal, values: Array) -> float:
+    """Variation of H relative to its terms; where something is read at an instant it may jump."""
+    largest = max(float(np.ptp(values[part, 0])) for part in stretches(extremal))
+    return largest / max(float(values[:, 1].max()), np.finfo(float).tiny)
+
+
+def _read_through(extremal: Extremal) -> NDArray[np.bool_]:
+    """Nodes whose control acts through what is read there at an instant, beside H_u."""
+    result = np.zeros(extremal.mesh.intervals + 1, dtype=bool)
+    samples = extremal.statement.samples
+    if samples is not None and any(samples.measurement.jac_sparsity(i, 1).nnz() for i in (1, 2)):
+        result[extremal.mesh.instants] = True
+    return result
 
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array) -> float:
@@ -357,7 +369,9 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array) -> fl
     slope += passage_end(extremal, costates.matrices[-1, behind])[1]
     (explicit,) = along(duration_slope(st), extremal, costates)
     slope += float(np.trapezoid(explicit[:, 0], extremal.time))
-    residual = slope + float(values[-1, 0])
+    jumps = extremal.mesh.instants  # H jumps where something is read, and the instant moves with T
+    moved = extremal.mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
+    residual = slope + float(values[-1, 0]) - float(moved)
     at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
     at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
     if (at_lower and residual > 0) or (at_upper and residual < 0):

@@ -106,11 +106,13 @@ def _sizes(lower: Array, upper: Array, largest: Array) -> Array:
 def _values(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
     """States and path constraints at normalised times s of the intervals k, (K, rows)."""
     st, mesh = extremal.statement, extremal.mesh
-    z = dense.at(s)
+    z, ends = dense.at(s), s == mesh.nodes[k + 1]
+    z[ends] = dense.at(s[ends], before=True)  # what is read at an instant belongs to what follows
     x = z[:, : st.nx]
     if not st.path.size:
         return x
-    controls = extremal.control(k, (s - mesh.nodes[k]) / np.diff(mesh.nodes)[k])
+    h = np.diff(mesh.nodes)[k]
+    controls = extremal.control(k, (s - mesh.nodes[k]) / np.where(h > 0, h, 1.0))
     duration = extremal.trajectory.duration
     fixed = repeated(duration, extremal.parameters, s.size)
     rows = mapped(st.path.function, x.T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -98,14 +98,17 @@ class Drawn:
         """Choose the times."""
         self.solution, self.order = solution, order
         self.covariance = next((b for b in solution.blocks if b.estimation and b.covariance), None)
-        nodes, parts = solution.t, -(-SAMPLES // solution.mesh.intervals)
+        nodes, parts = np.unique(solution.t), -(-SAMPLES // solution.mesh.intervals)
         if solution.mesh.control == "constant":  # rates jump at the nodes, which a smooth curve would follow
             parts = 1
         inner = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         regular = np.append(inner.ravel(), nodes[-1])
         # where something happens between the nodes; what a closed loop shows is known at its nodes
         knots = solution.dense.knots if solution.loop is None else solution.mesh.nodes
-        self.t = np.union1d(regular, knots[~np.isin(knots, solution.mesh.nodes)] * solution.duration)
+        t = np.union1d(regular, knots[~np.isin(knots, solution.mesh.nodes)] * solution.duration)
+        # before and after what is read at an instant
+        self.t = np.sort(np.concatenate([t, solution.t[solution.mesh.instants]]))
+        self.early = np.flatnonzero(np.diff(self.t) == 0.0)
 
     def knows(self, name: str) -> bool:
         """Whether a name, or the vector of an entry, is in the solution."""
@@ -114,7 +117,14 @@ class Drawn:
     @cached
     def sample(self) -> Sample:
         """Values between the nodes."""
-        return self.solution.at(self.t)
+        sample = self.solution.at(self.t)
+        if not self.early.size:
+            return sample
+        before, values = self.solution.at(self.t[self.early], "before"), {}
+        for name, value in sample.values.items():
+            values[name] = value.copy()
+            values[name][self.early] = before.values[name]
+        return replace(sample, values=values)
 
     def rows(self, name: str) -> list[int]:
         """Rows of the covariance that belong to a state or an unknown."""
@@ -142,13 +152,8 @@ class Drawn:
 
     def between(self, values: Array) -> Array:
         """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""
-        from scipy.interpolate import PchipInterpolator
-
-        if self.t.size == values.shape[0] or not np.isfinite(values).all():
-            columns = values.reshape(values.shape[0], -1).T
-            flat = np.array([np.interp(self.t, self.solution.t, column) for column in columns]).T
-            return flat.reshape(self.t.size, *values.shape[1:])
-        return np.asarray(PchipInterpolator(self.solution.t, values, axis=0)(self.t))
+        ends = zip(_ends(self.solution.mesh.instants, values.shape[0]), _ends(self.early, self.t.size), strict=True)
+        return np.concatenate([_between(self.solution.t[k], values[k], self.t[i]) for k, i in ends])
 
     def spread(self, key: Given) -> tuple[Array, Array, Array]:
         """Root mean squares at the times, each (K, size): deviation, its error of the estimate, its estimate.
@@ -235,3 +240,22 @@ def ratio_unit(above: str, below: str, units: Mapping[str, str]) -> str:
 def _bracketed(word: str) -> str:
     """A unit that may stand in a product."""
     return word if word.isalnum() else f"({word})"
+
+
+def _ends(last: Given, count: int) -> list[slice]:
+    """The stretches of so many places that end at some of them."""
+    stops = [*(int(k) + 1 for k in last), count]
+    return [slice(begin, stop) for begin, stop in zip([0, *stops], stops, strict=False)]
+
+
+def _between(nodes: Array, values: Array, times: Array) -> Array:
+    """Values at the times from those at the nodes of a stretch in which nothing jumps."""
+    from scipy.interpolate import PchipInterpolator
+
+    if nodes.size == 1:
+        return np.repeat(values, times.size, axis=0)
+    if times.size == nodes.size or not np.isfinite(values).all():
+        columns = values.reshape(values.shape[0], -1).T
+        flat = np.array([np.interp(times, nodes, column) for column in columns]).T
+        return flat.reshape(times.size, *values.shape[1:])
+    return np.asarray(PchipInterpolator(nodes, values, axis=0)(times))

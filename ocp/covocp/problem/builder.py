@@ -51,6 +51,7 @@ from covocp.problem.declarations import (
 from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
+from covocp.problem.instants import sampled_at
 from covocp.problem.integrals import with_integral
 from covocp.problem.measurement_information import stated_noise
 from covocp.problem.rates import with_rate
@@ -435,28 +436,43 @@ class Problem:
         """
         self._change(with_rate(self._declarations, symbol, rate, noise))
 
-    @checked(unit=text)
+    @checked(unit=text, relative=truth)
     def measurement(
-        self, name: str, expression: Given, noise: Given = None, *, information: Given = None, unit: str = ""
+        self,
+        name: str,
+        expression: Given,
+        noise: Given = None,
+        *,
+        information: Given = None,
+        at: Given = None,
+        every: Given = None,
+        relative: bool = False,
+        unit: str = "",
     ) -> None:
-        """Add a continuous measurement m = expression + v with white noise v.
+        """Add a measurement m = expression + v, continuous with white noise v or taken at instants.
 
         Args:
             name: unique name.
             expression: of states, unknowns, controls and time, shape (m, 1).
-            noise: power spectral density of v: scalar, vector (diagonal) or matrix (correlated), positive definite.
-            information: its inverse in place of it: scalar or vector (diagonal), not negative. Where it is zero nothing
-                is measured: a sensor that a control switches off, information=w/U, w in [0, 1].
+            noise: power spectral density of v, of one that is taken at instants its variance: scalar, vector
+                (diagonal) or matrix (correlated), positive definite.
+            information: inverse density in place of it: scalar or vector (diagonal), not negative. Where it is zero
+                nothing is measured: a sensor that a control switches off, information=w/U, w in [0, 1].
+            at: instants at which it is taken [s], rising; the mesh has nodes there.
+            every: period [s] in place of them, first taken one period after the start.
+            relative: whether `at` or `every` are fractions of the duration, as they must be where it is free.
             unit: for exported code.
 
         Raises:
-            ProblemError: name used twice, singular, negative or of the wrong size, both or neither given.
+            ProblemError: name used twice, singular, negative or of the wrong size, both or neither given, instants
+                outside [0, T] or twice, a period longer than the duration.
         """
         value = column_expression(name, "measurement", expression)
         size = self._declare(name, value.shape[0])
-        density, inverse = stated_noise(name, noise, information, size)
-        entry = Measurement(name=name, expression=value, noise=density, information=inverse, unit=unit, where=caller())
-        self._add("measurements", entry)
+        instants = sampled_at(self._declarations, name, at, every, relative)
+        density, inverse = stated_noise(name, noise, information, size, sampled=bool(instants))
+        own = {"expression": value, "noise": density, "information": inverse, "instants": instants}
+        self._add("measurements", Measurement(name=name, unit=unit, where=caller(), **own))
 
     def minimize(self, running: Given = 0.0, terminal: Given = 0.0) -> None:
         """State the deterministic cost: terminal + integral of running over [0, T].

@@ -287,8 +287,9 @@ class Dynamics:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
-    """A continuous measurement and the density matrix of its noise.
+    """A measurement and the density matrix of its noise, or, where it is taken at instants, its variance.
 
+    instants: when it is taken, as rising fractions of the terminal time; none: always.
     information: the inverse density where it was stated in place of the density (a diagonal matrix that may be zero),
         else None. `noise` is then what stands for the density where a filter or a simulation needs one.
     """
@@ -299,6 +300,7 @@ class Measurement:
     unit: str
     where: str
     information: ca.MX | None = None
+    instants: tuple[float, ...] = ()
 
     __repr__ = short_repr
 
@@ -458,6 +460,16 @@ class Declarations:
     def taken(self) -> tuple[Any, ...]:
         """All declarations whose names are taken."""
         return (*self.named, *(() if self.spread is None else (self.spread,)))
+
+    @property
+    def continuous(self) -> tuple[Measurement, ...]:
+        """Measurements that are always there."""
+        return tuple(entry for entry in self.measurements if not entry.instants)
+
+    @property
+    def sampled(self) -> tuple[Measurement, ...]:
+        """Measurements that are taken at instants."""
+        return tuple(entry for entry in self.measurements if entry.instants)
 
     @property
     def augmented(self) -> list[State | Unknown]:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # Entries of a vector or a matrix that are shown one by one, at most.
 MOST_ENTRIES = 24
+# Instants of a measurement that are listed.
+MOST_INSTANTS = 4
 FREE = "free"
 FILTER = "F E + E F' + Q"
 UPDATE = " - E M' U^-1 M E"
@@ -285,9 +287,25 @@ def _measurements(problem: Problem, written: _Written) -> Section:
         kind = "noise" if q.information is None else "information"
         noise, empty = [entry or "0" for entry in written.diagonal(kind, q.name)], [""] * len(values)
         columns = (names, [q.unit] * len(values), [f"= {v}" for v in values])
-        both = (noise, empty) if kind == "noise" else (empty, noise)
-        rows += _shortened([list(row) for row in zip(*columns, *both, strict=True)])
-    return _table(["measurement", "unit", "", "noise density", "inverse density"], rows, code=(2,))
+        place = 2 if q.instants else 0 if kind == "noise" else 1
+        kinds = [noise if k == place else empty for k in range(3)]
+        taken = [_instants(problem, q.instants)] + [""] * (len(values) - 1)
+        rows += _shortened([list(row) for row in zip(*columns, *kinds, taken, strict=True)])
+    titles = ["measurement", "unit", "", "noise density", "inverse density", "noise variance", "taken"]
+    return _table(titles, rows, code=(2,))
+
+
+def _instants(problem: Problem, instants: tuple[float, ...]) -> str:
+    """When a measurement is taken, in a few words."""
+    if not instants:
+        return ""
+    free = problem.free_duration is not None
+    times = np.array(instants) * (1.0 if free else float(problem.duration))
+    unit = "T" if free else "s"
+    if times.size > 1 and np.allclose(np.diff(times), times[0], rtol=1e-9):
+        return f"every {times[0]:.4g} {unit}"
+    listed = ", ".join(f"{time:.4g}" for time in times[:MOST_INSTANTS])
+    return f"at {listed}{', ...' if times.size > MOST_INSTANTS else ''} {unit}"
 
 
 def _weights(problem: Problem) -> list[tuple[str, Any]]:

@@ -69,11 +69,11 @@ def augmented_slope(problem: Declarations, expression: Expr) -> Any:
 
 
 def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
-    """M and U of all measurements."""
-    if not problem.measurements:
+    """M and U of the continuous measurements."""
+    if not problem.continuous:
         return ca.MX(0, size), ca.MX(0, 0)
-    value = ca.vertcat(*(m.expression for m in problem.measurements))
-    return augmented_slope(problem, value), ca.diagcat(*(m.noise for m in problem.measurements))
+    value = ca.vertcat(*(m.expression for m in problem.continuous))
+    return augmented_slope(problem, value), ca.diagcat(*(m.noise for m in problem.continuous))
 
 
 def slope_by(expression: Expr, symbols: list[Any]) -> Any:

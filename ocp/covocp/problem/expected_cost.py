@@ -65,11 +65,12 @@ from covocp.problem.expansion import expand, measurement_slope
 from covocp.problem.freeze import freeze
 from covocp.problem.integrals import check_expected
 from covocp.problem.measurement_information import inverse_density
+from covocp.problem.samples import ESTIMATE as ESTIMATE
 from covocp.statement.names import name_of, split_entry
 from covocp.statement.statement import Statement, error_names, error_size
 
 # Names of what the derived problem adds to the user's symbols.
-FEEDBACK, ESTIMATE, GAIN = "S", "Xhat", "C"
+FEEDBACK, GAIN = "S", "C"
 
 
 def expected_cost(
@@ -169,7 +170,7 @@ def derive(problem: Declarations) -> Declarations:
     innovation = E @ jacobian.T  # K U
     information = ca.MX(size, size)
     if jacobian.shape[0]:
-        blocks = [(entry.noise, entry.information) for entry in derived.measurements]
+        blocks = [(entry.noise, entry.information) for entry in derived.continuous]
         information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
     if gain is None:
         derived, S, expansion = _with_feedback(derived, expansion)

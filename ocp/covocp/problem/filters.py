@@ -46,6 +46,8 @@ def extended_filter(
 
     Continuous: the Kalman-Bucy filter with slopes at the estimate [Schmidt 2.5-3]. Discrete: the same model sampled
     (item 8); a reading is the mean of the measurement over a step, so its noise has the covariance density / step.
+    What is measured at instants is read at the end of a step, with its variance, in the rows below the others; NaN
+    where nothing is.
 
     Args:
         problem: with noise and measurements as declared; parameters have their values.
@@ -60,13 +62,17 @@ def extended_filter(
         start of it, and update (x, P, y, u, t) -> x, P after the reading.
 
     Raises:
-        ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive.
+        ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive;
+            measurements at instants without a step, or where missing ones are not skipped.
     """
     system = _System(problem, duration)
+    _check_instants(problem, step, missing)
     x, P, u, t = system.symbols
-    readings = 0 if system.measurement is None else system.measurement.size1_out(0)
+    none = (type(x)(0, 1), type(x)(0, 0))
+    value, density = none if system.measurement is None else system.measurement(x, t, u)
+    read, variance = none if system.samples is None else system.samples(x, t, u)
+    readings = value.shape[0] + read.shape[0]
     y = type(x).sym("y", readings)
-    value, density = (type(x)(0, 1), type(x)(0, 0)) if system.measurement is None else system.measurement(x, t, u)
     names = ["estimate", "covariance"]
     if step is None:
         process = (system.rate(x, t, u), system.noise(x, t, u))
@@ -74,12 +80,24 @@ def extended_filter(
         return ca.Function("rate", [x, P, u, y, t], slopes, ["x", "P", "u", "y", "t"], ["dx", "dP"])
     length = time_step(step)
     ahead = propagated(system.rate, system.noise, Estimated(x, P, t, u), length, substeps, system.geometry)
-    reading = (value, density / length)
+    reading = (ca.vertcat(value, read), ca.diagcat(density / length, variance))
     after = corrected_by(x, P, y, reading, form, missing, system.geometry) if readings else [x, P]
     return (
         ca.Function("predict", [x, P, u, t], ahead, ["x", "P", "u", "t"], names),
         ca.Function("update", [x, P, y, u, t], after, ["x", "P", "y", "u", "t"], names),
     )
+
+
+def _check_instants(problem: Problem, step: float | None, missing: Missing) -> None:
+    """What is measured at instants is not always there."""
+    taken = problem.declarations.sampled
+    if taken and (step is None or missing != "skip"):
+        raise ProblemError(
+            f"'{taken[0].name}' is measured at instants: between them it is missing.",
+            expected="extended_filter(problem, step=..., missing='skip'), whose rows are NaN where nothing is read",
+            received=f"step={step}, missing='{missing}'",
+            remedy="give a step that divides the time between the instants, and missing='skip'",
+        )
 
 
 def initial_estimate(problem: Problem) -> tuple[Array, Array]:
@@ -142,6 +160,10 @@ class _System:
         if statement.measurement is not None:
             value, _, density = statement.measurement(*at)
             self.measurement = ca.Function("measurement", [x, t, u], [value, density])
+        self.samples: ca.Function | None = None
+        if statement.samples is not None:
+            read, _, variance = statement.samples.measurement(*at)
+            self.samples = ca.Function("samples", [x, t, u], [read, variance])
 
 
 def _statement(problem: Problem) -> Statement:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +14,6 @@ from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
-from covocp.base.short_repr import short_repr
 from covocp.problem.checks import check_dynamics
 from covocp.problem.closed_loop_covariance import floored, used_in
 from covocp.problem.decisions import check_decisions
@@ -25,30 +22,10 @@ from covocp.problem.ends import boundary, tied_values, with_end_conditions
 from covocp.problem.integrals import check_integrals
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.problem.rates import process_noise
+from covocp.problem.samples import measured_blocks, samples
+from covocp.problem.stacked import Stacked, stack
 from covocp.statement.chances import ChanceLimits
-from covocp.statement.statement import INPUTS, Block, Conditions, Duration, Loop, Statement, error_names, error_size
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stacked:
-    """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them.
-
-    geometry: of the states that are estimated, the first of all; unknowns: entries of these.
-    """
-
-    inputs: tuple[Any, ...]
-    geometry: Geometry
-    unknowns: int
-    substitute: Callable[..., list[Any]]
-    symbolic: type
-
-    __repr__ = short_repr
-
-    def function(self, name: str, expressions: list[Any], *, without: tuple[str, ...] = ()) -> ca.Function:
-        """A function of the stacked vectors, with named inputs."""
-        kept = [(symbol, label) for symbol, label in zip(self.inputs, INPUTS, strict=True) if label not in without]
-        outputs = [f"out{i}" for i in range(len(expressions))]
-        return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
+from covocp.statement.statement import Block, Conditions, Duration, Loop, Statement, error_names, error_size
 
 
 def freeze(problem: Declarations) -> Statement:
@@ -60,13 +37,14 @@ def freeze(problem: Declarations) -> Statement:
     """
     _check_complete(problem)
     problem = with_end_conditions(problem)
-    stacked = _stack(problem)
+    stacked = stack(problem)
     x, u, e, t, _, p = stacked.inputs
     rates = _state_rates(problem, stacked)
     matrix_rates, riccati, measurement = _matrix_rates(problem, stacked, rates)
     running, terminal = stacked.substitute(*(problem.cost or ()))
     coupled = bool(ca.depends_on(rates, e)) if problem.matrices else False
     running_uses = bool(ca.depends_on(running, e)) if problem.matrices else False
+    running_uses = running_uses or bool(problem.sampled and problem.expansion is not None)
     nominal = None
     if not coupled:
         cost = ca.DM(0) if running_uses else running
@@ -88,8 +66,9 @@ def freeze(problem: Declarations) -> Statement:
         loop=_loop(problem, stacked),
         riccati=riccati,
         measurement=measurement,
-        measurements=_measured(problem),
+        measurements=measured_blocks(problem.continuous),
         information=_information(problem, stacked),
+        samples=samples(problem, stacked),
         path=_conditions(problem, stacked, "path"),
         start=_conditions(problem, stacked, "initial"),
         end=_conditions(problem, stacked, "final"),
@@ -214,51 +193,6 @@ def _symbols(problem: Declarations) -> dict[str, Any]:
     return symbols
 
 
-def _stack(problem: Declarations) -> Stacked:
-    """Stacked symbols, SX where every expression can be expanded, and the substitution of the user's symbols."""
-    groups: list[Any] = [problem.states, problem.controls, problem.matrices, problem.parameters, problem.unknowns]
-    own: list[Any] = [entry.symbol for group in groups for entry in group] + [problem.time]
-    if problem.free_duration is not None:
-        own.append(problem.duration)
-    value: Any = None if problem.spread is None else problem.spread.value
-    known = own if problem.spread is None or value is None else [*own, problem.spread.symbol]
-    every = [entry.rate for entry in problem.rates.values()]
-    every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
-    every += [value for m in problem.measurements for value in (m.expression, m.noise)]
-    every += [c.expression for c in problem.constraints] + list(problem.cost or ())
-    every += [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
-    symbolic: type = ca.SX
-    try:
-        ca.Function("everything", known, every).expand()
-    except RuntimeError:  # interpolation tables and external functions have no SX form
-        symbolic = ca.MX
-    sizes = [sum(entry.symbol.shape[0] for entry in group) for group in groups]
-    sizes[3:] = [sizes[3] + sizes[4]]
-    x, u, e, p = (symbolic.sym(n, k) for n, k in zip(("x", "u", "e", "p"), sizes, strict=True))  # type: ignore[attr-defined]
-    t, duration = symbolic.sym("t"), symbolic.sym("T")  # type: ignore[attr-defined]
-    arguments: list[Any] = []
-    groups[3:] = [[*problem.parameters, *problem.unknowns]]
-    for group, vector in zip(groups, (x, u, e, p), strict=True):
-        offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
-        arguments += [vector[i:j] for i, j in pairwise(offsets)]
-    arguments += [t, duration] if problem.free_duration is not None else [t]
-    if value is not None:
-        arguments += ca.Function("spread", own, [value]).call(arguments, True, False)
-
-    def substitute(*expressions: Any, spread: Any = None) -> list[Any]:
-        """The expressions in the stacked symbols; with another covariance of the closed loop where one is given."""
-        function = ca.Function("substitute", known, list(expressions))
-        return list(function.call(arguments if spread is None else [*arguments[:-1], spread], True, False))
-
-    return Stacked(
-        inputs=(x, u, e, t, duration, p),
-        geometry=Geometry.of(entry for entry in problem.states if entry.estimated),
-        unknowns=sum(entry.size for entry in problem.unknowns),
-        substitute=substitute,
-        symbolic=symbolic,
-    )
-
-
 def _state_rates(problem: Declarations, stacked: Stacked) -> Any:
     """Rate of the stacked state."""
     return ca.vertcat(*stacked.substitute(*(problem.rates[state.name].rate for state in problem.states)))
@@ -292,29 +226,21 @@ def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple
     return ca.vertcat(empty, *values), tuple(forms), function
 
 
-def _augmented_jacobian(stacked: Stacked, expression: Expr) -> Any:
-    """Jacobian with respect to the augmented state (states, then unknowns)."""
-    x, p = stacked.inputs[0], stacked.inputs[5]
-    rows = stacked.geometry.size
-    by_state = stacked.geometry.tangent_slope(x[:rows], ca.jacobian(expression, x)[:, :rows])
-    return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - stacked.unknowns :])
-
-
 def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any] | None:
     """Stacked measurement, its Jacobian M and the noise density U."""
-    if not problem.measurements:
+    if not problem.continuous:
         return None
-    values = stacked.substitute(*(m.expression for m in problem.measurements))
-    density = ca.diagcat(*stacked.substitute(*(m.noise for m in problem.measurements)))
+    values = stacked.substitute(*(m.expression for m in problem.continuous))
+    density = ca.diagcat(*stacked.substitute(*(m.noise for m in problem.continuous)))
     value = ca.vertcat(*values)
-    return value, _augmented_jacobian(stacked, value), density
+    return value, stacked.augmented_jacobian(value), density
 
 
 def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measurement: Expr) -> tuple[Any, Any, Any]:
     """F, Q and W = M' U^-1 M of the Kalman-Bucy covariance [Schmidt 2.5-3]."""
     geometry, rows = stacked.geometry, stacked.geometry.size
     velocity = geometry.velocity(stacked.inputs[0][:rows], rates[:rows])
-    drift = _augmented_jacobian(stacked, ca.vertcat(velocity, ca.DM.zeros(stacked.unknowns, 1)))
+    drift = stacked.augmented_jacobian(ca.vertcat(velocity, ca.DM.zeros(stacked.unknowns, 1)))
     if not geometry.plain:
         drift += ca.diagcat(geometry.drift(velocity), ca.DM(stacked.unknowns, stacked.unknowns))
     (noise,) = stacked.substitute(process_noise(problem))
@@ -323,14 +249,14 @@ def _kalman_form(problem: Declarations, stacked: Stacked, rates: Expr, measureme
     _, jacobian, density = measurement
     blocks = [
         (stacked.substitute(m.noise)[0], None if m.information is None else stacked.substitute(m.information)[0])
-        for m in problem.measurements
+        for m in problem.continuous
     ]
     return drift, noise, jacobian.T @ inverse_density(density, blocks, inverse) @ jacobian
 
 
 def _information(problem: Declarations, stacked: Stacked) -> ca.Function | None:
     """What is stated as information, one below the other."""
-    stated = [ca.diag(entry.information) for entry in problem.measurements if entry.information is not None]
+    stated = [ca.diag(entry.information) for entry in problem.continuous if entry.information is not None]
     if not stated:
         return None
     return stacked.function("information", stacked.substitute(ca.vertcat(*stated)), without=("matrices",))
@@ -376,16 +302,6 @@ def _blocks(problem: Declarations) -> tuple[Block, ...]:
         if kind == "parameter":
             parameters = offset
     return tuple(blocks)
-
-
-def _measured(problem: Declarations) -> tuple[Block, ...]:
-    """Where each measurement lies."""
-    sizes = [m.expression.shape[0] for m in problem.measurements]
-    offsets = np.cumsum([0, *sizes]).tolist()
-    return tuple(
-        Block(name=m.name, kind="measurement", size=size, offset=offset, unit=m.unit)
-        for m, size, offset in zip(problem.measurements, sizes, offsets, strict=False)
-    )
 
 
 def _duration(problem: Declarations) -> Duration:

@@ -17,23 +17,41 @@ from covocp.problem.declarations import Matrix, Measurement
 LEAST = 1e-30
 
 
-def stated_noise(name: str, noise: Expr, information: Expr, size: int) -> tuple[Any, Any]:
+def stated_noise(name: str, noise: Expr, information: Expr, size: int, *, sampled: bool = False) -> tuple[Any, Any]:
     """Density of the noise of a measurement, and the information where that was stated (else None); size x size.
 
+    Args:
+        name: of the measurement.
+        noise: its density, or the variance of one that is taken at instants.
+        information: the inverse density.
+        size: rows.
+        sampled: whether it is taken at instants.
+
     Raises:
-        ProblemError: both or none given, wrong size, negative, singular density, information that is not diagonal.
+        ProblemError: both or none given, wrong size, negative, singular density, information that is not diagonal,
+            information of what is taken at instants.
     """
+    if sampled and information is not None:
+        raise ProblemError(
+            f"The measurement '{name}' is taken at instants, and information= is the inverse of a density.",
+            expected="noise=, the variance of what is read at an instant",
+            received="information=",
+            remedy="give noise=; at instants at which nothing is measured leave them out of at=",
+        )
+    what = "noise variance" if sampled else "noise density"
     if (noise is None) == (information is None):
         raise ProblemError(
             f"The noise of the measurement '{name}' is given {'not at all' if noise is None else 'twice'}.",
-            expected="noise=, its power spectral density, or information=, the inverse of it",
+            expected="noise=, the variance of what is read at an instant"
+            if sampled
+            else "noise=, its power spectral density, or information=, the inverse of it",
             received="neither" if noise is None else "both",
             remedy="give one of them",
         )
     if information is None:
-        density = density_matrix(name, "noise density", noise, size)
+        density = density_matrix(name, what, noise, size)
         if density.is_constant():
-            check_density(name, "noise density", ca.evalf(density).full(), definite=True)
+            check_density(name, what, ca.evalf(density).full(), definite=True)
         return density, None
     stated = density_matrix(name, "information", information, size)
     if stated.is_constant():

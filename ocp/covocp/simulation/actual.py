@@ -27,6 +27,8 @@ from covocp.solution.solution import Solution
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Block, Statement
 
+ARGUMENTS = ["state", "control", "time", "duration", "parameters"]
+
 
 class Linearised(NamedTuple):
     """Rate of the augmented state, F, G, Q; measured values h, M, their slope Hu by the control, U."""
@@ -41,6 +43,15 @@ class Linearised(NamedTuple):
     U: Given
 
 
+class Read(NamedTuple):
+    """What is read at instants: values h, H, their slope Hu by the control, variance R."""
+
+    h: Given
+    H: Given
+    Hu: Given
+    R: Given
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class System:
     """A system with its statistics. n: errors of the augmented state, of which `states` move; m: controls fed back.
@@ -49,6 +60,8 @@ class System:
     variance: covariance of its deviation there, (n, n).
     linear: (state, control, time, duration, parameters) -> velocity of the augmented state (n,), F (n, n), G (n, m),
         process noise Q (n, n), measured values h (r,), M (r, n), their slope by the control (r, m), noise U (r, r).
+    readings: the same arguments -> all values that can be read at instants (s,), H (s, n), their slope by the control
+        (s, m), variance R (s, s).
     constants: what stands behind the states in x(0): decisions as they were chosen, integrals.
     """
 
@@ -59,6 +72,7 @@ class System:
     states: int
     fed_back: int
     linear: ca.Function
+    readings: ca.Function
     constants: Array
 
     __repr__ = short_repr
@@ -66,6 +80,15 @@ class System:
     def model(self, *point: Given) -> Linearised:
         """What `linear` gives at (state, control, time, duration, parameters), by name."""
         return Linearised(*self.linear(*point))
+
+    def read(self, *point: Given) -> Read:
+        """What `readings` gives at (state, control, time, duration, parameters), by name."""
+        return Read(*self.readings(*point))
+
+    @property
+    def sampled(self) -> int:
+        """Number of values that can be read at instants."""
+        return int(self.readings.size1_out(0))
 
     @property
     def size(self) -> int:
@@ -195,6 +218,7 @@ def _system(
         states=len(statement.augmented) - statement.unknowns,
         fed_back=fed_back,
         linear=_linear(statement, fed_back),
+        readings=_readings(statement, fed_back),
         constants=constants,
     )
 
@@ -211,9 +235,7 @@ def _linear(statement: Statement, fed_back: int) -> ca.Function:
             remedy="simulate a problem whose states move without the matrices",
         )
     symbolic: Any = statement.symbolic
-    sizes = (statement.nx, statement.nu, 1, 1, statement.np)
-    a = [symbolic.sym(name, k) for name, k in zip(("x", "u", "t", "T", "p"), sizes, strict=True)]
-    n = len(statement.augmented)
+    a, n = _arguments(statement), len(statement.augmented)
     geometry = statement.augmented_geometry
     entries = geometry.size - statement.unknowns
     state, moved = (ca.vertsplit(v, [0, entries, statement.nx])[0] for v in (a[0], statement.nominal(*a)[0]))
@@ -227,8 +249,26 @@ def _linear(statement: Statement, fed_back: int) -> ca.Function:
     slopes = [ca.jacobian(value, a[1])[:, :fed_back] for value in (rate, h)]
     outputs = [rate, F, slopes[0], Q, h, M, slopes[1], U]
     names = ["rate", "F", "G", "Q", "h", "M", "Hu", "U"]
-    inputs = ["state", "control", "time", "duration", "parameters"]
-    return ca.Function("linear", a, outputs, inputs, names)
+    return ca.Function("linear", a, outputs, ARGUMENTS, names)
+
+
+def _arguments(statement: Statement) -> list[Any]:
+    """Symbols of (state, control, time, duration, parameters)."""
+    symbolic: Any = statement.symbolic
+    sizes = (statement.nx, statement.nu, 1, 1, statement.np)
+    return [symbolic.sym(name, k) for name, k in zip(("x", "u", "t", "T", "p"), sizes, strict=True)]
+
+
+def _readings(statement: Statement, fed_back: int) -> ca.Function:
+    """What can be read at instants, see `System.readings`."""
+    symbolic: Any = statement.symbolic
+    a, n = _arguments(statement), len(statement.augmented)
+    read: tuple[Any, ...] = (symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0))
+    if statement.samples is not None:
+        read = statement.samples.measurement(*a)
+    h, H, R = read
+    outputs = [h, H, ca.jacobian(h, a[1])[:, :fed_back], R]
+    return ca.Function("readings", a, outputs, ARGUMENTS, ["h", "H", "Hu", "R"])
 
 
 def _with_values(design: System, truth: Mapping[Any, Any]) -> System:
@@ -309,16 +349,34 @@ def _check_symbols(design: System, truth: Statement) -> None:
 
 
 def _check_measured(design: System, truth: Declarations) -> None:
-    """The filter of the design must be fed with what it expects."""
-    names = design.statement.measurement_names
-    rows = sum(m.expression.shape[0] for m in truth.measurements)
-    if names != tuple(m.name for m in truth.measurements) or rows != design.measured:
+    """The filter of the design must be fed with what it expects, when it expects it."""
+    own, read = design.statement, design.statement.samples
+    expected: list[Any] = [(b.name, b.size, ()) for b in own.measurements]
+    if read is not None:
+        expected += [(b.name, b.size, at) for b, at in zip(read.blocks, read.places, strict=True)]
+    given = [(m.name, m.expression.shape[0], m.instants) for m in (*truth.continuous, *truth.sampled)]
+    if given != expected:
+        same = [entry[:2] for entry in given] == [entry[:2] for entry in expected]
         raise ProblemError(
-            "The truth has other measurements than the design.",
-            expected=f"{', '.join(names) or 'none'}: {design.measured} values",
-            received=f"{', '.join(m.name for m in truth.measurements) or 'none'}: {rows} values",
-            remedy="declare the same measurements in the same order and size; expressions and noises may differ",
+            "The truth has measurements at other instants than the design."
+            if same
+            else "The truth has other measurements than the design.",
+            expected=_with_instants(expected),
+            received=_with_instants(given),
+            remedy="declare the same measurements in the same order, size and instants; expressions and noises may "
+            "differ",
         )
+
+
+def _with_instants(entries: list[Any]) -> str:
+    """Measurements with their sizes, and at how many instants they are taken."""
+    return (
+        ", ".join(
+            f"{name}: {size} value{'s' * (size > 1)}" + (f" at {len(at)} instants" if at else "")
+            for name, size, at in entries
+        )
+        or "none"
+    )
 
 
 def _listed(entries: list[tuple[str, int]]) -> str:

@@ -17,6 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.simulation.flown import own_copy, stepped
 from covocp.simulation.plan import Plan
+from covocp.simulation.run_parts import UNREAD
 from covocp.simulation.vectorised import LANES, padded, vectorise
 
 # Steps whose random numbers are drawn together: they are most of the memory of a batch.
@@ -98,6 +99,7 @@ class _Simulation:
         self.plan, self.first, self.runs = plan, first, last - first
         width = self.width = padded(self.runs)
         self.step = vectorise(plan.step, width, (3,))
+        self.read = None if plan.read is None else vectorise(plan.read, width, (3,))
         self.observe = vectorise(plan.observe, width, (2,))
         kind = (1,) if plan.pilot else ()
         self.streams = [
@@ -140,17 +142,20 @@ class _Simulation:
         domain = plan.domain[:, None]
         where = {int(k): i for i, k in enumerate(plan.stored)}
         sampled = {int(k): i for i, k in enumerate(plan.samples)}
-        if sampled:
+        if 0 in sampled:
             self._sample(0)
         self._store(where[0])
         before = self.before
         before[:] = self.observe.outputs[0][: 2 * plan.size]
         last = plan.steps.shape[0]
         for k, noise in self._noises(last, stop):
-            w[:] = noise
-            coefficients[:] = plan.steps[k]
-            step.evaluate()
-            z[:] = after
+            if self.read is not None and plan.reads[k]:
+                moved[:] = self._read(noise, k)
+            else:
+                w[:] = noise
+                coefficients[:] = plan.steps[k]
+                step.evaluate()
+                z[:] = after
             np.less_equal(np.abs(moved, size), domain, inside)  # false for NaN
             if not inside.all():
                 self._leave(~inside.all(axis=0), plan.times[k])
@@ -161,12 +166,24 @@ class _Simulation:
                 self._store(where[k + 1])
         return self._batch()
 
+    def _read(self, noise: Array, k: int) -> Array:
+        """Let all runs read what is read in a step of no length; their deviations and estimates after it."""
+        assert self.read is not None
+        z, w, own, coefficients = self.read.inputs
+        z[:], w[:], own[:] = self.step.inputs[0], noise, self.own
+        coefficients[:] = self.plan.steps[k]
+        self.read.evaluate()
+        self.step.inputs[0][:] = self.read.outputs[0]
+        return self.read.outputs[1]
+
     def _sample(self, number: int) -> None:
         """Step the laws of the runs that are inside the domain; the mean of what was measured starts anew."""
         flown, spans, z = self.plan.flown, self.plan.spans, self.step.inputs[0]
         assert flown is not None
         measured, controls = z[spans["measured"]], self.plan.fed_back
         mean = measured / flown.period if number else np.full_like(measured, np.nan)
+        read = z[spans["read"]]
+        mean = np.vstack([mean, np.where(read < UNREAD, read, np.nan)])
         for i in np.flatnonzero(np.isinf(self.left[: self.runs])).tolist():
             time, estimates = float(flown.times[number]), flown.estimates * self.plan.size
             result = stepped(self.laws[i], mean[:, i].copy(), time, controls, estimates, self.first + i)
@@ -175,7 +192,7 @@ class _Simulation:
             z[spans["held"], i] = result[:controls]
             if flown.estimates:
                 z[spans["estimate"], i] = result[controls:]
-        measured[:] = 0.0
+        measured[:], read[:] = 0.0, UNREAD
 
     def _leave(self, gone: Given, time: float) -> None:
         """Note when runs leave the domain, and where they were before."""

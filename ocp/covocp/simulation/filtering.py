@@ -22,7 +22,11 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.blocks.arithmetic import apply
 from covocp.blocks.updates import updating
-from covocp.simulation.run_parts import Run, control_of, estimate_of, factor, part, replaced, system_at
+from covocp.simulation.run_parts import UNREAD, Run, control_of, estimate_of, factor, part, read_at, replaced, system_at
+from covocp.simulation.schedule import by_rows, read_gain
+
+# Less than any share of a reading that is taken.
+LEAST_SHARE = 1e-9
 
 
 def corrected(run: Run, z: Given, c: dict[str, Any], noise: Given, h: Given, *, late: bool) -> Any:
@@ -55,6 +59,41 @@ def corrected(run: Run, z: Given, c: dict[str, Any], noise: Given, h: Given, *, 
     change, spread = apply(law, none, covariance, reading - own.h, own.M, 2 / h * own.U)
     estimate = design.geometry.move(y, change)
     return replaced(replaced(z, run.spans["estimate"], estimate), run.spans["E"], pack_symbolic(spread))
+
+
+def read_now(run: Run, c: dict[str, Any], noise: Given, reading: Given) -> Any:
+    """The state of a run after what is read at an instant; of a law's run the value itself, for its next step.
+
+    Args:
+        run: its symbols.
+        c: coefficients there.
+        noise: normal numbers, one for each value that can be read.
+        reading: what is taken of each measurement: 0 or 1, or a part, whose noise is larger by so much.
+    """
+    setting, design, z = run.setting, run.setting.design, run.z
+    taken = by_rows(design.statement, reading)
+    _, fed = control_of(run, z, c)
+    u = ca.vertcat(fed, part(c["u"], design.fed_back))
+    actual = read_at(run, setting.actual, (z[run.spans["x"]], run.own), u, c)
+    scatter = ca.if_else(taken > 0, 1 / ca.sqrt(ca.fmax(taken, LEAST_SHARE)), 0) * (factor(actual.R) @ noise)
+    value = actual.h + scatter
+    if setting.flown:
+        before = z[run.spans["read"]]
+        known = ca.if_else(before < UNREAD, before, 0)
+        return replaced(z, run.spans["read"], ca.if_else(taken > 0, known + taken * value, before))
+    y = z[run.spans["estimate"]]
+    if setting.filter == "perturbation":
+        expected = c["hr"] + c["Hr"] @ y + c["Hru"] @ (fed - part(c["u"], 0, design.fed_back))
+        return replaced(z, run.spans["estimate"], y + c["Kr"] @ (value - expected))
+    own = read_at(run, design, estimate_of(run, z), u, c)
+    covariance = unpack_symbolic(z[run.spans["E"]], design.size)
+    root = ca.sqrt(taken)
+    gain = read_gain(design.statement, covariance, own.H, own.R, reading)
+    left = run.symbolic.eye(design.size) - gain @ own.H
+    seen = ca.if_else(taken > 0, 1 / ca.fmax(root, LEAST_SHARE), 0)
+    spread = left @ covariance @ left.T + gain @ (ca.diag(seen) @ own.R @ ca.diag(seen)) @ gain.T
+    estimate = design.geometry.move(y, gain @ (value - own.h))
+    return replaced(replaced(z, run.spans["estimate"], estimate), run.spans["E"], pack_symbolic(ca.densify(spread)))
 
 
 def moved_covariance(run: Run, z: Given, ahead: Given, sides: list[dict[str, Any]], h: Given) -> Any:

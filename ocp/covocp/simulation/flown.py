@@ -105,7 +105,7 @@ def _first_step(law: Given, design: System) -> Any:
     expected = f"{design.fed_back} finite number(s) from step(measurement, 0.0), where the measurement is NaN"
     remedy = "let step return the whole control, also where nothing was measured yet"
     try:
-        answer = first.step(np.full(design.measured, np.nan), 0.0)
+        answer = first.step(np.full(design.measured + design.sampled, np.nan), 0.0)
         control = column_of(answer)
         estimate = _estimate(first)
     except Exception as error:
@@ -153,7 +153,9 @@ def stepped(own: Given, measurement: Array, time: float, controls: int, estimate
 
 def sample_indices(flown: Flown | None, grid: Grid) -> Any:
     """Where the samples lie among the times of a grid."""
-    return np.searchsorted(grid.t, flown.times - WHOLE * flown.period) if flown else np.zeros(0, dtype=int)
+    if flown is None:
+        return np.zeros(0, dtype=int)
+    return np.searchsorted(grid.t, flown.times + WHOLE * flown.period, side="right") - 1  # after what is read there
 
 
 def column_of(value: Given) -> Array:

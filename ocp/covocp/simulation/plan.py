@@ -15,8 +15,8 @@ from covocp.base.short_repr import short_repr
 from covocp.simulation.constraints import Place, counted_rows
 from covocp.simulation.flown import Flown, sample_indices
 from covocp.simulation.run_parts import Setting, factor, run_symbols
-from covocp.simulation.run_step import finish_function, observe_function, start_of, step_function
-from covocp.simulation.schedule import Grid, coefficients, table
+from covocp.simulation.run_step import finish_function, observe_function, read_function, start_of, step_function
+from covocp.simulation.schedule import Grid, coefficients, indices, readings_of, table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,9 +24,10 @@ class Plan:
     """All that a worker needs for any range of runs; the functions are those of `run_step`.
 
     step: (state of a run, noise, own unknowns, coefficients of the step) -> state after it, deviation and estimate.
+    read: the same of steps of no length, at which something is read; None where nothing is.
     observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
     finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
-    steps: coefficients, a row for each step; times: at which they start [s].
+    steps: coefficients, a row for each step; reads: which of them have no length; times: at which they start [s].
     stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
     start: state of a run that starts at its mean; unknowns: their mean; motion: how x moves.
     spread: factor of the covariance of the start, (n, n).
@@ -41,9 +42,11 @@ class Plan:
     """
 
     step: ca.Function
+    read: ca.Function | None
     observe: ca.Function
     finish: ca.Function | None
     steps: Array
+    reads: Any
     times: Array
     stored: Any
     stored_coefficients: Array
@@ -102,16 +105,19 @@ def make_plan(
     chosen = coefficients(design, setting.filter)
     before, after = table(setting.solution, grid, chosen)
     varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
-    watched = counted_rows(design)
+    watched, at = counted_rows(design), indices(grid, stored)
+    lengths = np.hstack([grid.h[:, None], readings_of(setting.solution, grid).T])
     run = run_symbols(setting, chosen, len(watched.at("path")))
     return Plan(
         step=step_function(run, before[0], varying),
+        read=read_function(run, before[0], varying),
         observe=observe_function(run),
         finish=finish_function(run),
-        steps=np.hstack([before[:, varying], after[:, varying], grid.h[:, None]]),
+        steps=np.hstack([before[:, varying], after[:, varying], lengths]),
+        reads=grid.share > 0,
         times=grid.t[:-1],
-        stored=np.searchsorted(grid.t, stored),
-        stored_coefficients=np.vstack([before, after[-1:]])[np.searchsorted(grid.t, stored)],
+        stored=at,
+        stored_coefficients=np.vstack([before, after[-1:]])[at],
         start=start_of(run),
         unknowns=setting.actual.start[design.entries :],
         motion=design.motion,

@@ -10,6 +10,8 @@ and 6.11, for any truth):
 All of the actual system is taken at the nominal state and at the true means of the unknowns: fa - f and ha - h then
 contain what another mean does, so its part of d, which stands in the mean of d too, is taken off again.
 
+Where something is read at an instant y jumps by K (Ha d - (H + (hau - hu) C) y + ha - h + v).
+
 Where the truth is the design, the covariance of d is E + Xhat of (A-31 .. 33) and that of y - d is E.
 """
 
@@ -27,7 +29,16 @@ from covocp.base.matrices import Array
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
-from covocp.simulation.schedule import Grid, Nominal, coefficients, nominal_at
+from covocp.simulation.schedule import (
+    Grid,
+    Nominal,
+    by_rows,
+    coefficients,
+    indices,
+    nominal_at,
+    readings_of,
+    table,
+)
 from covocp.solution.solution import Solution
 
 # Length of a step times the fastest rate: classical Runge-Kutta then errs by less than 1e-6.
@@ -95,7 +106,8 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     joint = _joint(design, actual)
     rates, step_rates = _fastest_rates(solution, joint, grid, actual, n)
     fine = grid.divided(np.minimum(grid.parts(STEP_PER_RATE / np.maximum(rates, 1e-300)), MOST_PARTS))
-    kept = set(np.flatnonzero(np.isin(fine.t, grid.t)).tolist())
+    kept = {int(k) for k in indices(fine, grid.t)}
+    jumps = _jumps(solution, design, actual, fine)
     sides = [_evaluate(solution, joint, fine.t[:-1] + c * fine.h, fine.interval, actual, n) for c in (0.0, 0.5, 1.0)]
     mean = np.concatenate([design.error(actual.start), np.zeros(n)])
     covariance = np.zeros((2 * n, 2 * n))
@@ -103,7 +115,11 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     means, covariances = [mean], [covariance]
     with np.errstate(over="ignore", invalid="ignore"):  # gains that the mesh does not resolve: the verdict says it
         for k, h in enumerate(fine.h.tolist()):
-            mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
+            if k in jumps:
+                transition, noise, offset = jumps[k]
+                mean, covariance = transition @ mean + offset, transition @ covariance @ transition.T + noise
+            else:
+                mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
             if k + 1 in kept:
                 means.append(mean)
                 covariances.append(covariance)
@@ -127,7 +143,7 @@ def _joint(design: System, actual: System) -> ca.Function:
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np, other.np)
     x, u, e, t, T, p, q = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
     chosen = coefficients(design, "perturbation")
-    c = chosen.split(chosen.function(x, u, e, t, T, p, 0))
+    c = chosen.split(chosen.function(x, u, e, t, T, p, 0, symbolic.zeros(st.readings)))
     f, F, G, Q, h, M, Hu, U = actual.model(x[: other.nx], u[: other.nu], t, T, q)
     C, K = c["C"], c["K"]
     rate = design.model(x, u, t, T, p).rate
@@ -137,6 +153,47 @@ def _joint(design: System, actual: System) -> ca.Function:
     known = ca.DM(np.concatenate([np.zeros(design.states), design.error(actual.start)[design.states :]]))
     offset = ca.vertcat(f - rate - F @ known, K @ (h - c["h"] - M @ known))
     return ca.Function("joint", a, [ca.densify(value) for value in (drift, noise, offset)])
+
+
+def _jumps(solution: Solution, design: System, actual: System, grid: Grid) -> dict[int, tuple[Array, Array, Array]]:
+    """Transition (2n, 2n), noise (2n, 2n) and offset (2n,) of the steps of a grid at which something is read."""
+    steps = np.flatnonzero(grid.share)
+    if not design.sampled or not steps.size:
+        return {}
+    chosen, n = coefficients(design, "perturbation"), design.size
+    function = _read_jump(design, actual)
+    before, _ = table(solution, grid, chosen)
+    nominal = nominal_at(solution, grid.t, np.append(grid.interval, grid.interval[-1]))
+    read = readings_of(solution, grid)
+    result = {}
+    for k in steps:
+        u = nominal_at(solution, grid.t[k : k + 1], grid.interval[k : k + 1]).u[0]
+        at = (nominal.x[k], u, before[k], grid.t[k], solution.duration, read[:, k], actual.parameters)
+        values = [np.asarray(v.full()) for v in function(*at)]
+        result[int(k)] = (values[0].reshape(2 * n, 2 * n), values[1].reshape(2 * n, 2 * n), values[2].ravel())
+    return result
+
+
+def _read_jump(design: System, actual: System) -> ca.Function:
+    """(x, u, coefficients, t, T, reading, parameters of the truth) -> transition, noise, offset of (d, y)."""
+    st, other, n = design.statement, actual.statement, design.size
+    symbolic: Any = ca.SX if st.symbolic is ca.SX and other.symbolic is ca.SX else ca.MX
+    chosen = coefficients(design, "perturbation")
+    sizes = (st.nx, st.nu, chosen.rows, 1, 1, st.readings, other.np)
+    x, u, column, t, T, reading, q = a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
+    c = chosen.split(column)
+    own = actual.read(x[: other.nx], u[: other.nu], t, T, q)
+    K, taken = c["Kr"], by_rows(st, reading)
+    seen = own.H
+    expected = c["Hr"] + (own.Hu - c["Hru"]) @ c["C"]
+    none, unit = symbolic.zeros(n, n), symbolic.eye(n)
+    share = ca.if_else(taken > 0, 1 / ca.sqrt(ca.fmax(taken, 1e-9)), 0)
+    noise = K @ (ca.diag(share) @ own.R @ ca.diag(share)) @ K.T
+    known = ca.DM(np.concatenate([np.zeros(design.states), design.error(actual.start)[design.states :]]))
+    transition = ca.blockcat([[unit, none], [K @ seen, unit - K @ expected]])
+    offset = ca.vertcat(symbolic.zeros(n), K @ (own.h - c["hr"] - seen @ known))
+    values = [ca.densify(v) for v in (transition, ca.blockcat([[none, none], [none, noise]]), offset)]
+    return ca.Function("read_jump", a, values)
 
 
 def _evaluate(

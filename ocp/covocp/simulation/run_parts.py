@@ -13,13 +13,15 @@ from covocp.base.expressions import Given
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_length
 from covocp.base.short_repr import short_repr
-from covocp.simulation.actual import Linearised, System
+from covocp.simulation.actual import Linearised, Read, System
 from covocp.simulation.flown import Flown
 from covocp.simulation.schedule import Coefficients, Estimator
 from covocp.solution.solution import Solution
 
 # A pivot of a factorisation counts as zero below this share of its diagonal entry.
 PIVOT = 1e-12
+# What stands for nothing read: comparisons with NaN are simplified away in expressions.
+UNREAD = 1e300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +69,8 @@ class Run:
     """Symbols of one run, and where the parts of its state lie.
 
     z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "measured" (what a law has
-    measured since its last step, an integral), "cost", "asked" and "violated" (flags), "held" (control of a law).
+    measured since its last step, an integral), "cost", "asked" and "violated" (flags), "held" (control of a law),
+    "read" (what a law has read since its last step, UNREAD where nothing).
     noisy: states with process noise; watched: number of inequalities along the path.
     """
 
@@ -84,9 +87,9 @@ class Run:
 
     @property
     def parts_of_noise(self) -> list[int]:
-        """Where the noises of the motion, of the first and of the second reading of a step begin, and their end."""
-        measured, motion = self.setting.design.measured, len(self.noisy)
-        return [0, motion, motion + measured, motion + 2 * measured]
+        """Where the noises of the motion, of the measurement of both halves and of what is read begin, and the end."""
+        measured, motion, read = self.setting.design.measured, len(self.noisy), self.setting.design.sampled
+        return [0, motion, motion + measured, motion + 2 * measured, motion + 2 * measured + read]
 
     @property
     def noises(self) -> int:
@@ -96,11 +99,11 @@ class Run:
     @property
     def pairing(self) -> Array:
         """For each noise of a step the two noises of its halves that it is the sum of, (noises, 2), these stacked."""
-        motion, early, late = (
+        motion, early, late, read = (
             np.arange(i, j) for i, j in zip(self.parts_of_noise, self.parts_of_noise[1:], strict=False)
         )
-        first = np.concatenate([motion, early, self.noises + early])
-        second = np.concatenate([self.noises + motion, late, self.noises + late])
+        first = np.concatenate([motion, early, self.noises + early, read])
+        second = np.concatenate([self.noises + motion, late, self.noises + late, self.noises + read])
         return np.stack([first, second], axis=1)
 
     @property
@@ -132,6 +135,7 @@ def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) 
         "asked": design.fed_back,
         "violated": watched,
         "held": design.fed_back if setting.flown else 0,
+        "read": design.sampled if setting.flown else 0,
     }
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return Run(
@@ -171,6 +175,15 @@ def system_at(
     return system.model(state, part(u, 0, system.statement.nu), time, duration, ca.vertcat(known, unknowns))
 
 
+def read_at(run: Run, system: System, augmented: tuple[Any, Any], u: Given, c: dict[str, Any]) -> Read:
+    """What `System.read` gives for a state and unknowns, as `system_at` does."""
+    x, unknowns = augmented
+    state = part(ca.vertcat(x, part(c["x"], run.setting.design.entries)), 0, system.statement.nx)
+    known = ca.DM(system.parameters[: system.parameters.size - system.unknowns])
+    control, duration = part(u, 0, system.statement.nu), run.setting.solution.duration
+    return system.read(state, control, c["t"], duration, ca.vertcat(known, unknowns))
+
+
 def part(column: Given, first: int, last: int | None = None) -> Any:
     """Some rows of a column; (0, 1) where there are none, which slicing a single number does not give."""
     size = int(column.shape[0])
@@ -206,7 +219,7 @@ def deviations(run: Run, z: Given, c: dict[str, Any]) -> Any:
 def control_of(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
     """The control that the feedback asks for, and the one that there is, both of the fed-back rows."""
     if run.setting.flown:
-        asked = part(z, run.spans["held"].start)
+        asked = part(z, run.spans["held"].start, run.spans["held"].stop)
     else:
         asked = part(c["u"], 0, run.setting.design.fed_back) - c["C"] @ estimated_deviation(run, z, c)
     limits, applied = run.setting.limits, []

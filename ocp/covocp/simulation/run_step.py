@@ -30,8 +30,18 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
 from covocp.simulation.constraints import Place, beyond, counted_rows, violations
-from covocp.simulation.filtering import corrected, moved_covariance
-from covocp.simulation.run_parts import Run, control_of, deviations, estimate_of, factor, part, replaced, system_at
+from covocp.simulation.filtering import corrected, moved_covariance, read_now
+from covocp.simulation.run_parts import (
+    UNREAD,
+    Run,
+    control_of,
+    deviations,
+    estimate_of,
+    factor,
+    part,
+    replaced,
+    system_at,
+)
 
 
 def start_of(run: Run) -> Array:
@@ -41,6 +51,7 @@ def start_of(run: Run) -> Array:
     z[run.spans["x"]] = run.setting.actual.start[: design.entries]
     if run.setting.flown:
         z[run.spans["held"]] = solution.controls[0, : design.fed_back]
+        z[run.spans["read"]] = UNREAD
     if run.setting.filter == "extended":
         z[run.spans["estimate"]] = design.start
         z[run.spans["E"]] = solution.trajectory.e[0][design.covariance]
@@ -59,17 +70,12 @@ def step_function(run: Run, constant: Array, varying: Given) -> ca.Function:
         (state, noise, own unknowns, varying coefficients at both ends and h) -> state after the step; deviation from
         the nominal and estimate of it there (2n).
     """
-    w, h = run.symbolic.sym("w", run.noises), run.symbolic.sym("h")
-    motion, early, late = ca.vertsplit(w, run.parts_of_noise)
+    w, rest = run.symbolic.sym("w", run.noises), run.symbolic.sym("rest", 1 + run.setting.design.statement.readings)
+    h = rest[0]
+    motion, early, late, _ = ca.vertsplit(w, run.parts_of_noise)
     if run.setting.flown:
         motion = ca.vertcat(motion, (early + late) / np.sqrt(2.0))
-    symbols = [run.symbolic.sym(name, varying.size) for name in ("before", "after")]
-    sides = []
-    for symbol in symbols:
-        column = run.symbolic(ca.DM(constant))
-        if varying.size:
-            column[varying.tolist()] = symbol
-        sides.append(run.coefficients.split(column))
+    symbols, sides = _sides(run, constant, varying)
     moving, end = run.moving, run.spans["held"].start
     z = corrected(run, run.z, sides[0], early, h, late=False)
     move = run.geometry.move
@@ -85,7 +91,34 @@ def step_function(run: Run, constant: Array, varying: Given) -> ca.Function:
     flags = ca.fmax(part(z, moving.stop, end), _flags(run, sides[0], ("path",)))
     outputs = [ca.densify(ca.vertcat(after[moving], flags, part(z, end))), deviations(run, after, sides[1])]
     options = {"cse": True} if run.symbolic is ca.SX else {}
-    return ca.Function("step", [run.z, w, run.own, ca.vertcat(*symbols, h)], outputs, options)
+    return ca.Function("step", [run.z, w, run.own, ca.vertcat(*symbols, rest)], outputs, options)
+
+
+def _sides(run: Run, constant: Array, varying: Given) -> tuple[list[Any], list[dict[str, Any]]]:
+    """Symbols of the coefficients that vary, at both ends of a step, and all coefficients there by name."""
+    symbols = [run.symbolic.sym(name, varying.size) for name in ("before", "after")]
+    sides = []
+    for symbol in symbols:
+        column = run.symbolic(ca.DM(constant))
+        if varying.size:
+            column[varying.tolist()] = symbol
+        sides.append(run.coefficients.split(column))
+    return symbols, sides
+
+
+def read_function(run: Run, constant: Array, varying: Given) -> ca.Function | None:
+    """What is read at an instant, as `step_function` with steps of no length; None where nothing is."""
+    design = run.setting.design
+    if not design.sampled:
+        return None
+    w, rest = run.symbolic.sym("w", run.noises), run.symbolic.sym("rest", 1 + design.statement.readings)
+    symbols, sides = _sides(run, constant, varying)
+    noise = ca.vertsplit(w, run.parts_of_noise)[3]
+    after = read_now(run, sides[0], noise, rest[1:])
+    flags = ca.fmax(part(after, run.moving.stop, run.spans["held"].start), _flags(run, sides[0], ("path",)))
+    after = ca.vertcat(after[run.moving], flags, part(after, run.spans["held"].start))
+    outputs = [ca.densify(after), deviations(run, after, sides[1])]
+    return ca.Function("read", [run.z, w, run.own, ca.vertcat(*symbols, rest)], outputs)
 
 
 def observe_function(run: Run) -> ca.Function:

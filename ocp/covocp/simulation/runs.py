@@ -25,7 +25,7 @@ from covocp.simulation.prediction import Prediction, control_spread, predict
 from covocp.simulation.request import Request, wrong_argument
 from covocp.simulation.run_parts import Limits, Setting
 from covocp.simulation.sampling import THREE_SIGMA, moments_of
-from covocp.simulation.schedule import FilterKind, Grid, Nominal, base_grid, nominal_at, stored_times
+from covocp.simulation.schedule import FilterKind, Grid, Nominal, base_grid, indices, nominal_at, stored_times
 from covocp.simulation.step_choice import StepChoice, choose_step, examined, given_step
 from covocp.simulation.verdict import LEFT
 from covocp.simulation.workers import Harvest, simulate_batches
@@ -78,7 +78,8 @@ def simulate(
         law: what flies instead of the design's filter and feedback: an object with `step(measurement, time)` that
             returns the whole control, (m,), such as a CPackage's `python()`. Each run has a deep copy of it, started by
             its `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual
-            measurement over the period before, (r,), NaN at time zero; its control is held until the next step. Where
+            measurement over the period before, (r,), NaN at time zero, and below it what was read at instants since
+            its last step, NaN where nothing was; its control is held until the next step. Where
             it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too.
         period: time between two steps of the law [s]; None: its own attribute `period`.
         executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
@@ -130,7 +131,7 @@ def simulate(
         plan = make_plan(setting, chosen.grid, t, seed=int(seed), paths=paths)
         harvest = simulate_batches(plan, request.ranges, executor, lambda: reporter.stop, _reporting(reporter))
         _tell(harvest, runs)
-        at = np.searchsorted(base.t, t)
+        at = indices(base, t)
         kept = tuple(prediction.at(at) for prediction in (expected, true))
         result = _result(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, truth)
         return _told(result, setting, reporter)

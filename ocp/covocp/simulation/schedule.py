@@ -21,6 +21,7 @@ from covocp.blocks.arithmetic import apply
 from covocp.blocks.updates import definite_gain
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
+from covocp.statement.statement import Statement
 
 FilterKind = Literal["perturbation", "extended"]
 Estimator = FilterKind | Literal["law"]
@@ -34,11 +35,13 @@ MOST_STEPS = 10**7  # of a run; their times alone fill a memory
 class Grid:
     """Steps within the intervals of a mesh.
 
-    t: times, (N + 1,); interval: of the mesh, for each step, (N,).
+    t: times, (N + 1,); interval: of the mesh, for each step, (N,). share: what a step of no length takes of what is
+        read at its instant, (N,); of the others zero.
     """
 
     t: Array
     interval: Any
+    share: Array
 
     __repr__ = short_repr
 
@@ -58,7 +61,8 @@ class Grid:
         step = np.repeat(np.arange(self.steps), counts)
         inside = np.arange(step.size) - np.repeat(np.cumsum(counts) - counts, counts)
         starts = self.t[step] + self.h[step] * (inside / counts[step])
-        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step])
+        share = self.share[step] / counts[step]
+        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step], share=share)
 
     def parts(self, length: Given) -> Any:
         """Into how many parts each step must be divided so that none is longer than `length`."""
@@ -82,7 +86,9 @@ def base_grid(solution: Solution, points: int, step: float | None = None, sample
     if samples is not None:
         new = np.abs(samples[:, None] - nodes).min(axis=1) > WHOLE * solution.duration
         t = np.sort(np.concatenate([nodes, samples[new]]))
-    mesh = Grid(t=t, interval=np.searchsorted(nodes, t[:-1], side="right") - 1)
+    read = np.diff(t) == 0.0
+    interval = np.searchsorted(nodes, t[:-1], side="right") - 1 - read
+    mesh = Grid(t=t, interval=interval, share=read.astype(float))
     parts = mesh.parts(solution.duration / max(1, points - 1))
     return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 
@@ -98,7 +104,17 @@ def stored_times(grid: Grid, points: int, samples: Given) -> tuple[Array, Any]:
     after = np.clip(np.searchsorted(t, wanted), 1, t.size - 1)
     nearer = wanted - t[after - 1] < t[after] - wanted
     at = among[np.unique(after - nearer)]
+    read = np.flatnonzero(grid.share)  # before and after what is read there
+    at = np.unique(np.concatenate([at, read[np.isin(read + 1, at)], read[np.isin(read, at)] + 1]))
     return grid.t[at], grid.interval[np.minimum(at, grid.steps - 1)]
+
+
+def indices(grid: Grid, times: Array) -> Any:
+    """Where some times lie in a grid; of two that are the same the second is after what is read there."""
+    at = np.searchsorted(grid.t, times)
+    again = np.append(False, times[1:] == times[:-1])
+    last = np.searchsorted(grid.t, times, side="right") - 1
+    return np.where(again, last, at)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,11 +142,19 @@ def nominal_at(solution: Solution, t: Array, interval: Given) -> Nominal:
 
 
 def _states_at(solution: Solution, t: Array) -> tuple[Array, Array]:
-    """States (K, nx) and half-vectors (K, ne)."""
-    sample = solution.at(t)
+    """States (K, nx) and half-vectors (K, ne); of times that follow each other and are the same those before the last
+    one are before what is read there."""
     blocks = {kind: [b for b in solution.blocks if b.kind == kind] for kind in ("state", "matrix")}
-    x = np.hstack([sample[b.name].reshape(t.size, b.size) for b in blocks["state"]])
-    return x, np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+
+    def values(sample: Given, count: int) -> tuple[Array, Array]:
+        x = np.hstack([sample[b.name].reshape(count, b.size) for b in blocks["state"]])
+        return x, np.hstack([pack(sample[b.name]) for b in blocks["matrix"]])
+
+    x, e = values(solution.at(t), t.size)
+    early = np.flatnonzero(np.append(t[1:] == t[:-1], False))
+    if early.size:
+        x[early], e[early] = values(solution.at(t[early], "before"), early.size)
+    return x, e
 
 
 def _controls_at(solution: Solution, t: Array, interval: Given) -> Array:
@@ -138,7 +162,8 @@ def _controls_at(solution: Solution, t: Array, interval: Given) -> Array:
     nodes, u = solution.t, solution.controls
     if solution.mesh.control == "constant":
         return np.asarray(u[interval])
-    c = ((t - nodes[interval]) / np.diff(nodes)[interval])[:, None]
+    h = np.diff(nodes)[interval]
+    c = np.where(h > 0, (t - nodes[interval]) / np.where(h > 0, h, 1.0), 0.0)[:, None]
     return np.asarray(u[interval] + c * (u[interval + 1] - u[interval]))
 
 
@@ -146,11 +171,12 @@ def _controls_at(solution: Solution, t: Array, interval: Given) -> Array:
 class Coefficients:
     """What filter and feedback use at one time, stacked in a column of `rows` entries.
 
-    function: (state, control, matrices, time, duration, parameters, length h of the step) -> the column.
+    function: (state, control, matrices, time, duration, parameters, length h of the step, readings) -> the column.
     shapes: of the parts by name, in their order: "t", the nominal "x", "u" and, where a constraint uses them, the
         matrices "e", the gain "C", "extra", the weights B - L_uu of the feedback; for the perturbation filter its gain
         "K", its model "F", "G", "M", "Hu", "h", the measurement that is expected along the nominal, and "early",
-        E M'(M E M' + 2 U/h)^-1, its gain for what is measured during the first half of a step.
+        E M'(M E M' + 2 U/h)^-1, its gain for what is measured during the first half of a step; of what is read at an
+        instant its gain "Kr", its model "Hr", "Hru" and the reading "hr" that is expected.
     """
 
     function: ca.Function
@@ -187,16 +213,36 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
         "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
     }
-    step = symbolic.sym("step")
+    step, reading = symbolic.sym("step"), symbolic.sym("reading", st.readings)
     if kind == "perturbation":
         at, E = design.model(x, u, t, T, p), unpack_symbolic(estimation_half(st, e), n)
         parts |= {"K": kalman_gain(E, at.M, at.U), "F": at.F, "G": at.G, "M": at.M, "Hu": at.Hu, "h": at.h}
         parts["early"] = early_gain(E, at.M, at.U, step)
+        read = design.read(x, u, t, T, p)
+        gain = read_gain(st, E, read.H, read.R, reading)
+        parts |= {"Kr": gain, "Hr": read.H, "Hru": read.Hu, "hr": read.h}
     shapes = {name: (int(value.shape[0]), int(value.shape[1])) for name, value in parts.items()}
     assert shapes["C"] == (m, n)
     return Coefficients(
-        function=ca.Function("coefficients", [*a, step], [ca.veccat(*map(ca.densify, parts.values()))]), shapes=shapes
+        function=ca.Function("coefficients", [*a, step, reading], [ca.veccat(*map(ca.densify, parts.values()))]),
+        shapes=shapes,
     )
+
+
+def read_gain(statement: Statement, E: Given, H: Given, R: Given, reading: Given) -> Any:
+    """Gain E H'(H E H' + R/r)^-1 of what is read at an instant, (n, s), r the share of each; zero where it is none."""
+    if not H.shape[0]:
+        return type(E).zeros(E.shape[0], 0)
+    taken = by_rows(statement, reading)
+    H = ca.repmat(ca.sqrt(taken), 1, H.shape[1]) * H
+    gain = apply(lambda E, H, R: (definite_gain(E, H, R),), E, H, ca.densify(R))[0]
+    return gain * ca.repmat(ca.sqrt(taken).T, E.shape[0], 1)
+
+
+def by_rows(statement: Statement, reading: Given) -> Any:
+    """The share that is taken of each value that can be read."""
+    assert statement.samples is not None
+    return ca.vertcat(*(ca.repmat(reading[j], b.size, 1) for j, b in enumerate(statement.samples.blocks)))
 
 
 def estimation_half(statement: Given, e: Given) -> Any:
@@ -214,11 +260,30 @@ def early_gain(E: Given, M: Given, U: Given, h: Given) -> Any:
 def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, Array]:
     """The columns at the starts and at the ends of all steps, (N, rows) each."""
     x, e = _states_at(solution, grid.t)
+    read = readings_of(solution, grid)
+    _read_in_parts(solution, grid, x, e, read)
     sides = []
     for part in (slice(0, -1), slice(1, None)):
         t = grid.t[part]
         at = Nominal(x=x[part], u=_controls_at(solution, t, grid.interval), e=e[part], t=t)
         columns = at.columns(solution.duration, solution.parameters)
-        values = chosen.function.map(grid.steps)(*columns, grid.h[None, :])
+        values = chosen.function.map(grid.steps)(*columns, grid.h[None, :], read)
         sides.append(np.ascontiguousarray(values.full().T))
     return sides[0], sides[1]
+
+
+def readings_of(solution: Solution, grid: Grid) -> Array:
+    """What the steps of a grid take of each measurement at instants, (measurements, N)."""
+    taken = solution.mesh.readings
+    return np.asarray(taken[:, grid.interval] * grid.share if taken.size else np.zeros((0, grid.steps)))
+
+
+def _read_in_parts(solution: Solution, grid: Grid, x: Array, e: Array, read: Array) -> None:
+    """Half-vectors (in place) between the parts in which something is read at one instant."""
+    samples = solution.extremal.statement.samples
+    if samples is None:
+        return
+    u, fixed = _controls_at(solution, grid.t[:-1], grid.interval), (solution.duration, solution.parameters)
+    for k in np.flatnonzero(grid.share[:-1] * grid.share[1:] * (np.diff(grid.interval) == 0)):
+        after, _ = samples.update(x[k], u[k], e[k], grid.t[k], *fixed, read[:, k])
+        e[k + 1] = np.asarray(after.full()).ravel()

@@ -58,7 +58,7 @@ class StepChoice:
     @property
     def shortest(self) -> float:
         """Shortest step [s]."""
-        return float(self.grid.h.min())
+        return float(self.grid.h[self.grid.share == 0].min())
 
     @property
     def reason(self) -> str:

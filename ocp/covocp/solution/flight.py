@@ -99,9 +99,12 @@ def _interpolated(solution: Solution) -> Array:
     """x and half-vectors at equal parts of the intervals, (N, m + 1, size), as `Solution.at` has them."""
     nodes, m = solution.t, loop_substeps(solution.extremal)
     c = np.arange(m + 1) / m
-    t = nodes[:-1, None] + np.diff(nodes)[:, None] * c
-    t[:, -1] = nodes[1:]
-    sample = solution.at(t.ravel())
-    states = [sample[b.name].reshape(t.size, b.size) for b in solution.blocks if b.kind == "state"]
-    halves = [pack(sample[b.name]) for b in solution.blocks if b.kind == "matrix"]
-    return np.hstack([*states, *halves]).reshape(t.shape[0], m + 1, -1)
+    t = nodes[:-1, None] + np.diff(nodes)[:, None] * c[:-1]
+    parts = []
+    for times, side in ((t.ravel(), "after"), (nodes[1:], "before")):
+        sample = solution.at(times, side)
+        states = [sample[b.name].reshape(times.size, b.size) for b in solution.blocks if b.kind == "state"]
+        halves = [pack(sample[b.name]) for b in solution.blocks if b.kind == "matrix"]
+        parts.append(np.hstack([*states, *halves]))
+    inside, ends = parts[0].reshape(*t.shape, -1), parts[1][:, None, :]
+    return np.concatenate([inside, ends], axis=1)

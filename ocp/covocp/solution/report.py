@@ -426,7 +426,7 @@ def _effort(solution: Solution) -> Section:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
-        _intervals(mesh.intervals, stats),
+        _intervals(mesh.intervals, len(mesh.instants), stats),
         f"controls piecewise {mesh.control}",
         _counted(mesh.substeps, "integration step") + " an interval",
         _counted(len(mesh.segments), "shooting segment"),
@@ -444,13 +444,16 @@ def _effort(solution: Solution) -> Section:
     return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
-def _intervals(count: int, stats: Mapping[str, Any]) -> str:
-    """The number of intervals, and how the mesh that was asked for was graded."""
-    asked, added = stats.get("intervals_asked"), stats.get("nodes_added")
-    if asked is None or added is None:
-        return _counted(count, "interval")
-    places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
-    return f"{_counted(asked, 'interval')}, graded to {count} {places}"
+def _intervals(count: int, instants: int, stats: Mapping[str, Any]) -> str:
+    """The number of intervals, how the mesh that was asked for was graded, where measurements are taken."""
+    asked, added, count = stats.get("intervals_asked"), stats.get("nodes_added"), count - instants
+    words = _counted(count, "interval")
+    if asked is not None and added is not None and any(added):
+        places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
+        words = f"{_counted(asked, 'interval')}, graded to {count} {places}"
+    elif asked is not None and asked != count:
+        words = f"{_counted(asked, 'interval')} asked for, {count} between the instants"
+    return words + (f", measurements taken at {_counted(instants, 'instant')}" if instants else "")
 
 
 def _starts(costs: Given) -> str:

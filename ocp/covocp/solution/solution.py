@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.arguments import checked, one_of
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -293,7 +294,8 @@ class Solution:
         shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
         return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
 
-    def at(self, t: Given) -> Sample:
+    @checked(side=one_of("after", "before"))
+    def at(self, t: Given, side: str = "after") -> Sample:
         """Values at other times than the nodes.
 
         States and matrices as the integrator computes them between the nodes (`dense`), controls as they were
@@ -301,6 +303,7 @@ class Solution:
 
         Args:
             t: a time or an array of times [s], within [0, duration].
+            side: "after" or "before", where something jumps there: a covariance at a measurement that is taken then.
 
         Returns:
             What `[symbol or name]` gives the values of.
@@ -317,21 +320,18 @@ class Solution:
                 received=str(t)[:100],
                 remedy="stay within the duration of the solution",
             )
-        z, u = self.dense.at(np.clip(times / self.duration, 0.0, 1.0)), self.controls_at(times)
+        before = side == "before"
+        z = self.dense.at(self.mesh.placed(times / self.duration), before=before)
+        u = self.controls_at(times, before=before)
         nx = self.trajectory.x.shape[1]
         values = self._assemble(times, z[:, :nx], u, z[:, nx:])
         if np.ndim(t) == 0:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols=self.symbols)
 
-    def controls_at(self, times: Array) -> Array:
-        """Controls at some times [s], (K, nu); at a node where they jump those of the interval that starts there."""
-        nodes, u = self.t, self.controls
-        k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, nodes.size - 2)
-        if self.mesh.control == "constant":
-            return np.asarray(u[k])
-        c = (times - nodes[k]) / (nodes[k + 1] - nodes[k])
-        return np.asarray(u[k] + c[:, None] * (u[k + 1] - u[k]))
+    def controls_at(self, times: Array, *, before: bool = False) -> Array:
+        """Controls at some times [s], (K, nu); where they jump those after it, or before it."""
+        return self.extremal.controls_at(self.mesh.placed(times / self.duration), before=before)
 
     @cached
     def dense(self) -> Dense:

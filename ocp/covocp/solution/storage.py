@@ -34,6 +34,8 @@ from covocp.solution.solution import Solution
 
 FORMAT = "covocp solution"
 VERSION = 3
+# Fields with a default that files of this version may lack.
+ADDED = ("readings",)
 SUFFIXES = (".npz", ".json")
 REASON = 160  # letters of a reason that an error quotes
 # Fields: of the problem, which is not kept; of the candidate, whose own fields are entries of the file.
@@ -277,6 +279,8 @@ def _made(hint: Any, value: Any, place: str, missing: list[str], wrong: list[str
                 entries[name] = _made(kind, value, place, missing, wrong)
             elif name in value:
                 entries[name] = _made(kind, value[name], here, missing, wrong)
+            elif name in ADDED:  # files that were written before have none of it
+                continue
             else:
                 missing.append(here)
         return hint(**entries) if len(missing) + len(wrong) == faults else None
@@ -349,13 +353,16 @@ def _check_blocks(solution: Solution) -> None:
 def _check_mesh(solution: Solution) -> None:
     """The mesh is one, and the solution is what it holds on it."""
     mesh, nodes, knots = solution.mesh, solution.mesh.nodes, solution.dense.knots
-    if nodes.ndim != 1 or nodes.size < 2 or not (np.diff(nodes) > 0).all() or nodes[0] != 0 or nodes[-1] != 1:
+    if nodes.ndim != 1 or nodes.size < 2 or not (np.diff(nodes) >= 0).all() or nodes[0] != 0 or nodes[-1] != 1:
         raise DamagedFileError("the nodes of its mesh do not rise from 0 to 1")
+    read = mesh.readings.any(axis=0) if mesh.readings.shape[-1] == mesh.intervals else np.zeros(mesh.intervals, bool)
+    if not np.array_equal(read, np.diff(nodes) == 0):
+        raise DamagedFileError("the nodes of its mesh are not those at which something is read")
     held = mesh.control in ("linear", "constant") and mesh.linear_solver.isalnum()
     least = min(*mesh.segments, mesh.substeps, mesh.points)
     if not held or sum(mesh.segments) != mesh.intervals or least < 1:
         raise DamagedFileError("its mesh contradicts itself")
-    if knots.ndim != 1 or not (np.diff(knots) > 0).all() or not np.isin(nodes, knots).all() or knots[-1] != 1:
+    if knots.ndim != 1 or not (np.diff(knots) >= 0).all() or not np.isin(nodes, knots).all() or knots[-1] != 1:
         raise DamagedFileError("the knots between the nodes of its mesh contradict it")
     if set(solution.constraints) != {"path", "start", "end"}:
         raise DamagedFileError("its constraints are not those of the path, the start and the end")

@@ -17,7 +17,7 @@ from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.threads import one_at_a_time
-from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance
+from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance, variances
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import finer_steps
@@ -94,7 +94,7 @@ def _along(
     given = Options(intervals=intervals, **_known(options))
     if isinstance(nominal, Solution) and not options:
         own = nominal.mesh
-        given = replace(given, grid=own.nodes, control=own.control)  # type: ignore[arg-type]
+        given = replace(given, grid=np.unique(own.nodes), control=own.control)  # type: ignore[arg-type]
     given = graded(st, given, values)
     mesh = evaluation_mesh(st, given, values)
     u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
@@ -261,6 +261,7 @@ def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
         initial=unpack(start_covariance(other, extremal, values)[block.span], block.size),
         density=densities(other),
         parameters=values,
+        variance=variances(other),
     )
     _check_densities(extremal, statistics)
     return statistics
@@ -272,7 +273,11 @@ def _check_densities(extremal: Extremal, truth: Statistics) -> None:
     count = extremal.mesh.intervals + 1
     values = truth.density.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
     check_density("truth", "initial covariance", truth.initial, definite=False)
-    for what, value in zip(("process noise density", "measurement noise density"), values, strict=True):
+    named = list(zip(("process noise density", "measurement noise density"), values, strict=True))
+    if truth.variance is not None:
+        own = truth.variance.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
+        named.append(("noise variance of what is read at instants", own))
+    for what, value in named:
         matrices = stacked(value, count)
         if matrices.size:
             smallest = np.linalg.eigvalsh(np.nan_to_num(matrices))[:, 0]
@@ -287,7 +292,7 @@ def _check_same(design: Statement, truth: Statement) -> None:
         kinds = ("state", "control", "unknown")
         return [(b.kind, b.name, b.size) for b in statement.blocks if b.kind in kinds]
 
-    measured = (design.measurement_names, truth.measurement_names)
+    measured = (_measured(design), _measured(truth))
     if signature(design) != signature(truth) or measured[0] != measured[1]:
         raise ProblemError(
             "The truth is another system than the design's.",
@@ -295,6 +300,15 @@ def _check_same(design: Statement, truth: Statement) -> None:
             received=", ".join(f"{k} {n} ({s})" for k, n, s in signature(truth)) + "; measured " + str(measured[1]),
             remedy="declare the same states, controls, unknowns and measurements in the same order",
         )
+
+
+def _measured(statement: Statement) -> tuple[str, ...]:
+    """The measurements, those at instants with their number of these."""
+    names = statement.measurement_names
+    if statement.samples is None:
+        return names
+    pairs = zip(statement.samples.blocks, statement.samples.places, strict=True)
+    return (*names, *(f"{block.name} at {len(places)} instants" for block, places in pairs))
 
 
 def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None:
@@ -321,6 +335,18 @@ def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None
         ("is controlled differently: the slope", st.augmented, 1, first_loop, other_loop),
         ("is measured differently: the slope", measured, 1, st.measurement, truth.measurement),
     )
+    if st.samples is not None and truth.samples is not None:
+        if st.samples.places != truth.samples.places:
+            raise ProblemError(
+                "The truth is measured at other instants than the design's.",
+                expected=f"the same instants: {len(st.samples.instants)} of them",
+                received=f"{len(truth.samples.instants)} of them, some elsewhere",
+                remedy="give the truth the instants of the design; or solve the problem with the others",
+            )
+        names = tuple(block.name for block in st.samples.blocks)
+        label = (", ".join(names),)
+        own_samples = ("is read differently: the slope", label, 1, st.samples.measurement, truth.samples.measurement)
+        functions = (*functions, own_samples)
     for what, names, output, one, two in functions:
         if one is not None and two is not None:
             values = [f.map(count)(x, u, t, duration, p)[output].full() for f, p in ((one, own), (two, others))]

@@ -167,7 +167,7 @@ def _weighted(own: Declarations) -> Declarations:
 
 def _searched(statement: Statement, rows: list[_Row], best: Solution, parameters: Mapping[str, Any]) -> Solution | None:
     """The solution along the nominal of `best` with weights of X that come closest to the conditions; None: no need."""
-    options = Options(grid=best.mesh.nodes, control=best.mesh.control)  # type: ignore[arg-type]
+    options = Options(grid=np.unique(best.mesh.nodes), control=best.mesh.control)  # type: ignore[arg-type]
     assert best.loop is not None
     loop = best.loop
     outcome: Outcome | None = None

@@ -80,6 +80,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
     sample = solution.at(mesh.nodes * solution.duration)
     at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
+    ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
     plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
     gain = free_gain_block(statement) if solution.loop is not None else None
     x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
@@ -101,6 +102,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
         else:
             e[:, block.span] = pack(sample[block.name])
+            e[mesh.instants, block.span] = pack(ahead[block.name])
     if same and matched and solution.trajectory.u.shape == u.shape:
         u = solution.trajectory.u.copy()
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:

@@ -32,6 +32,7 @@ class Interval(NamedTuple):
         s, ds: where it begins, and its length.
         duration: T [s].
         parameters: of the statement.
+        reading: what it takes of the measurements at instants (`Samples`); zero where its length is not.
     """
 
     start: Expr
@@ -40,12 +41,14 @@ class Interval(NamedTuple):
     ds: Expr
     duration: Expr
     parameters: Expr
+    reading: Expr
 
     @classmethod
     def symbols(cls, statement: Statement, kind: Any = None) -> Interval:
         """Symbols of all of them, of the kind of the statement's own unless another is given."""
         kind = statement.symbolic if kind is None else kind
         sizes = {"ua": statement.nu, "ub": statement.nu, "s": 1, "ds": 1, "T": 1, "p": statement.np}
+        sizes["reading"] = statement.readings
         return cls(*(kind.sym(name, size) for name, size in sizes.items()))
 
     @property
@@ -73,7 +76,8 @@ class Interval(NamedTuple):
     def part(self, c: float, d: float) -> Interval:
         """Its part [c, d], 0 <= c <= d <= 1."""
         s, ds = self.s + c * self.ds, (d - c) * self.ds
-        return self._replace(start=self.control(c), end=self.control(d), s=s, ds=ds)
+        own = {"start": self.control(c), "end": self.control(d), "reading": (d - c) * self.reading}
+        return self._replace(s=s, ds=ds, **own)
 
     def turned(self) -> Interval:
         """The same, passed backward."""

@@ -179,6 +179,34 @@ class Loop:
         return LoopSlopes(*self.expansion(*point))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """Measurements that are taken at instants, where the covariance of the estimation error falls at once.
+
+    Such an instant is an interval of no length in the meshes, with a node before and one after it. What an interval
+    takes of each measurement is its *reading*: 0 or 1, or a part of it, 1/k of the information in each of k parts.
+
+    blocks: where each measurement lies among the values.
+    places: the instants of each, rising fractions of the terminal time.
+    measurement: (state, control, time, duration, parameters) -> values (m), H = their Jacobian by the augmented state
+        (m, n), variance R of the noise (m, m).
+    update: (all six, reading) -> half-vectors after it [E+ = (I - K H) E (I - K H)' + K R K'], what it adds to the
+        running cost: tr S (E - E+)/2 in a closed loop with the best gain, else nothing.
+    """
+
+    blocks: tuple[Block, ...]
+    places: tuple[tuple[float, ...], ...]
+    measurement: ca.Function
+    update: ca.Function
+
+    __repr__ = short_repr
+
+    @cached
+    def instants(self) -> tuple[float, ...]:
+        """All instants, rising."""
+        return tuple(sorted({place for own in self.places for place in own}))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Duration:
     """The terminal time: its guess and bounds [s]; fixed where the bounds are equal."""
@@ -215,6 +243,7 @@ class Statement:
         information: (state, control, time, duration, parameters) -> the inverse densities that were stated as
             information, which may be zero but not negative; None where none was.
         chances: conditions on probabilities, which are among those of `path`, `start` and `end`.
+        samples: measurements that are taken at instants; None where there are none.
         geometry: how the state moves where some of it is no vector.
         expression: a user's expression -> function of the six inputs.
     """
@@ -234,6 +263,7 @@ class Statement:
     measurement: ca.Function | None
     measurements: tuple[Block, ...]
     information: ca.Function | None
+    samples: Samples | None
     path: Conditions
     start: Conditions
     end: Conditions
@@ -254,6 +284,16 @@ class Statement:
     expression: Callable[[Any], ca.Function] = field(repr=False)
 
     __repr__ = short_repr
+
+    @cached
+    def readings(self) -> int:
+        """Number of measurements that are taken at instants."""
+        return 0 if self.samples is None else len(self.samples.blocks)
+
+    @cached
+    def instants(self) -> tuple[float, ...]:
+        """Fractions of the terminal time that must be nodes of every mesh."""
+        return () if self.samples is None else self.samples.instants
 
     @property
     def measurement_names(self) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from covocp.base.short_repr import short_repr
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
+from covocp.transcription.instants import completed, with_instants
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import stiffness
@@ -59,8 +60,9 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
     Returns:
         The options; with the uniform mesh where nothing is steep.
     """
+    plain = with_instants(statement, options)
     if options.grid is not None or not _needed(statement):
-        return options
+        return plain
     longest = statement.duration.guess
     if statement.duration.free:
         longest = min(LONGER * longest, statement.duration.upper)
@@ -69,7 +71,7 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
         _steepness(statement, guess, parameters, longest / options.intervals, backward) for backward in (False, True)
     ]
     start, end = (_parts(entry, options.intervals, longest) / longest for entry in seen)
-    nodes = np.array(sorted({*options.nodes(), *start, *(1.0 - end)}))
+    nodes = completed(statement, np.array(sorted({*plain.nodes(), *start, *(1.0 - end)})))
     lengths = longest * np.diff(nodes)
     stiff = float((lengths * np.interp(longest * nodes[:-1], seen[0].times, seen[0].poles)).max())
     return replace(
@@ -100,6 +102,7 @@ def _guess(statement: Statement, options: Options, parameters: Array) -> Traject
         segments=(nodes.size - 1,),
         eliminated=True,
         step="gauss",
+        readings=np.zeros((statement.readings, nodes.size - 1)),
     )
     if _varies(statement):
         stiff = stiffness(statement, replace(options, grid=nodes), parameters)

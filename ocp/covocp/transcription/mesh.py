@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from covocp.base.expressions import Given
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.base.threads import cached
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import StepKind
 
@@ -34,19 +35,25 @@ EXPLICIT_SUBSTEPS = 8
 # 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
 IMPLICIT_SUBSTEPS = 4
 
+# Share of the terminal time by which a time may miss an instant and mean it.
+SAME_TIME = 1e-9
+# The same of a node: what dividing and multiplying by the terminal time leave.
+SAME_NODE = 4 * float(np.finfo(float).eps)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Graded:
     """The nodes of a default mesh that was graded at its ends, in place of a grid that is given (`grading`).
 
-    nodes: of t/T; asked: intervals that the user asked for; added: nodes added at the start and at the end; stiffness:
-        largest h times rate of the filter on its intervals.
+    nodes: of t/T, twice where a measurement is taken; asked: intervals that the user asked for; added: nodes added at
+        the start and at the end; stiffness: largest h times rate of the filter on its intervals, None where it was not
+        looked at.
     """
 
     nodes: Array
     asked: int
-    added: tuple[int, int]
-    stiffness: float
+    added: tuple[int, int] = (0, 0)
+    stiffness: float | None = None
 
     __repr__ = short_repr
 
@@ -101,7 +108,7 @@ class Options:
     @property
     def grading(self) -> dict[str, Any]:
         """What is said of the mesh in the statistics of a solution: how its ends were graded, where they were."""
-        if not isinstance(self.grid, Graded) or not any(self.grid.added):
+        if not isinstance(self.grid, Graded) or self.grid.asked == self.grid.nodes.size - 1:
             return {}
         return {"intervals_asked": self.grid.asked, "nodes_added": self.grid.added}
 
@@ -118,6 +125,8 @@ class Mesh:
         eliminated: whether the matrices are propagated along the nominal instead of being variables.
         step: covariance step; "rodas": implicit steps of the nominal, gauss steps of the covariances.
         linear_solver: CasADi's linear solver of the covariance steps.
+        readings: what each interval takes of each measurement at instants, (measurements, N): its node is there twice,
+            and the interval between has no length.
         points: equally spread points of an interval, its start among them, where path inequalities and bounds of
             states are imposed; they are ends of substeps. 1: at the nodes only.
     """
@@ -130,6 +139,7 @@ class Mesh:
     step: StepKind
     linear_solver: str = LINEAR_SOLVER
     points: int = 1
+    readings: Annotated[Array, "any intervals or none"] = field(default_factory=lambda: np.zeros((0, 0)))
 
     __repr__ = short_repr
 
@@ -148,12 +158,79 @@ class Mesh:
         c = np.arange(parts) / parts
         inside = self.nodes[:-1, None] + c * np.diff(self.nodes)[:, None]
         segments = tuple(parts * length for length in self.segments)
-        return replace(self, nodes=np.append(inside.ravel(), self.nodes[-1]), segments=segments, points=1)
+        nodes, readings = np.append(inside.ravel(), self.nodes[-1]), np.repeat(self.readings / parts, parts, axis=1)
+        return replace(self, nodes=nodes, segments=segments, points=1, readings=readings)
+
+    @cached
+    def instants(self) -> list[int]:
+        """Intervals of no length, at which measurements are taken."""
+        return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
+
+    def placed(self, s: Array) -> Array:
+        """Normalised times within [0, 1]; what rounding parts from a node is the node, more so from an instant."""
+        s = np.clip(s, 0.0, 1.0)
+        for places, same in ((self.nodes, SAME_NODE), (self.nodes[self.instants], SAME_TIME)):
+            if places.size:
+                k = np.clip(np.searchsorted(places, s), 1, places.size) - 1
+                for near in (places[k], places[np.minimum(k + 1, places.size - 1)]):
+                    s = np.where(np.abs(s - near) <= same, near, s)
+        return s
+
+    @cached
+    def stand_ins(self) -> list[int]:
+        """For each control value the one that acts in its place: another where it would act for no time."""
+        own = list(range(self.control_nodes))
+        last = self.intervals
+        if self.control == "constant":
+            for k in self.instants:
+                own[k] = own[k - 1] if k else next(j for j in own if j not in self.instants)
+        elif self.instants:
+            if self.nodes[1] == 0.0:
+                begin = int(np.flatnonzero(self.nodes == 0.0)[-1])
+                own[:begin] = [begin] * begin
+            if self.nodes[last - 1] == self.nodes[last]:
+                end = int(np.flatnonzero(self.nodes == self.nodes[last])[0])
+                own[end:] = [end] * (last + 1 - end)
+        return own
+
+    @cached
+    def idle(self) -> list[int]:
+        """Control values in whose place others act."""
+        return [k for k, j in enumerate(self.stand_ins) if j != k]
+
+    def acting(self, u: Any) -> Any:
+        """Controls, a column each, with those that act in the place of others."""
+        return u[:, self.stand_ins] if self.idle else u
+
+    def gathered(self, slopes: Array) -> Array:
+        """Slopes by the controls, a row each, where some act in the place of others."""
+        if not self.idle:
+            return slopes
+        result = np.zeros_like(slopes)
+        np.add.at(result, self.stand_ins, slopes)
+        return result
 
     @property
     def starts(self) -> tuple[int, ...]:
         """Node at which each segment starts, and the last node."""
         return tuple(np.cumsum([0, *self.segments]).tolist())
+
+
+def readings_at(statement: Statement, nodes: Array) -> Array:
+    """What each interval of some nodes takes of each measurement at instants, (measurements, N).
+
+    Raises:
+        ValueError: an instant is not there twice.
+    """
+    taken = np.zeros((statement.readings, nodes.size - 1))
+    if statement.samples is not None:
+        empty = np.flatnonzero(np.diff(nodes) == 0.0)
+        for j, places in enumerate(statement.samples.places):
+            at = np.searchsorted(nodes[empty], places)
+            if at.size and (at.max() >= empty.size or not np.array_equal(nodes[empty[at]], places)):
+                raise ValueError("the nodes of the mesh are not those of the measurements")
+            taken[j, empty[at]] = 1.0
+    return taken
 
 
 def control_places(nodes: Array, control: str) -> Array:
@@ -222,6 +299,7 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
         eliminated=eliminated,
         step=step,
         points=points,
+        readings=readings_at(statement, nodes),
     )
 
 

@@ -111,8 +111,9 @@ class NLP:
             lows.append(el / self.scales.e)
             highs.append(eu / self.scales.e)
         nodes = self.mesh.control_nodes
-        lows.append(np.tile(st.control_bounds[0], (nodes, 1)) / self.scales.u)
-        highs.append(np.tile(st.control_bounds[1], (nodes, 1)) / self.scales.u)
+        for bounds, limit in ((lows, st.control_bounds[0]), (highs, st.control_bounds[1])):
+            bounds.append(np.tile(limit, (nodes, 1)) / self.scales.u)
+            bounds[-1][self.mesh.idle] = 0.0  # these variables stand for nothing
         if st.duration.free:
             lows.append(np.array([st.duration.lower / self.scales.duration]))
             highs.append(np.array([st.duration.upper / self.scales.duration]))
@@ -192,11 +193,16 @@ class NLP:
             path=path,
             states=states,
             matrices=matrices,
-            controls=parts["u"] / self.scales.u,
+            controls=self._acting(parts["u"] / self.scales.u),
             gaps=np.hstack(gaps),
             inside_path=by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape),
             inside_states=inside_states,
         )
+
+    def _acting(self, controls: Array) -> Array:
+        """Multipliers of the control bounds, none where another control acts."""
+        controls[self.mesh.idle] = 0.0
+        return controls
 
     def pack_multipliers(self, multipliers: Multipliers, costates: tuple[Array, Array]) -> tuple[Array, Array]:
         """Multipliers of the NLP (for a cost scale of 1) from those of the statement and the costates at the nodes."""

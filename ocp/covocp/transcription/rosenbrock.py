@@ -46,6 +46,8 @@ DENSE = (
     (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
     (-0.6762803392801253, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
 )
+# Length [s] in place of none: nothing moves in it.
+SHORTEST = 1e-60
 # States up to which a step is written out in scalar operations, its linear systems too.
 SCALAR_STATES = 6
 KEPT = 16
@@ -76,6 +78,8 @@ def implicit_step(statement: Statement, fractions: tuple[float, ...]) -> ca.Func
     at = ca.Function("at", [value, c, side, *interval], [rate])
     slopes = ca.Function("slopes", [value, c, side, *interval], [ca.jacobian(rate, value), ca.jacobian(rate, c)])
     h = interval.h
+    if statement.readings:  # a measurement is taken in an interval of no length
+        h = ca.if_else(h == 0, SHORTEST, h)
     slope, in_time = slopes(x, 0.0, one_sided(0.0), *interval)
     solve = _solver(ca.DM.eye(nx) / (GAMMA * h) - slope, scalar)
     moves: list[Any] = []
@@ -121,7 +125,7 @@ def implicit_interval(statement: Statement, substeps: int, nodes: tuple[float, .
         x, inside = step(x, *part)
         total += sum(nominal(*part.at(c, inside[:, k]))[1] for k, c in enumerate(nodes)) / (substeps * len(nodes))
         states.append(x)
-    options = {"is_diff_in": [True] * 3 + [False, False, statement.duration.free, False]}  # as explicit steps
+    options = {"is_diff_in": [True] * 3 + [False, False, statement.duration.free, False, False]}  # as explicit steps
     outputs = [x, ca.horzcat(*states), interval.h * total]
     return ca.Function("implicit_interval", [start, *interval], outputs, options)
 

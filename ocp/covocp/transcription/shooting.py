@@ -18,9 +18,11 @@ from covocp.transcription.steps import (
     joint_interval,
     nominal_interval,
     propagate_step,
+    read_by,
     runge_kutta_step,
     simpson_interval,
     step_matrix,
+    with_reading,
 )
 
 # Steps that a sequence of numbers takes at a time.
@@ -34,6 +36,7 @@ def repeat(column: Expr, count: int) -> Any:
 
 def control_ends(mesh: Mesh, u: Expr) -> tuple[Any, Any]:
     """Controls at the starts and the ends of the intervals, a column each."""
+    u = mesh.acting(u)
     return (u[:, :-1], u[:, 1:]) if mesh.control == "linear" else (u, u)
 
 
@@ -42,7 +45,8 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     n = mesh.intervals
     start, end = control_ends(mesh, u)
     s, ds = ca.DM(mesh.nodes[:-1]).T, ca.DM(np.diff(mesh.nodes)).T
-    return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n))
+    reading = ca.DM(mesh.readings) if mesh.readings.size else ca.DM(0, n)
+    return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
 
 
 def shoot(statement: Statement, mesh: Mesh, variables: Expr) -> dict[str, Any]:
@@ -233,9 +237,9 @@ def _gathered(
 def _backward(statement: Statement, mesh: Mesh, last: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
     """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
     n, m = mesh.intervals, mesh.substeps
-    before, after, start, end, s, ds, duration, parameters = columns
+    before, after, *rest = columns
     order = list(range(n * m - 1, -1, -1))
-    turned = tuple(column[:, order] for column in (after, before, end, start, s + ds, -ds, duration, parameters))
+    turned = tuple(column[:, order] for column in (after, before, *Interval(*rest).turned()))
     if kicks is not None:
         last, kicks = last + kicks[:, n], kicks[:, list(range(n - 1, -1, -1))]
     arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
@@ -254,6 +258,9 @@ def _sequence(
     else:
         step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
         matrices = [step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions]
+        if mesh.instants and read_by(statement, positions):
+            step = with_reading(statement, positions, step)
+            matrices += [columns[0], *columns[2:]]
     if kicks is None:
         values = _accumulated(step, first, matrices, count)
         return values, values

@@ -270,7 +270,9 @@ def _coarse(statement: Statement, mesh: Mesh, parameters: tuple[float, ...]) -> 
     nodes = np.linspace(0.0, 1.0, count + 1)
     stiff = stiffness(statement, Options(grid=nodes), np.array(parameters))
     steps = IMPLICIT_SUBSTEPS if mesh.step == "rodas" else max(2, explicit_substeps(stiff.nominal))
-    return replace(mesh, nodes=nodes, substeps=steps + steps % 2, segments=(count,), eliminated=True, points=1)
+    none = np.zeros((mesh.readings.shape[0], count))
+    steps += steps % 2
+    return replace(mesh, nodes=nodes, substeps=steps, segments=(count,), eliminated=True, points=1, readings=none)
 
 
 def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory) -> Iterator[Trajectory]:

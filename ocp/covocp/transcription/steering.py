@@ -27,6 +27,8 @@ CUTS = 5
 TRACKING_ENERGY = 1e-4
 # Operations up to which a run and its slopes are written out in scalars where they are called often.
 SHORT = 50_000
+# Weight of a control that acts for no time, in mean weights.
+NO_TIME = 1e-3
 # Smallest singular value, relative to the largest, of directions in which the controls move what is aimed at.
 RANK = 1e-8
 
@@ -80,11 +82,13 @@ class Run:
 
 
 def quadrature_weights(mesh: Mesh) -> Array:
-    """Weight of each control value in the integral over s: trapezoidal for linear controls, lengths for constant."""
+    """Weight of each control value in the integral over s: trapezoidal for linear controls, lengths for constant.
+
+    Where a value acts for no time, small ones in place of none.
+    """
     steps = np.diff(mesh.nodes)
-    if mesh.control == "constant":
-        return steps
-    return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
+    weights = steps if mesh.control == "constant" else 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    return np.asarray(np.where(weights > 0, weights, NO_TIME * weights.mean()))
 
 
 @lru_cache(maxsize=KEPT)

@@ -1,5 +1,9 @@
 """One control interval: the nominal by Runge-Kutta, the covariances given the nominal by gauss, strang or rk4 steps.
 
+Where a measurement is taken at an instant the interval has no length: a step leaves everything as it is, and after it
+the covariance of the estimation error falls by what is read (`Samples.update`), in Joseph's form: exact and positive
+semidefinite at any accuracy.
+
 All functions made here take one control interval [s, s + ds] of the normalised time s = t/T, the controls at its two
 ends, and cut it into `substeps` equal steps. Their last arguments, after state (and half-vectors), are those
 of an `Interval`: control at the start, at the end, s, ds, T, parameters; `*interval` below.
@@ -47,7 +51,7 @@ def _slopes(statement: Statement, count: int) -> dict[str, Any]:
 
     The adjoint of a step is the dearest function of all; slopes by the mesh and the parameters would add a third.
     """
-    return {"is_diff_in": [True] * (count + 2) + [False, False, statement.duration.free, False]}
+    return {"is_diff_in": [True] * (count + 2) + [False, False, statement.duration.free, False, False]}
 
 
 @lru_cache(maxsize=KEPT)
@@ -93,7 +97,12 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
             cost = ca.if_else(first, _by_parts(statement)(*point)[0], cost)
         return ca.vertcat(moved, grown, cost)
 
-    stacked, cost = _classical_steps(statement, rate, ca.vertcat(z, 0), interval, substeps)
+    def read(part: Interval, value: Expr) -> Expr:
+        after, gained = read_at(statement, part, value[:nx], value[nx:-1])
+        return ca.vertcat(value[:nx], after, value[-1] + ca.if_else(first, 0, gained))
+
+    start = ca.vertcat(z, 0)
+    stacked, cost = _classical_steps(statement, rate, start, interval, substeps, read if statement.samples else None)
     if statement.behind:
         ends = ((0.0, z), (1.0, stacked[:, -1]))
         before, after = (_by_parts(statement)(*interval.at(c, v[:nx], v[nx:]))[1] for c, v in ends)
@@ -107,14 +116,43 @@ def _classical_steps(
     start: Expr,
     interval: Interval,
     substeps: int,
+    read: Callable[[Interval, Expr], Expr] | None = None,
 ) -> tuple[Expr, Expr]:
-    """Classical Runge-Kutta over the parts of an interval: values at their ends, and the last entry, the cost."""
+    """Classical Runge-Kutta over the parts of an interval: values at their ends, and the last entry, the cost.
+
+    What is read at the end of a part changes the values there.
+    """
     values = [start]
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
-        values.append(statement.geometry.step(partial(rate, part), values[-1], interval.h / substeps))
+        after = statement.geometry.step(partial(rate, part), values[-1], interval.h / substeps)
+        values.append(after if read is None else read(part, after))
     stacked: Expr = ca.horzcat(*values[1:])
     return stacked[:-1, :], stacked[-1, -1]
+
+
+def read_at(statement: Statement, part: Interval, x: Expr, e: Expr) -> tuple[Any, Any]:
+    """Half-vectors after what a part of an interval reads, and what that adds to the running cost."""
+    assert statement.samples is not None
+    after, cost = statement.samples.update(*part.at(0.0, x, e), part.reading)
+    return after, cost
+
+
+def read_by(statement: Statement, positions: tuple[int, ...]) -> bool:
+    """Whether measurements at instants change some of the matrices."""
+    return statement.samples is not None and any(statement.matrices[i].estimation for i in positions)
+
+
+@lru_cache(maxsize=KEPT)
+def with_reading(statement: Statement, positions: tuple[int, ...], step: ca.Function) -> ca.Function:
+    """A step of some matrices, and after it what is read: (*its arguments, state, *interval) -> half-vectors."""
+    own, *matrices = step.mx_in()
+    x, interval = ca.MX.sym("x", statement.nx), Interval.symbols(statement, ca.MX)
+    entries = statement.entries(positions)
+    e = ca.MX.zeros(statement.ne)
+    e[entries] = step(own, *matrices)
+    after, _ = read_at(statement, interval, x, e)
+    return ca.Function("read_step", [own, *matrices, x, *interval], [after[entries]])
 
 
 @lru_cache(maxsize=KEPT)
@@ -256,13 +294,18 @@ def simpson_interval(statement: Statement, substeps: int, by_parts: bool = False
     states, halves = symbolic.sym("xf", nx, substeps), symbolic.sym("ef", ne, substeps)
     interval = Interval.symbols(statement)
     rates = _by_parts(statement) if by_parts else _running(statement)
-    total, passed = 0, []
+    total: Any = 0
+    passed: list[Any] = []
     for j in range(substeps + 1):
         xj, ej = (x, e) if j == 0 else (states[:, j - 1], halves[:, j - 1])
         cost, product = rates(*interval.at(j / substeps, xj, ej))
         total = total + simpson_weight(j, substeps) * cost
         passed.append(product)
     value = interval.h * total + passed[0] - passed[-1]
+    if statement.samples is not None and not by_parts:
+        for j in range(substeps):
+            xj, ej = (x, e) if j == 0 else (states[:, j - 1], halves[:, j - 1])
+            value += read_at(statement, interval.part(j / substeps, (j + 1) / substeps), xj, ej)[1]
     return ca.Function("simpson_interval", [x, e, states, halves, *interval], [value], _slopes(statement, 4))
 
 
@@ -314,6 +357,10 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
         after = propagate(own, *(matrix(starts[:, j], states[:, j], *part) for matrix in matrices))
+        if read_by(statement, stepped):
+            whole: Any = ca.MX.zeros(statement.ne)
+            whole[statement.entries(stepped)] = after
+            after = read_at(statement, part, starts[:, j], whole)[0][statement.entries(stepped)]
         if statement.summed:
             ends = (own[: ahead_size(statement)], after[: ahead_size(statement)], starts[:, j], states[:, j])
             gathered = gathered + gathering_step(statement, step, solver)(*ends, *part)
@@ -433,4 +480,8 @@ def matrices_step(
     else:
         steps = [step_matrix(statement, i, step, solver)(xa, xb, *interval) for i in positions]
         end = propagate_step(statement, positions, step, solver)(e, *steps)
+        if read_by(statement, positions):
+            whole = ca.MX.zeros(statement.ne)
+            whole[statement.entries(positions)] = end
+            end = read_at(statement, interval, xa, whole)[0][statement.entries(positions)]
     return ca.Function("matrices_step", [e, xa, xb, *interval], [end])

@@ -12,6 +12,7 @@ from covocp.base.matrices import Array, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess, starts
+from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
 from covocp.transcription.steps import KEPT
 
@@ -21,6 +22,7 @@ DAMPED = -0.5
 
 def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
+    options = with_instants(statement, options)
     stiff = stiffness(statement, options, parameters)
     return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
 
@@ -45,7 +47,7 @@ def stiffness(statement: Statement, options: Options, parameters: Array) -> Stif
             slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
             matrices = max(matrices, _largest(_eigenvalues(slope)))
             break
-        if block.estimation and isinstance(options.grid, Graded):
+        if block.estimation and isinstance(options.grid, Graded) and options.grid.stiffness is not None:
             matrices = max(matrices, options.grid.stiffness / longest)
             continue
         drift, _, information = (np.asarray(v.full()) for v in form(x, u, 0.0, duration, parameters))

@@ -67,7 +67,7 @@ class _Variables:
         if self.e is not None and statement.tied is not None and statement.tied.matrices:
             first = statement.started(self.x[:, 0], self.parameters, self.e[:, 0])[1]
             self.e = ca.horzcat(first, self.e[:, 1:])
-        self.u = ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T)
+        self.u = mesh.acting(ca.reshape(u, nu, nodes) * ca.DM(np.broadcast_to(scales.u, (nodes, nu)).T))
         self.duration = duration * scales.duration if statement.duration.free else ca.MX(statement.duration.guess)
 
 

@@ -11,7 +11,8 @@ deviation from the nominal, computes
     u  =  u(t) - C y+,                       within the limits, where there are some
 
 with F, G, Q, M, H, U and the measurement h expected there from the model's own functions along the nominal, and C at t.
-A measurement stands for the h seconds before it: white noise of density U, averaged over them.
+A measurement stands for the h seconds before it: white noise of density U, averaged over them. What is read at an
+instant has its variance in place of U/h.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
 from covocp.base.matrices import Array
 from covocp.base.quadrature import GAUSS_NODES, gauss_step
 from covocp.blocks.updates import without
-from covocp.export.laws.design import Design
+from covocp.export.laws.design import Design, measured_blocks
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
@@ -49,6 +50,10 @@ ABOUT = (
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
+ABOUT_INSTANTS = (
+    "Rows of the measurement that are read at instants count with their variance in the step in which they are finite; "
+    "NaN between the instants is no missing row.",
+)
 
 
 def controller_law(design: Design, tables: History, tolerance: float) -> Law:
@@ -64,7 +69,8 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     before = design.error(tables.at(last).e)
     predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
     now = tables.at(clock.time)
-    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h), now, clock.time)
+    due = design.due(clock.time, tables.margin * tables.duration)
+    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h, due), now, clock.time)
     feedback = C @ corrected
     good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
@@ -89,7 +95,7 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     return Law(
         name="step",
         kind="controller",
-        about=(*ABOUT, limits_text(design.statement, design.limits)),
+        about=(*about(design), limits_text(design.statement, design.limits)),
         notes=limits_notes(design.statement, design.limits),
         constants=limit_constants(design.statement, design.limits),
         core=core,
@@ -101,6 +107,11 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
         points=lambda random, count: points(design, tables, random, count),
         tolerance=tolerance,
     )
+
+
+def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:
+    """What is said of a law, with what is read at instants where something is."""
+    return (*own, *(ABOUT_INSTANTS if design.always < design.sizes[2] else ()))
 
 
 def finite(estimate: Expr, feedback: Expr) -> Any:
@@ -120,7 +131,7 @@ def input_ports(design: Design) -> tuple[Port, ...]:
 
 def measurement_port(design: Design) -> Port:
     """The port of what is measured."""
-    rows = entry_names(design.statement.measurements)
+    rows = entry_names(design.measured)
     return Port(name="measurement", rows=design.sizes[2], entries=with_units(design.statement, rows))
 
 
@@ -158,7 +169,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
 
 def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
     """Names of entries with the units of their symbols."""
-    blocks = (*statement.blocks, *statement.measurements)
+    blocks = (*statement.blocks, *measured_blocks(statement))
     units = {name: block.unit for block in blocks for name in entry_names((block,))}
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
@@ -219,30 +230,36 @@ def _predict(
 
 
 def _corrected(
-    design: Design, predicted: tuple[Any, Any], given: tuple[Any, Any, Any], now: Nominal, time: Expr
+    design: Design, predicted: tuple[Any, Any], given: tuple[Any, ...], now: Nominal, time: Expr
 ) -> tuple[Any, ...]:
     """Estimate after the measurement, feedback gain, filter gain, whether a row of the measurement is missing.
 
     Args:
         design: the model.
         predicted: estimate and covariance of its error before.
-        given: control held, measurement, length of the step.
+        given: control held, measurement, length of the step, which rows are there.
         now: the nominal.
         time: of the measurement.
     """
     st, (n, m, r) = design.statement, design.sizes
     kind = design.symbolic if r <= SCALAR_SIZE else ca.MX
     y, held, measured, h = kind.sym("y", n), kind.sym("held", m), kind.sym("measurement", r), kind.sym("h")
+    due = kind.sym("due", r)
     x, u, e, t = kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("e", st.ne), kind.sym("t")
     model = design.model(x, u, t)
     expected, M, slope, U = model.h, model.M, model.H, model.U
     E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
-    L, _ = innovation_gain(h * E, *without(present, M, U), solved_in_units)
-    missing = ca.sum1(present) < r
+    if design.always == r:
+        L, _ = innovation_gain(h * E, *without(present, M, U), solved_in_units)
+    else:  # sqrt(h) of what is measured all the time, so that its noise is U; what is read has its variance
+        roots = ca.vertcat(ca.repmat(ca.sqrt(h), design.always, 1), kind.ones(r - design.always))
+        L, _ = innovation_gain(E, *without(present, ca.diag(roots) @ M, U), solved_in_units)
+        L = L @ ca.diag(roots)
+    missing = ca.sum1(due * (1 - present)) > 0
     outputs = [ca.densify(v) for v in (y + L @ residual, C, L, missing)]
-    function = ca.Function("correct", [y, E, held, measured, h, x, u, e, t], outputs)
+    function = ca.Function("correct", [y, E, held, measured, h, due, x, u, e, t], outputs)
     return tuple(function(*predicted, *given, now.x, now.u, now.e, time))
 
 
@@ -262,7 +279,8 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
     for k in range(count):
         deviation = _root(E[:, k * n : (k + 1) * n]) @ random.standard_normal(n)
         estimate = deviation * random.uniform(0.0, 2.0)
-        noise = _root(np.asarray(U[:, k * r : (k + 1) * r].full()) / steps[k]) @ random.standard_normal(r)
+        lengths = np.where(np.arange(r) < design.always, np.sqrt(steps[k]), 1.0)
+        noise = _root(np.asarray(U[:, k * r : (k + 1) * r].full())) @ random.standard_normal(r) / lengths
         seen = np.asarray(expected[:, k].full()).ravel() + np.asarray(M[:, k * n : (k + 1) * n].full()) @ deviation
         rows[k, span(ports, "estimate")] = estimate
         rows[k, span(ports, "held")] = u[:m, k] - C[:, k * n : (k + 1) * n] @ estimate

@@ -32,12 +32,14 @@ class DesignAt(NamedTuple):
 class Design:
     """A closed loop along its nominal; n: rows of the estimate, m: controls fed back, r: measured values.
 
+    Measured values are those that are always there, then those that are read at instants.
+
     Attributes:
         statement: of the problem.
         duration: T [s].
         parameters: of the statement.
         linear: (state, control, time) -> F (n, n), G (n, m), h (r,), M (r, n), slope of h by the control (r, m),
-            noise density U (r, r).
+            noise density U (r, r), of what is read at instants its variance.
         noise: (state, control, time) -> Q (n, n).
         gain: (state, control, half-vectors, time) -> C (m, n), E (n, n).
         error: half-vectors -> E (n, n).
@@ -49,6 +51,8 @@ class Design:
         units: largest standard deviation of each row of the estimate on the way, (n,); 1 where it is zero.
         labels: names of the rows of the estimate.
         sizes: n, m, r.
+        measured: the measurements, in the order of the values.
+        instants: times at which each value is read [s], (r,) of them; None of those that are always there.
     """
 
     statement: Statement
@@ -65,6 +69,20 @@ class Design:
     units: Array
     labels: tuple[str, ...]
     sizes: tuple[int, int, int]
+    measured: tuple[Block, ...]
+    instants: tuple[Array | None, ...]
+
+    @property
+    def always(self) -> int:
+        """Number of values that are always there, the first ones."""
+        return sum(times is None for times in self.instants)
+
+    def due(self, time: Expr, margin: float) -> Any:
+        """Which values are there at a time, 1 or 0, (r,); an MX expression."""
+        rows = [
+            ca.MX(1) if times is None else ca.mmin(ca.fabs(time - ca.DM(times))) <= margin for times in self.instants
+        ]
+        return ca.vertcat(ca.MX(0, 1), *rows)
 
     __repr__ = short_repr
 
@@ -98,7 +116,7 @@ def design_of(solution: Solution, limits: Given) -> Design:
             received=f"'{solution.name}', read from a file",
             remedy="load(path, problem=...) with the problem that was solved",
         )
-    if statement.measurement is None:
+    if statement.measurement is None and statement.samples is None:
         raise ExportError(
             "There is no controller: the problem measures nothing, so the feedback never acts.",
             expected="a problem with measurement()",
@@ -111,7 +129,8 @@ def design_of(solution: Solution, limits: Given) -> Design:
     x, u, e, t = (symbolic.sym(k, size) for k, size in zip("xuet", sizes, strict=True))
     rest = (t, solution.duration, ca.DM(solution.parameters))
     F, G, A, B, N, Q = statement.loop.slopes(x, u, *rest)
-    h, M, U = statement.measurement(x, u, *rest)
+    h, M, U = _measured(statement, n, x, u, *rest)
+    _check_instants(statement)
     slope = ca.jacobian(h, u)[:, :m]
     block = statement.estimation
     C, E = statement.loop.gain(x, u, e, *rest), unpack_symbolic(e[block.span], n)
@@ -130,7 +149,53 @@ def design_of(solution: Solution, limits: Given) -> Design:
         units=_units(solution, block),
         labels=statement.augmented,
         sizes=(n, m, int(h.shape[0])),
+        measured=measured_blocks(statement),
+        instants=_instants(statement, solution.duration),
     )
+
+
+def measured_blocks(statement: Statement) -> tuple[Block, ...]:
+    """The measurements that are always there, then those at instants."""
+    return (*statement.measurements, *(() if statement.samples is None else statement.samples.blocks))
+
+
+def _measured(statement: Statement, n: int, *point: Any) -> tuple[Any, Any, Any]:
+    """Values, slopes and noise of everything that is measured."""
+    symbolic: Any = statement.symbolic
+    parts: list[tuple[Any, ...]] = [(symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0))]
+    if statement.measurement is not None:
+        parts.append(tuple(statement.measurement(*point)))
+    if statement.samples is not None:
+        parts.append(tuple(statement.samples.measurement(*point)))
+    h, M, U = zip(*parts, strict=True)
+    return ca.vertcat(*h), ca.vertcat(*M), ca.diagcat(*U)
+
+
+def _instants(statement: Statement, duration: float) -> tuple[Array | None, ...]:
+    """When each measured value is there."""
+    always: list[Array | None] = [None for block in statement.measurements for _ in range(block.size)]
+    if statement.samples is None:
+        return tuple(always)
+    pairs = zip(statement.samples.blocks, statement.samples.places, strict=True)
+    return (*always, *(duration * np.array(places) for block, places in pairs for _ in range(block.size)))
+
+
+def _check_instants(statement: Statement) -> None:
+    """A controller starts after what is read at time zero.
+
+    Raises:
+        ExportError: something is read then.
+    """
+    if statement.samples is None:
+        return
+    for block, places in zip(statement.samples.blocks, statement.samples.places, strict=True):
+        if places[0] == 0.0:
+            raise ExportError(
+                f"'{block.name}' is read at time zero, where the controller starts with what is known before.",
+                expected="instants after time zero",
+                received="0 s among them",
+                remedy="put what is read at time zero into the initial variance, or let the first instant be later",
+            )
 
 
 def _units(solution: Solution, block: Block) -> Array:

@@ -59,10 +59,12 @@ class History:
         nodes: times of the nodes [s], (K,).
         knots: times between which the states are cubic [s], (P + 1,); the nodes, and what lies between them where the
             solution is steep.
-        z: states and half-vectors at the knots, (P + 1, nx + ne).
+        z: states and half-vectors at the starts of the pieces, and at the end, (P + 1, nx + ne).
+        ends: at their ends, (P, nx + ne), which are others where a measurement is taken.
         first: slopes of z at the starts of the pieces, (P, nx + ne).
         last: slopes at their ends.
-        u: controls, (K, nu) where they are linear, (K - 1, nu) where they are constant.
+        u: controls at the starts of the intervals, and at the end where they are linear, (K, nu) or (K - 1, nu).
+        u_ends: at their ends, (K - 1, nu).
         states: nx.
         units: rows of x that are of unit length together: the quaternions of attitudes.
         margin: relative, within which a time counts as inside.
@@ -71,9 +73,11 @@ class History:
     nodes: Array
     knots: Array
     z: Array
+    ends: Array
     first: Array
     last: Array
     u: Array
+    u_ends: Array
     states: int
     units: tuple[slice, ...]
     margin: float
@@ -102,17 +106,22 @@ class History:
         knots = ca.MX(ca.DM(self.knots))
         start, end = knots[k], knots[k + 1]
         smooth = _hermite(self.z.shape[1])
-        za, zb = _column(self.z, k), _column(self.z, k + 1)
+        jumps = not np.array_equal(self.z[1:], self.ends)
+        za, zb = _column(self.z, k), _column(self.ends, k) if jumps else _column(self.z, k + 1)
         shared = np.array_equal(self.first[1:], self.last[:-1])
         slopes = np.vstack([self.first, self.last[-1:]]) if shared else self.first
         fa, fb = _column(slopes, k), _column(slopes, k + 1) if shared else _column(self.last, k)
         z = smooth(za, zb, fa, fb, start, end, time)
+        if not np.array_equal(self.z[-1], self.ends[-1]):
+            z = ca.if_else(time >= self.duration, ca.DM(self.z[-1]), z)
         if not np.array_equal(self.knots, self.nodes):
             k, nodes = _piece(self.nodes, time), ca.MX(ca.DM(self.nodes))
             start, end = nodes[k], nodes[k + 1]
         u = _column(self.u, k)
         if self.u.shape[0] == self.nodes.size:
-            u = _linear(self.u.shape[1])(u, _column(self.u, k + 1), start, end, time)
+            jumps = not np.array_equal(self.u[1:], self.u_ends)
+            after = _column(self.u_ends, k) if jumps else _column(self.u, k + 1)
+            u = _linear(self.u.shape[1])(u, after, start, end, time)
         x, e = ca.vertsplit(z, [0, self.states, self.z.shape[1]])
         for own in self.units:  # interpolation keeps their length up to its error
             x[own] = x[own] / ca.norm_2(x[own])
@@ -145,14 +154,21 @@ def history(solution: Solution, precision: str) -> History:
                 remedy="export a solution that converged",
             )
     times, least = dense.knots * solution.duration, RESOLVED[precision] * solution.duration
-    knots, z, first, last = _resolved(times, dense.values, slopes, least)
+    long = np.diff(times) > 0  # where something is read the values jump, in pieces of no length
+    pieces = (dense.values[:-1][long], dense.values[1:][long], slopes[0][long], slopes[1][long])
+    knots, z, ends, first, last = _resolved(np.append(times[:-1][long], times[-1]), pieces, least)
+    u, intervals = trajectory.u, np.diff(solution.t) > 0
+    linear = u.shape[0] == solution.t.size
+    u_starts = (u[:-1] if linear else u)[intervals]
     return History(
-        nodes=np.asarray(solution.t),
+        nodes=np.append(solution.t[:-1][intervals], solution.t[-1]),
         knots=knots,
-        z=z,
+        z=np.vstack([z, dense.values[-1:]]),
+        ends=ends,
         first=first,
         last=last,
-        u=trajectory.u,
+        u=np.vstack([u_starts, u[-1:]]) if linear else u_starts,
+        u_ends=u[1:][intervals] if linear else u_starts,
         states=trajectory.x.shape[1],
         units=tuple(block.span for block in solution.blocks if block.tangent),
         margin=MARGINS[precision],
@@ -177,27 +193,31 @@ def time_status(clock: Clock) -> Any:
     return status_of(clock.conditions)
 
 
-def _resolved(knots: Array, values: Array, slopes: tuple[Array, Array], least: float) -> tuple[Array, ...]:
+def _resolved(knots: Array, pieces: tuple[Array, ...], least: float) -> tuple[Array, ...]:
     """The polynomials without the knots that a clock of this precision cannot tell apart.
 
     Where some fall away the piece becomes a chord: the slope of a fall that is over at once would carry it far below.
 
     Args:
         knots: times, (P + 1,).
-        values: there.
-        slopes: at the starts and the ends of the pieces.
+        pieces: values at the starts and at the ends of the pieces, slopes there.
         least: distance of two knots [s].
+
+    Returns:
+        Knots, and the same of the pieces between them.
     """
+    starts, ends, first, last = pieces
     kept = [0]
     for i in range(1, knots.size - 1):
         if knots[i] - knots[kept[-1]] >= least and knots[-1] - knots[i] >= least:
             kept.append(i)
     chosen = np.array([*kept, knots.size - 1])
-    first, last = slopes[0][chosen[:-1]].copy(), slopes[1][chosen[1:] - 1].copy()
+    starts, ends = starts[chosen[:-1]], ends[chosen[1:] - 1]
+    first, last = first[chosen[:-1]].copy(), last[chosen[1:] - 1].copy()
     merged = np.diff(chosen) > 1
-    chords = np.diff(values[chosen], axis=0) / np.diff(knots[chosen])[:, None]
+    chords = (ends - starts) / np.diff(knots[chosen])[:, None]
     first[merged] = last[merged] = chords[merged]
-    return knots[chosen], values[chosen], first, last
+    return knots[chosen], starts, ends, first, last
 
 
 def _column(table: Array, k: Expr) -> Any:

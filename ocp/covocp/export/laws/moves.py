@@ -28,7 +28,7 @@ class Period(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moves:
-    """Gauss steps between nodes and samples; n deviations, m controls, r measured values.
+    """Gauss steps between nodes and samples; n deviations, m controls, r values that are measured all the time.
 
     state: transitions of (deviation, control held, 1), (steps, n + m + 1, n + m + 1).
     measured: of (deviation, integral of what is measured of it, control held), (steps, n + r + m, n + r + m).
@@ -56,7 +56,8 @@ class Moves:
         grid = np.array([*grid[~near]])
         h = np.diff(grid)
         points = [_Point.at(design, tables, grid[:-1] + c * h, h[:, None, None]) for c in GAUSS_NODES]
-        n, m, r = design.sizes
+        n, m, _ = design.sizes
+        r = design.always
         state = [_blocks([[p.F, p.G, -p.G @ p.u]], n + m + 1) for p in points]
         measured = [_blocks([[p.F, p.zero(n, r), p.G], [p.M, p.zero(r, r), p.H]], n + r + m) for p in points]
         joint = [matrix[:, : n + r, : n + r] for matrix in measured]
@@ -69,7 +70,7 @@ class Moves:
             noise=_lyapunov([p.F for p in points], [p.Q for p in points]),
             measured_noise=_lyapunov(joint, spread),
             weight=_lyapunov(held, cost),
-            sizes=design.sizes,
+            sizes=(n, m, r),
             first=np.searchsorted(grid, t - 0.5 * h.min()),
         )
 
@@ -134,6 +135,8 @@ class _Point:
         x, u, _ = tables.rows(t)
         columns = x.T, u.T, t[None, :]
         F, G, _, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
+        r = design.always
+        M, H, U = M[:, :r], H[:, :r], U[:, :r, :r]
         Q = h * stacked(design.noise.map(t.size)(*columns), t.size)
         A, N, B = (h * stacked(v, t.size) for v in design.weights.map(t.size)(*columns))
         return _Point(F=F, G=G, M=M, H=H, U=U, Q=Q, A=A, N=N, B=B, u=u[:, : design.sizes[1], None])

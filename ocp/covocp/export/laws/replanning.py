@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, pack_symbolic, unpack
 from covocp.base.short_repr import short_repr
@@ -67,6 +68,13 @@ def replannable(problem: Problem) -> Replannable:
     a free duration and decisions are chosen anew by each plan.
     """
     statement, own = problem.statement(), problem.declarations
+    if own.sampled:
+        raise ExportError(
+            f"'{own.sampled[0].name}' is read at instants, which another plan would have elsewhere.",
+            expected="continuous measurements, whose plan may begin at any time",
+            received=", ".join(f"'{entry.name}'" for entry in own.sampled),
+            remedy="export the controller or the trajectory; solve again in Python with the instants that are left",
+        )
     start, _, matrices, _ = statement.boundary_values(statement.values)
     taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
     entries: list[Argument] = []

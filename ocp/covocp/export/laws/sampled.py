@@ -34,6 +34,7 @@ from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
     SCALAR_SIZE,
     STATUSES,
+    about,
     field_ports,
     finite,
     first_fields,
@@ -49,6 +50,8 @@ from covocp.export.laws.moves import WHOLE, Moves
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
+# Share of a period by which an instant may miss a sample.
+SAME_INSTANT = 1e-6
 CONTINUE = -1.0
 HELD = {"estimate": "estimate", "last": "index", "held": "control"}
 ABOUT = (
@@ -110,12 +113,13 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     index = ca.if_else(valid, begun + ahead, wanted)
     more = ca.if_else(ahead, wanted > index, 0.0)
     at = samples.at(index)
-    present = ca.fabs(measured) <= LARGEST
+    finite_rows = ca.fabs(measured) <= LARGEST
+    present = finite_rows if "due" not in at else ca.if_else(at["due"], finite_rows, 1.0)
     missing = ca.sum1(present) < r
     before = ca.if_else(ahead, at["Phi"] @ y + at["Gamma"] @ held + at["g"], y)
     residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
     L = _gain_of_rows(at, present, missing) * ca.logic_and(ahead, ca.logic_not(more))
-    corrected = before + L @ ca.if_else(present, residual, 0.0)
+    corrected = before + L @ ca.if_else(finite_rows, residual, 0.0)
     feedback = at["C"] @ corrected
     good = finite(corrected, feedback)
     estimate = ca.if_else(good, corrected, y)
@@ -142,7 +146,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     return Law(
         name="step",
         kind="controller",
-        about=(*ABOUT, spoken, limits_text(*limits)),
+        about=(*about(design, ABOUT), spoken, limits_text(*limits)),
         notes=limits_notes(*limits),
         constants={"PERIOD [s]": period} | limit_constants(*limits),
         core=core,
@@ -199,6 +203,8 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
         )
     t = np.minimum(np.arange(count + 1) * period, tables.duration)
     x, u, e, h, M, H, U, C = _at_samples(design, tables, t)
+    due = _due(design, t, period)
+    M, noise = M * due, _noise_of(design, U, due, period)
     E0 = np.asarray(design.gain(x[0], u[0], e[0], 0.0)[1].full())
     held_on = tables.duration - t[-1] > WHOLE * period
     moves = Moves.of(design, tables, np.append(t, tables.duration) if held_on else t)
@@ -209,18 +215,53 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
     for k in range(1, count + 1):
         Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
-        gain, spread = innovation_gain(P, M[k], U[k] / period, np.linalg.solve)
-        P = joseph_form(P, gain, M[k], U[k] / period)
+        gain, spread = innovation_gain(P, M[k], noise[k], np.linalg.solve)
+        P = joseph_form(P, gain, M[k], noise[k])
         gains.append(gain)
         spreads.append(spread)
     L = np.array(gains)
     parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
     parts |= {"g": g, "L": L}
+    if design.always < r:
+        parts["due"] = due
     if r > 1:
         parts["spread"] = _correlations(np.array(spreads))[:, :, None]
     with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges is told by its numbers
-        flown = flown_covariances(moves, period, E0, C, L, M, H)
+        flown = flown_covariances(moves, period, E0, C, L, M, H, noise)
     return Samples(parts=parts, period=period, times=t, flown=flown)
+
+
+def _due(design: Design, t: Array, period: float) -> Array:
+    """Which values are there at the samples, 1 or 0, (K + 1, r, 1).
+
+    Raises:
+        ExportError: an instant is no sample.
+    """
+    names = [block.name for block in design.measured for _ in range(block.size)]
+    rows = []
+    for name, times in zip(names, design.instants, strict=True):
+        if times is None:
+            rows.append(np.ones(t.size))
+            continue
+        near = np.abs(t[:, None] - times) <= SAME_INSTANT * period
+        missed = times[~near.any(axis=0)]
+        if missed.size:
+            raise ExportError(
+                f"'{name}' is read at instants that are no samples of the controller.",
+                expected=f"multiples of the period, {period:g} s",
+                received=", ".join(f"{value:g} s" for value in missed[:3]) + (", ..." if missed.size > 3 else ""),
+                remedy="choose a period that divides the time between the instants; period=None takes any time",
+            )
+        rows.append(near.any(axis=1).astype(float))
+    return np.array(rows).T[:, :, None]
+
+
+def _noise_of(design: Design, U: Array, due: Array, period: float) -> Array:
+    """Variances of what is measured: of the mean over a period, of what is read; one where nothing is."""
+    always = np.arange(U.shape[1]) < design.always
+    noise = np.where(always[:, None] & always, U / period, U)
+    there = due * due.transpose(0, 2, 1)
+    return np.asarray(noise * there + np.eye(U.shape[1]) * (1.0 - due))
 
 
 def _correlations(spreads: Array) -> Array:

@@ -36,30 +36,42 @@ def sampled_gains(moves: Moves, final_weight: Array, samples: int) -> Array:
 
 
 def flown_covariances(
-    moves: Moves, period: float, start: Array, gains: Array, filters: Array, rows: Array, slopes: Array
+    moves: Moves,
+    period: float,
+    start: Array,
+    gains: Array,
+    filters: Array,
+    rows: Array,
+    slopes: Array,
+    variances: Array,
 ) -> Array:
     """Covariances of the deviation from the nominal at the samples, as the sampled law flies.
 
     The law is told the mean of the measurement over the period before, its noise included. With y its estimate,
-    y- = Phi y + Gamma v, y = y- + L (mean - M y- - H v), v = -C y.
+    y- = Phi y + Gamma v, y = y- + L (mean - M y- - H v), v = -C y. What is read at an instant it is told as it is.
 
     Args:
         moves: between the samples.
         period: of the samples [s].
         start: covariance at time zero, (n, n).
         gains: C_k, (K + 1, m, n). filters: L_k, (K + 1, n, r). rows: M_k, (K + 1, r, n). slopes: H_k, (K + 1, r, m).
+        variances: of the noise of all values, read where they are read at instants, (K + 1, r, r).
 
     Returns:
         (K + 1, n, n).
     """
-    n = start.shape[0]
+    n, always = start.shape[0], moves.sizes[2]
+    read = slice(n + always, None)
     joint = np.zeros((2 * n, 2 * n))  # of (deviation, estimate)
     joint[:n, :n] = start
     result = [start]
     for k in range(1, gains.shape[0]):
         by_state, by_control, noise = moves.measuring(k - 1)
-        mean = np.vstack([np.eye(n, by_state.shape[0]), np.eye(by_state.shape[0])[n:] / period])
+        size = by_state.shape[0]
+        mean = np.vstack([np.eye(n, size), np.eye(size)[n:] / period, rows[k][always:] @ np.eye(n, size)])
         by_state, by_control, noise = mean @ by_state, mean @ by_control, mean @ noise @ mean.T
+        by_control[read] += slopes[k][always:]
+        noise[read, read] += variances[k][always:, always:]
         v = -gains[k - 1]
         ahead = by_state[:n] + by_control[:n] @ v  # of the estimate alone
         expected = rows[k] @ ahead + slopes[k] @ v

@@ -1,0 +1,91 @@
+"""The stacked vectors x, u, e, t, T, p of a problem, and what the user's expressions become in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.base.geometry import Geometry
+from covocp.base.short_repr import short_repr
+from covocp.problem.declarations import Declarations
+from covocp.statement.statement import INPUTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stacked:
+    """The stacked symbols x, u, e, t, T, p, and what the user's expressions become in them.
+
+    geometry: of the states that are estimated, the first of all; unknowns: entries of these.
+    """
+
+    inputs: tuple[Any, ...]
+    geometry: Geometry
+    unknowns: int
+    substitute: Callable[..., list[Any]]
+    symbolic: type
+
+    __repr__ = short_repr
+
+    def augmented_jacobian(self, expression: Expr) -> Any:
+        """Jacobian with respect to the augmented state (states, then unknowns)."""
+        x, p = self.inputs[0], self.inputs[5]
+        rows = self.geometry.size
+        by_state = self.geometry.tangent_slope(x[:rows], ca.jacobian(expression, x)[:, :rows])
+        return ca.horzcat(by_state, ca.jacobian(expression, p)[:, p.shape[0] - self.unknowns :])
+
+    def function(self, name: str, expressions: list[Any], *, without: tuple[str, ...] = ()) -> ca.Function:
+        """A function of the stacked vectors, with named inputs."""
+        kept = [(symbol, label) for symbol, label in zip(self.inputs, INPUTS, strict=True) if label not in without]
+        outputs = [f"out{i}" for i in range(len(expressions))]
+        return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
+
+
+def stack(problem: Declarations) -> Stacked:
+    """Stacked symbols, SX where every expression can be expanded, and the substitution of the user's symbols."""
+    groups: list[Any] = [problem.states, problem.controls, problem.matrices, problem.parameters, problem.unknowns]
+    own: list[Any] = [entry.symbol for group in groups for entry in group] + [problem.time]
+    if problem.free_duration is not None:
+        own.append(problem.duration)
+    value: Any = None if problem.spread is None else problem.spread.value
+    known = own if problem.spread is None or value is None else [*own, problem.spread.symbol]
+    every = [entry.rate for entry in problem.rates.values()]
+    every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
+    every += [value for m in problem.measurements for value in (m.expression, m.noise)]
+    every += [c.expression for c in problem.constraints] + list(problem.cost or ())
+    every += [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
+    symbolic: type = ca.SX
+    try:
+        ca.Function("everything", known, every).expand()
+    except RuntimeError:  # interpolation tables and external functions have no SX form
+        symbolic = ca.MX
+    sizes = [sum(entry.symbol.shape[0] for entry in group) for group in groups]
+    sizes[3:] = [sizes[3] + sizes[4]]
+    x, u, e, p = (symbolic.sym(n, k) for n, k in zip(("x", "u", "e", "p"), sizes, strict=True))  # type: ignore[attr-defined]
+    t, duration = symbolic.sym("t"), symbolic.sym("T")  # type: ignore[attr-defined]
+    arguments: list[Any] = []
+    groups[3:] = [[*problem.parameters, *problem.unknowns]]
+    for group, vector in zip(groups, (x, u, e, p), strict=True):
+        offsets = np.cumsum([0, *(entry.symbol.shape[0] for entry in group)]).tolist()
+        arguments += [vector[i:j] for i, j in pairwise(offsets)]
+    arguments += [t, duration] if problem.free_duration is not None else [t]
+    if value is not None:
+        arguments += ca.Function("spread", own, [value]).call(arguments, True, False)
+
+    def substitute(*expressions: Any, spread: Any = None) -> list[Any]:
+        """The expressions in the stacked symbols; with another covariance of the closed loop where one is given."""
+        function = ca.Function("substitute", known, list(expressions))
+        return list(function.call(arguments if spread is None else [*arguments[:-1], spread], True, False))
+
+    return Stacked(
+        inputs=(x, u, e, t, duration, p),
+        geometry=Geometry.of(entry for entry in problem.states if entry.estimated),
+        unknowns=sum(entry.size for entry in problem.unknowns),
+        substitute=substitute,
+        symbolic=symbolic,
+    )
