@@ -65,7 +65,7 @@ def chance_shares(sample: MonteCarlo) -> Mapping[str, Share]:
                 place=limits.place,
                 asked=probability,
                 runs=runs,
-                least=1.0 - missing[k] / runs,
+                least=1.0 - float(missing[k]) / runs,
                 time=float(sample.t[k]),
                 band=_band(int(missing[k]), runs, 1.0 - (1.0 - sample.level) / tests),
                 predicted=1.0 - float(sample.promised[k, i]),
