@@ -121,6 +121,8 @@ def stated(**given: dict[str, Any]) -> co.Problem:
     if "Problem" not in given:  # names that clash are told by their own arguments
         own = ocp.declarations
         x, b, u = (group[0].symbol for group in (own.states, own.unknowns, own.controls))
+    if "data" in given:
+        ocp.data(**to("data", name="w", times=[0.0, 1.0], values=[1.0, 2.0]))
     ocp.dynamics(**to("dynamics", symbol=x, rate=u - b * x, noise=0.1))
     ocp.measurement(**to("measurement", name="m", expression=x, noise=0.1))
     total = ocp.integral(**to("integral", expression=u**2)) if "integral" in given else 0.0
@@ -210,7 +212,7 @@ def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
     for method in (*symbols, "estimation_covariance", "dynamics"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
-    for method in ("measurement", "minimize", "minimize_expected", "subject_to", "chance"):
+    for method in ("data", "measurement", "minimize", "minimize_expected", "subject_to", "chance"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
     for argument in arguments_of(co.Gain):

@@ -2,8 +2,8 @@
 
     python benchmarks/measurements/instants.py
 
-Both are solved in turn in one process, first solves and re-solves, medians; the sampled one has the variance of a reading
-that the continuous one would collect in a second.
+Both are solved in turn in one process, first solves and re-solves, medians; the sampled one has the variance of a
+reading that the continuous one would collect in a second.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 import covocp as co
 
-ROUNDS, DURATION = 7, 10.0
+ROUNDS, DURATION = 5, 10.0
 
 
 def problem(masses: int, sampled: bool, expected: bool) -> co.Problem:
@@ -31,7 +31,7 @@ def problem(masses: int, sampled: bool, expected: bool) -> co.Problem:
     ocp.dynamics(v, -k * (ca.DM(springs) @ x) - 0.1 * v + np.eye(masses, 1) * u, noise=np.full(masses, 0.01))
     ocp.measurement("place", x[masses - 1], 0.2, **({"every": 1.0} if sampled else {}))
     if expected:
-        ocp.minimize_expected((x[masses - 1] - 1) ** 2 + 0.1 * u**2)
+        ocp.minimize_expected((x[masses - 1] - 1) ** 2 + 0.1 * u**2, x[masses - 1] ** 2)
     else:
         E = ocp.estimation_covariance()
         ocp.minimize(0.1 * u**2, 20 * E[k, k])
@@ -52,7 +52,7 @@ def once(masses: int, sampled: bool, expected: bool) -> tuple[float, float, floa
 def main() -> None:
     """Print the table."""
     print("states  cost       first solve [s]: continuous, sampled, ratio    re-solve: continuous, sampled, ratio")
-    for masses, expected in ((1, False), (2, False), (4, False), (1, True), (2, True)):
+    for masses, expected in ((1, False), (2, False), (4, False), (1, True)):
         runs = [[once(masses, sampled, expected) for sampled in (False, True)] for _ in range(ROUNDS)]
         first, again = ([statistics.median(run[s][i] for run in runs) for s in (0, 1)] for i in (0, 1))
         words = "expected" if expected else "estimation"

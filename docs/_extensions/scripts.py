@@ -57,6 +57,7 @@ GALLERY = (
             "incorrect_statistics",
             "monte_carlo",
             "own_law",
+            "tracking_in_the_wind",
             "mars_entry",
         ),
     ),

@@ -10,12 +10,12 @@
     ocp.minimize_expected(running=u**2, terminal_weight={x: 2.0})
     print(co.solve(ocp))
 
-To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback); expressions are
-CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several methods), `evaluate` (a given control),
-`methods`. To judge a solution: `certify` (is it the global minimum?), `worth` (does the combined design pay?),
-`simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To keep and to fly it:
-`Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said by `ProblemError`,
-`SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
+To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback), `table` (numbers over
+one to three variables); expressions are CasADi's. To solve it: `solve`, `Solver` (again and again), `compare` (several
+methods), `evaluate` (a given control), `methods`. To judge a solution: `certify` (is it the global minimum?), `worth`
+(does the combined design pay?), `simulate` (Monte Carlo of the actual system), `simulate_law`, `simulate_sampled`. To
+keep and to fly it: `Solution.save`, `load`, `export_c`. Filters and laws by themselves: `blocks`. What is wrong is said
+by `ProblemError`, `SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
 
 `help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
 """
@@ -57,6 +57,8 @@ __all__ = [
     "Worth",
     "simulate",
     "MonteCarlo",
+    "table",
+    "Table",
     "simulate_law",
     "simulate_sampled",
     "SampledSimulation",
@@ -80,6 +82,8 @@ if TYPE_CHECKING:
     from covocp.analysis.certificate import certify as certify
     from covocp.analysis.combined_gain import Worth as Worth
     from covocp.analysis.combined_gain import worth as worth
+    from covocp.blocks.tables import Table as Table
+    from covocp.blocks.tables import table as table
     from covocp.export import CPackage as CPackage
     from covocp.export import export_c as export_c
     from covocp.simulation import MonteCarlo as MonteCarlo
@@ -108,6 +112,8 @@ else:
         "SampledSimulation": "covocp.simulation.sampled_loop",
         "MonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
+        "Table": "covocp.blocks.tables",
+        "table": "covocp.blocks.tables",
         "Worth": "covocp.analysis.combined_gain",
         "worth": "covocp.analysis.combined_gain",
     }

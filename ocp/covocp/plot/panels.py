@@ -18,8 +18,9 @@ from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, prod
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
 from covocp.solution.solution import Solution
-from covocp.statement.names import block_of, name_of, sizes_of
+from covocp.statement.names import block_of, chosen_entry, name_of, sizes_of
 from covocp.statement.statement import Block, Statement, entry_names
+from covocp.statement.time_data import in_words
 
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 WHOLE_MATRIX = 2
@@ -286,7 +287,20 @@ def _expression(drawn: list[Drawn], key: Given) -> list[Panel]:
             )
             for i in range(count)
         ]
-    return [Panel(label=shortened(key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
+    return [Panel(label=_written(drawn, key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
+
+
+def _written(drawn: list[Drawn], key: Any) -> str:
+    """An expression with the names of data over time in it; one of the data with its unit."""
+    data = {entry.name: entry for d in drawn for entry in d.solution.extremal.statement.data}
+    (named,), symbols = in_words(data.values(), [key])
+    unit = next((e.unit for e, s in zip(data.values(), symbols, strict=True) if _part_of(named, s)), "")
+    return shortened(named) + (f" [{unit}]" if unit else "")
+
+
+def _part_of(expression: Any, symbol: Any) -> bool:
+    """Whether an expression is a symbol or an entry of it."""
+    return bool(ca.is_equal(expression, symbol)) or chosen_entry(expression, symbol) >= 0
 
 
 def _attitude(drawn: list[Drawn], block: Block) -> list[Panel]:

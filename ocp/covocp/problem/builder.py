@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -33,6 +33,7 @@ from covocp.problem.checks import (
 )
 from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.constraints import with_constraint
+from covocp.problem.data import data_over_time
 from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
     Chance,
@@ -435,6 +436,36 @@ class Problem:
             ProblemError: unknown symbol, rate given twice, shape that does not fit, density negative.
         """
         self._change(with_rate(self._declarations, symbol, rate, noise))
+
+    @checked(unit=text)
+    def data(
+        self,
+        name: str,
+        times: Given,
+        values: Given,
+        *,
+        kind: Literal["linear", "cubic"] = "linear",
+        unit: str = "",
+    ) -> ca.MX:
+        """Declare data over time (a reference, a wind, a measured input), for use wherever the time may be.
+
+        Args:
+            name: unique name.
+            times: rising, shape (K,) [s]; from 0 to the terminal time or beyond, where that is free to its upper bound.
+            values: shape (K,), or (K, m) of a vector.
+            kind: "linear", with kinks that become nodes of the mesh where it has at least as many intervals and the
+                duration is fixed; "cubic", the not-a-knot spline.
+            unit: for printouts.
+
+        Returns:
+            The value at the running time, shape (m, 1).
+
+        Raises:
+            ProblemError: name used twice, times that do not rise or do not cover the duration, too few of them, values
+                that are not finite or of another shape, unknown kind.
+        """
+        self._declare(name, 1)
+        return self._add("data", data_over_time(self._declarations, name, times, values, kind, unit)).course.expression
 
     @checked(unit=text, relative=truth)
     def measurement(

@@ -27,6 +27,7 @@ from covocp.base.matrices import Array, half_length, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.problem.boundary_values import check_free
 from covocp.statement.statement import ROLES, Role
+from covocp.statement.time_data import TimeData
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
@@ -335,6 +336,32 @@ class Chance:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Data:
+    """Data over time, and the table of them as a function of the time."""
+
+    course: TimeData
+    function: ca.Function
+    where: str
+
+    __repr__ = short_repr
+
+    @property
+    def name(self) -> str:
+        """The user's name."""
+        return self.course.name
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return int(self.course.values.shape[1])
+
+    @property
+    def unit(self) -> str:
+        """Of each entry."""
+        return self.course.unit
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
     """lower <= expression <= upper along the path, at the start or at the end.
 
@@ -438,6 +465,7 @@ class Declarations:
     unknowns: tuple[Unknown, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     controls: tuple[Control, ...] = ()
+    data: tuple[Data, ...] = ()
     matrices: tuple[Matrix, ...] = ()
     rates: Mapping[str, Dynamics] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
@@ -454,7 +482,7 @@ class Declarations:
     def named(self) -> tuple[Any, ...]:
         """All declarations that have a name."""
         symbols = (*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices)
-        return (*symbols, *self.measurements, *self.constraints, *self.chances)
+        return (*symbols, *self.data, *self.measurements, *self.constraints, *self.chances)
 
     @property
     def taken(self) -> tuple[Any, ...]:

@@ -17,6 +17,7 @@ from covocp.problem.declarations import Chance
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entries_of, entry_names, half_names
+from covocp.statement.time_data import in_words
 
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
@@ -49,6 +50,7 @@ def sections(problem: Problem) -> list[Section]:
         _values("parameter", [(q, [number(v) for v in q.value]) for q in problem.parameters], "value"),
         _values("control", [(q, _ranges(q.lower, q.upper)) for q in problem.controls], "bounds"),
         _matrices(problem, written),
+        _data(problem),
         _rates(problem, written),
         _integrals(problem, written),
         _measurements(problem, written),
@@ -79,7 +81,9 @@ class _Written:
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
             symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
-        found = formulas(list(expressions.values()), symbols, names)
+        data = problem.declarations.data
+        called, plain = in_words((entry.course for entry in data), list(expressions.values()))
+        found = formulas(called, [*symbols, *plain], [*names, *(entry_names((entry,)) for entry in data)])
         return _Written(entries=dict(zip(expressions, found.entries, strict=True)), definitions=found.definitions)
 
     def __call__(self, kind: str, name: str = "") -> list[str]:
@@ -207,6 +211,17 @@ def _decisions(problem: Problem) -> Section:
 def _integrals(problem: Problem, written: _Written) -> Section:
     rows = [[q.name, q.unit, *written("rate", q.name)] for q in integrals_of(problem.declarations)]
     return _table(["integral", "unit", "of"], rows)
+
+
+def _data(problem: Problem) -> Section:
+    """Data over time: how many values, over which times, in which range."""
+    rows = []
+    for q in problem.declarations.data:
+        times, values = q.course.times, q.course.values
+        knots = f"{q.course.kind}, {times.size} values from {number(times[0])} to {number(times[-1])} s"
+        spans = _ranges(values.min(axis=0), values.max(axis=0))
+        rows += _shortened([[name, q.unit, knots, span] for name, span in zip(entry_names((q,)), spans, strict=True)])
+    return _table(["data", "unit", "over time", "range"], rows)
 
 
 def _unknowns(problem: Problem, written: _Written) -> Section:

@@ -16,6 +16,7 @@ from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.problem.checks import check_dynamics
 from covocp.problem.closed_loop_covariance import floored, used_in
+from covocp.problem.data import used_data
 from covocp.problem.decisions import check_decisions
 from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
 from covocp.problem.ends import boundary, tied_values, with_end_conditions
@@ -69,6 +70,7 @@ def freeze(problem: Declarations) -> Statement:
         measurements=measured_blocks(problem.continuous),
         information=_information(problem, stacked),
         samples=samples(problem, stacked),
+        data=used_data(problem),
         path=_conditions(problem, stacked, "path"),
         start=_conditions(problem, stacked, "initial"),
         end=_conditions(problem, stacked, "final"),
@@ -171,7 +173,8 @@ def _check_symbols(problem: Declarations) -> None:
                 f"The terminal cost contains '{entry.name}'.",
                 expected="states, matrix states, parameters and the duration",
                 received=str(terminal_cost)[:200],
-                remedy="use Problem.duration for the terminal time; controls belong into the running cost",
+                remedy="use Problem.duration for the terminal time, of data casadi.substitute(data, problem.time, "
+                "casadi.MX(problem.duration)); controls belong into the running cost",
             )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())

@@ -57,6 +57,7 @@ def stack(problem: Declarations) -> Stacked:
     every = [entry.rate for entry in problem.rates.values()]
     every += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     every += [value for m in problem.measurements for value in (m.expression, m.noise)]
+    every += [m.information for m in problem.measurements if m.information is not None]
     every += [c.expression for c in problem.constraints] + list(problem.cost or ())
     every += [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
     symbolic: type = ca.SX

@@ -236,6 +236,9 @@ def _numbers(statement: Statement) -> Iterator[tuple[str, Array]]:
             yield f"the limits of '{name}'", np.array([lower, upper])
     for block in _constants(statement):
         yield _declared(block), statement.values[block.span]
+    for data in statement.data:
+        yield f"the times of the data '{data.name}'", data.times
+        yield f"the values of the data '{data.name}'", data.values.ravel()
 
 
 def _constants(statement: Statement) -> tuple[Block, ...]:

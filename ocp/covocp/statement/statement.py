@@ -24,6 +24,7 @@ from covocp.base.matrices import Array, half_indices, half_length
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.statement.chances import ChanceLimits
+from covocp.statement.time_data import TimeData, kinks
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
 
@@ -244,6 +245,7 @@ class Statement:
             information, which may be zero but not negative; None where none was.
         chances: conditions on probabilities, which are among those of `path`, `start` and `end`.
         samples: measurements that are taken at instants; None where there are none.
+        data: values over time that are in some of these functions.
         geometry: how the state moves where some of it is no vector.
         expression: a user's expression -> function of the six inputs.
     """
@@ -264,6 +266,7 @@ class Statement:
     measurements: tuple[Block, ...]
     information: ca.Function | None
     samples: Samples | None
+    data: tuple[TimeData, ...]
     path: Conditions
     start: Conditions
     end: Conditions
@@ -294,6 +297,11 @@ class Statement:
     def instants(self) -> tuple[float, ...]:
         """Fractions of the terminal time that must be nodes of every mesh."""
         return () if self.samples is None else self.samples.instants
+
+    @cached
+    def kinks(self) -> tuple[tuple[float, ...], ...]:
+        """Fractions of a fixed terminal time at which each of the data has kinks: nodes where these are few."""
+        return () if self.duration.free else tuple(kinks(entry, self.duration.guess) for entry in self.data)
 
     @property
     def measurement_names(self) -> tuple[str, ...]:

@@ -71,7 +71,7 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
         _steepness(statement, guess, parameters, longest / options.intervals, backward) for backward in (False, True)
     ]
     start, end = (_parts(entry, options.intervals, longest) / longest for entry in seen)
-    nodes = completed(statement, np.array(sorted({*plain.nodes(), *start, *(1.0 - end)})))
+    nodes = completed(statement, np.array(sorted({*plain.nodes(), *start, *(1.0 - end)})), options.intervals)
     lengths = longest * np.diff(nodes)
     stiff = float((lengths * np.interp(longest * nodes[:-1], seen[0].times, seen[0].poles)).max())
     return replace(

@@ -1,9 +1,15 @@
-"""Meshes with nodes where something happens: where a measurement is taken there are two, before and after it."""
+"""Meshes with nodes where something happens: where a measurement is taken there are two, before and after it.
+
+Data over time have kinks, over which integration steps lose their order. Those of each of the data are nodes too, of
+every mesh that was asked to have at least as many intervals; to a coarser one they are noise, and what they cost is in
+the error of the mesh.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -24,27 +30,51 @@ def with_instants(statement: Statement, options: Options) -> Options:
         statement: the problem.
         options: a grid that is complete stays as it is.
     """
-    instants = np.array(statement.instants)
-    if not instants.size or isinstance(options.grid, Graded):
+    if isinstance(options.grid, Graded):
         return options
     nodes = np.unique(options.nodes())
+    asked = nodes.size - 1
+    needed = _needed(statement, asked)
+    if not needed.size:
+        return options
     if options.grid is None:
-        nodes = _spread(instants, options.intervals)
-    asked = options.intervals if options.grid is None else nodes.size - 1
-    return replace(options, grid=Graded(nodes=completed(statement, nodes), asked=asked))
+        nodes = _spread(needed, options.intervals)
+    return replace(options, grid=Graded(nodes=completed(statement, nodes, asked), asked=asked))
 
 
-def completed(statement: Statement, nodes: Array) -> Array:
-    """Some nodes with the instants among them; twice where a measurement is taken."""
-    instants = np.array(statement.instants)
-    if not instants.size:
+def completed(statement: Statement, nodes: Array, asked: int) -> Array:
+    """Some nodes with the instants among them; twice where a measurement is taken.
+
+    Args:
+        statement: the problem.
+        nodes: rising.
+        asked: number of intervals that the mesh was asked to have.
+    """
+    needed = _needed(statement, asked)
+    if not needed.size:
         return nodes
     others = np.unique(nodes)
-    k = np.clip(np.searchsorted(instants, others), 1, instants.size) - 1
-    near = np.minimum(np.abs(others - instants[k]), np.abs(others - instants[np.minimum(k + 1, instants.size - 1)]))
-    kept = others[(near > SAME) | (others == 0.0) | (others == 1.0)]
+    kept = others[~_near(others, needed) | (others == 0.0) | (others == 1.0)]
     twice = () if statement.samples is None else statement.samples.instants
-    return np.sort(np.concatenate([np.union1d(kept, instants), twice]))
+    return np.sort(np.concatenate([np.union1d(kept, needed), twice]))
+
+
+def _needed(statement: Statement, asked: int) -> Array:
+    """Nodes that a mesh of so many intervals must have."""
+    instants = np.array(statement.instants)
+    kinks = np.unique([place for own in statement.kinks if len(own) <= asked for place in own])
+    if not kinks.size:
+        return instants
+    fixed = np.union1d(instants, [0.0, 1.0])
+    kinks = kinks[~_near(kinks, fixed)]
+    return np.union1d(instants, kinks[np.diff(kinks, prepend=-1.0) > SAME])
+
+
+def _near(nodes: Array, places: Array) -> Any:
+    """Which nodes are, but for rounding, one of some rising places."""
+    k = np.clip(np.searchsorted(places, nodes), 1, places.size) - 1
+    distance = np.minimum(np.abs(nodes - places[k]), np.abs(nodes - places[np.minimum(k + 1, places.size - 1)]))
+    return distance <= SAME
 
 
 def _spread(instants: Array, intervals: int) -> Array:

@@ -19,10 +19,10 @@ from covocp.transcription.steps import (
     nominal_interval,
     propagate_step,
     read_by,
+    read_step,
     runge_kutta_step,
     simpson_interval,
     step_matrix,
-    with_reading,
 )
 
 # Steps that a sequence of numbers takes at a time.
@@ -252,40 +252,90 @@ def _sequence(
 ) -> tuple[Any, Any]:
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
+    reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
+    moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
+    chosen = [column[:, moving] for column in columns] if reads else columns
     if mesh.step == "rk4":
         step = runge_kutta_step(statement, positions)
         matrices = [column for k, column in enumerate(columns) if k != 1]
     else:
         step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
-        matrices = [step_matrix(statement, i, mesh.step, mesh.linear_solver).map(count)(*columns) for i in positions]
-        if mesh.instants and read_by(statement, positions):
-            step = with_reading(statement, positions, step)
-            matrices += [columns[0], *columns[2:]]
+        kinds = [step_matrix(statement, i, mesh.step, mesh.linear_solver) for i in positions]
+        matrices = [kind.map(count - len(reads))(*chosen) for kind in kinds]
+    read = read_step(statement, positions) if reads else step
+    at_reads = [columns[0], *columns[2:]]
     if kicks is None:
-        values = _accumulated(step, first, matrices, count)
+        values = _stretches(step, read, first, (matrices, at_reads), reads, count)[0]
         return values, values
-    inputs = step.mx_in()
-    kick = ca.MX.sym("kick", first.shape[0])
-    arrived = step(*inputs)
-    kicked = ca.Function("kicked", [*inputs, kick], [arrived + kick, arrived])
     at_nodes = ca.MX(first.shape[0], count)
     at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
-    passed, before = kicked.mapaccum("propagate", count)(first, *matrices, at_nodes)
+    given = ([*matrices, at_nodes[:, moving]], [*at_reads, at_nodes])
+    passed, before = _stretches(_kicked(step), _kicked(read), first, given, reads, count)
     return before, passed
 
 
-def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> Any:
+def _reads(mesh: Mesh) -> list[int]:
+    """The substeps, in the order of travel forward, at which something is read."""
+    return [k * mesh.substeps + j for k in mesh.instants for j in range(mesh.substeps)]
+
+
+def _kicked(step: ca.Function) -> ca.Function:
+    """A step with a kick after it: (*its arguments, kick) -> after the kick, before it."""
+    inputs = step.mx_in()
+    kick = ca.MX.sym("kick", inputs[0].shape[0])
+    arrived = step(*inputs)
+    return ca.Function("kicked", [*inputs, kick], [arrived + kick, arrived])
+
+
+def _stretches(
+    step: ca.Function, read: ca.Function, first: Expr, given: tuple[list[Any], list[Any]], reads: list[int], count: int
+) -> list[Any]:
+    """What steps give in sequence, and between them what is read, a column each.
+
+    Args:
+        step: (value, *columns of `given[0]`) -> value after it, perhaps more.
+        read: (value, *columns of `given[1]`) -> the same.
+        first: value at the start.
+        given: arguments of the steps that move, without columns for the others; of those that read, a column for each.
+        reads: which of all steps read.
+        count: of all steps.
+    """
+    if not reads:
+        return _accumulated(step, first, given[0], count)
+    parts: list[list[Any]] = []
+    value, moved, k = first, 0, 0
+    for stop in [*reads, count]:
+        if length := stop - k:
+            own = [_columns(argument, moved, length, count - len(reads)) for argument in given[0]]
+            parts.append(_accumulated(step, value, own, length))
+            value, moved = parts[-1][0][:, -1], moved + length
+        if stop < count:
+            outputs = read(value, *(argument[:, stop] for argument in given[1]))
+            parts.append(list(outputs) if isinstance(outputs, (tuple, list)) else [outputs])
+            value = parts[-1][0]
+        k = stop + 1
+    return [ca.horzcat(*values) for values in zip(*parts, strict=True)]
+
+
+def _columns(argument: Any, begin: int, length: int, count: int) -> Any:
+    """The part of an argument that belongs to some steps, of which each has as many columns."""
+    width = argument.shape[1] // count
+    return argument[:, begin * width : (begin + length) * width]
+
+
+def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> list[Any]:
     """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
     if not isinstance(arguments[0], ca.DM):
-        return step.mapaccum("propagate", count)(first, *arguments)
+        run = step if count == 1 else step.mapaccum("propagate", count)
+        return run.call([first, *arguments])
     lengths = [min(NUMERIC_RUN, count - begin) for begin in range(0, count, NUMERIC_RUN)]
     runs = {length: step if length == 1 else step.mapaccum("propagate", length) for length in set(lengths)}
     parts = [ca.horzsplit(argument, NUMERIC_RUN * (argument.shape[1] // count)) for argument in arguments]
     value, passed = first, []
     for length, *columns in zip(lengths, *parts, strict=True):
-        passed.append(runs[length](value, *columns))
-        value = passed[-1][:, -1]
-    return ca.horzcat(*passed)
+        passed.append(runs[length].call([value, *columns]))
+        value = passed[-1][0][:, -1]
+    return [ca.horzcat(*values) for values in zip(*passed, strict=True)]
 
 
 def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:

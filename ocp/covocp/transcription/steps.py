@@ -144,15 +144,15 @@ def read_by(statement: Statement, positions: tuple[int, ...]) -> bool:
 
 
 @lru_cache(maxsize=KEPT)
-def with_reading(statement: Statement, positions: tuple[int, ...], step: ca.Function) -> ca.Function:
-    """A step of some matrices, and after it what is read: (*its arguments, state, *interval) -> half-vectors."""
-    own, *matrices = step.mx_in()
-    x, interval = ca.MX.sym("x", statement.nx), Interval.symbols(statement, ca.MX)
+def read_step(statement: Statement, positions: tuple[int, ...]) -> ca.Function:
+    """(half-vectors of some matrices, state, *interval without length) -> half-vectors after what is read."""
     entries = statement.entries(positions)
+    own, x = ca.MX.sym("e", len(entries)), ca.MX.sym("x", statement.nx)
+    interval = Interval.symbols(statement, ca.MX)
     e = ca.MX.zeros(statement.ne)
-    e[entries] = step(own, *matrices)
+    e[entries] = own
     after, _ = read_at(statement, interval, x, e)
-    return ca.Function("read_step", [own, *matrices, x, *interval], [after[entries]])
+    return ca.Function("read_step", [own, x, *interval], [after[entries]])
 
 
 @lru_cache(maxsize=KEPT)

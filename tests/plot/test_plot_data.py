@@ -1,0 +1,25 @@
+"""Panels of data over time: their names, units and values."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import covocp as co
+
+
+def test_data_are_drawn_by_name_with_their_unit():
+    times = np.linspace(0.0, 3.0, 201)
+    ocp = co.Problem(duration=3.0)
+    wind = ocp.data("head wind", times, np.stack([np.sin(times), times], axis=1), unit="m/s")
+    calm = ocp.data("calm", [0.0, 3.0], [0.5, 1.0])
+    x, u = ocp.state("x", initial=0.0, unit="m"), ocp.control("u")
+    ocp.dynamics(x, u + wind[0] + calm)
+    ocp.minimize(running=u**2 + x**2)
+    solution = co.solve(ocp, intervals=10, progress=False)
+    figure = solution.plot(wind, wind[1], calm, 2 * calm, [x, calm])
+    labels = [axes.get_ylabel() for axes in figure.axes[:5]]
+    assert labels == ["head wind [m/s]", "head wind[1] [m/s]", "calm", "(2.*calm)", "x, calm"]
+    lines = {label: axes.lines[0].get_xydata() for label, axes in zip(labels, figure.axes, strict=False)}
+    for label, exact in (("head wind[1] [m/s]", lambda t: t), ("calm", lambda t: 0.5 + t / 6)):
+        t, values = lines[label].T
+        np.testing.assert_allclose(values, exact(t), atol=1e-6)
+    plt.close(figure)
