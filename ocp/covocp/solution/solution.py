@@ -29,6 +29,7 @@ from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
@@ -67,6 +68,7 @@ class Solution:
         augmented: names of the rows of the estimation covariance.
         targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
+        chances: what is reached of the conditions on probabilities, by the linearised spread.
         stored_problem: of a solution read from a file, what its problem was, to tell it from others.
     """
 
@@ -87,6 +89,7 @@ class Solution:
     targets: Annotated[Array, "x"]
     constraints: Mapping[str, tuple[str, ...]]
     loop: ClosedLoop | None = None
+    chances: tuple[Reached, ...] = ()
     stored_costates: Costates | None = None
     stored_dense: Dense | None = None
     stored_optimality: Optimality | None = None
@@ -118,7 +121,7 @@ class Solution:
             constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
             loop=loop,
         )
-        return read_only(solution)
+        return read_only(replace(solution, chances=reached(solution)))
 
     @property
     def mesh(self) -> Mesh:
