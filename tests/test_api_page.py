@@ -33,6 +33,8 @@ MET = {
     "Row": "covocp.solving.comparison",
     "MeanEffect": "covocp.extremal.mean_effect",
     "Count": "covocp.simulation.counts",
+    "Share": "covocp.simulation.chances",
+    "Reached": "covocp.solution.chances",
     "Verdict": "covocp.simulation.verdict",
     "Check": "covocp.export.compiled.package",
     "Timing": "covocp.export.compiled.package",

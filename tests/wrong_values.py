@@ -141,6 +141,8 @@ def stated(**given: dict[str, Any]) -> co.Problem:
         ocp.minimize(**to("minimize", running=u**2 + d**2, terminal=E[x, x] + total))
     if "subject_to" in given:
         ocp.subject_to(**to("subject_to", expression=u, lower=-50.0, upper=50.0))
+    if "chance" in given:
+        ocp.chance(**to("chance", expression=x, lower=-50.0, upper=50.0, probability=0.9))
     return ocp
 
 
@@ -210,7 +212,7 @@ def statements(solved: bool = False) -> Iterator[tuple[str, str, Call]]:
     for method in (*symbols, "estimation_covariance", "dynamics"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
-    for method in ("data", "measurement", "minimize", "minimize_expected", "subject_to"):
+    for method in ("data", "measurement", "minimize", "minimize_expected", "subject_to", "chance"):
         for argument in arguments_of(getattr(co.Problem, method)):
             yield f"Problem.{method}", argument, functools.partial(given, method, argument)
     for argument in arguments_of(co.Gain):

@@ -23,6 +23,7 @@ from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.attitude import Attitude, with_attitude
 from covocp.problem.boundary_values import end_value
+from covocp.problem.chances import with_chance, with_chance_conditions
 from covocp.problem.checks import (
     as_expression,
     check_name,
@@ -35,6 +36,7 @@ from covocp.problem.constraints import with_constraint
 from covocp.problem.data import data_over_time
 from covocp.problem.decisions import with_constant
 from covocp.problem.declarations import (
+    Chance,
     Control,
     Declarations,
     Free,
@@ -83,6 +85,7 @@ class Problem:
         symbol = ca.MX.sym("duration") if isinstance(duration, Free) else duration
         self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
         self._statement: Statement | None = None
+        self._expanded: Declarations | None = None
         self.doubts_told = False
 
     @classmethod
@@ -94,8 +97,16 @@ class Problem:
 
     @property
     def declarations(self) -> Declarations:
-        """What is declared so far."""
-        return self._declarations
+        """What is declared so far; once the cost is known, with conditions on probabilities as constraints."""
+        if self._expanded is None:
+            self._expanded = with_chance_conditions(self._declarations)
+        return self._expanded
+
+    @property
+    def chances(self) -> tuple[Chance, ...]:
+        """Conditions on probabilities as they were stated."""
+        given = self._declarations
+        return (*(c.chance for c in given.constraints if c.chance is not None), *given.chances)
 
     @property
     def name(self) -> str:
@@ -574,6 +585,43 @@ class Problem:
         """
         self._change(with_constraint(self._declarations, expression, lower, upper, at, name, between))
 
+    @checked(joint=truth)
+    def chance(
+        self,
+        expression: Given,
+        *,
+        lower: Given = None,
+        upper: Given = None,
+        probability: float,
+        at: Place = "path",
+        joint: bool = False,
+        smallest: float = 0.0,
+        name: str | None = None,
+    ) -> None:
+        """Require lower <= expression <= upper of the actual system with a probability, by its linearised spread.
+
+        The spread is that of the closed loop where the cost is `minimize_expected`, else that of the system along its
+        open-loop control, which no measurement makes smaller. Along the path the probability holds at each time by
+        itself. Between two limits it is exact for a normal law.
+
+        Args:
+            expression: of states, unknowns, with feedback also controls; decisions, time; a column or a scalar.
+            lower: numbers, shape of the expression; None: no lower limit.
+            upper: numbers, shape of the expression; None: no upper limit.
+            probability: inside (0, 1), of each row; between two limits at least 0.1.
+            at: "path", "initial" or "final".
+            joint: whether all rows together keep their limits with it: each takes an equal share of the risk.
+            smallest: standard deviations s are taken as sqrt(s^2 + smallest^2), in the unit of the expression; give
+                one where s may vanish, so that it has a slope there.
+            name: appears in every diagnostic; "chance k" by default.
+
+        Raises:
+            ProblemError: probability outside (0, 1), no limit, limits that cross or are equal, an integral or a
+                matrix in the expression; when the problem is built: nothing in it scatters.
+        """
+        given = {"probability": probability, "joint": joint, "smallest": smallest}
+        self._change(with_chance(self._declarations, expression, lower, upper, at, name, **given))
+
     def statement(self) -> Statement:
         """The frozen problem that solvers read; built once and kept until something is added.
 
@@ -581,7 +629,7 @@ class Problem:
             ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
         """
         if self._statement is None:
-            self._statement = statement_of(self._declarations)
+            self._statement = statement_of(self.declarations)
         return self._statement
 
     def _declare(self, name: str, size: Given) -> int:
@@ -597,6 +645,7 @@ class Problem:
     def _change(self, declarations: Declarations) -> None:
         """Other declarations from now on: another statement, and other doubts about it."""
         self._declarations, self._statement, self.doubts_told = declarations, None, False
+        self._expanded = None
 
 
 def _symbol(name: str, size: int, unit: str) -> dict[str, Any]:

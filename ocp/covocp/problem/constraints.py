@@ -28,13 +28,8 @@ def with_constraint(
 ) -> Declarations:
     """The declarations with one more constraint; arguments and errors as of `Problem.subject_to`."""
     label = name if name is not None else f"constraint {len(own.constraints) + 1}"
-    if at is not None and (not isinstance(at, str) or at not in PLACES):
-        raise ProblemError(
-            f"'{label}' has an unknown place.",
-            expected="at='path', 'initial' or 'final'",
-            received=repr(at),
-            remedy="choose one of the three",
-        )
+    if at is not None:
+        check_place(label, at)
     value = column_expression(label, "constraint", expression)
     fixed: list[Any] = [*own.parameters, *own.unknowns]
     constants = [*(q.symbol for q in fixed), own.time]
@@ -52,6 +47,21 @@ def with_constraint(
     own_place: dict[str, Any] = {"at": place, "where": caller(), "between": between is not None}
     entry = Constraint(name=label, expression=value, lower=low, upper=high, **own_place)
     return own.adding(constraints=entry)
+
+
+def check_place(label: str, at: Given) -> None:
+    """A place is one of three.
+
+    Raises:
+        ProblemError: it is none.
+    """
+    if not isinstance(at, str) or at not in PLACES:
+        raise ProblemError(
+            f"'{label}' has an unknown place.",
+            expected="at='path', 'initial' or 'final'",
+            received=repr(at),
+            remedy="choose one of the three",
+        )
 
 
 def _place(own: Declarations, label: str, value: ca.MX, at: Any) -> Any:

@@ -307,6 +307,35 @@ class Measurement:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Chance:
+    """lower <= expression <= upper of the actual system with a probability.
+
+    probability: of each row, or of all rows together where they are joint; smallest: to which its standard deviations
+    are rounded. slopes: by the augmented state and by the controls that scatter, and spread: the name of the matrix
+    that is their covariance (None: X of the closed loop), once they are known.
+    """
+
+    name: str
+    expression: ca.MX
+    lower: Array
+    upper: Array
+    probability: float
+    joint: bool
+    smallest: float
+    at: Place
+    where: str
+    slopes: tuple[ca.MX, ca.MX] | None = None
+    spread: str | None = None
+
+    __repr__ = short_repr
+
+    @property
+    def each(self) -> float:
+        """Probability of each row: where they are joint each takes an equal share of the risk, by Boole's bound."""
+        return 1.0 - (1.0 - self.probability) / self.lower.size if self.joint else self.probability
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Data:
     """Data over time, and the table of them as a function of the time."""
 
@@ -334,7 +363,11 @@ class Data:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
-    """lower <= expression <= upper along the path, at the start or at the end; between: not at the nodes alone."""
+    """lower <= expression <= upper along the path, at the start or at the end.
+
+    between: not at the nodes alone.
+    chance: the condition on probabilities that it stands for, with this name; else None.
+    """
 
     name: str
     expression: ca.MX
@@ -343,6 +376,7 @@ class Constraint:
     at: Place
     where: str
     between: bool = False
+    chance: Chance | None = None
 
     __repr__ = short_repr
 
@@ -422,7 +456,7 @@ class Declarations:
 
     time, duration: symbols of the running and of the terminal time; the duration is a number where it is fixed.
     rates: by the name of the state or the matrix. expansion: of an expected cost that was derived. spread: the symbol
-    of the covariance of the closed loop.
+    of the covariance of the closed loop. chances: that are not yet constraints, because the cost is not known.
     """
 
     name: str
@@ -438,6 +472,7 @@ class Declarations:
     rates: Mapping[str, Dynamics] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    chances: tuple[Chance, ...] = ()
     cost: tuple[ca.MX, ca.MX] | None = None
     expected: Expected | None = None
     expansion: Expansion | None = None
@@ -449,7 +484,7 @@ class Declarations:
     def named(self) -> tuple[Any, ...]:
         """All declarations that have a name."""
         symbols = (*self.states, *self.unknowns, *self.parameters, *self.controls, *self.matrices)
-        return (*symbols, *self.data, *self.measurements, *self.constraints)
+        return (*symbols, *self.data, *self.measurements, *self.constraints, *self.chances)
 
     @property
     def taken(self) -> tuple[Any, ...]:

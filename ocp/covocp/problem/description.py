@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices
+from covocp.base.normal import shown_probability
 from covocp.base.pages import Part, Section, Sentence, Table, number
 from covocp.problem.closed_loop_covariance import SPREAD, reasons
 from covocp.problem.decisions import decisions_of
+from covocp.problem.declarations import Chance
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entries_of, entry_names, half_names
@@ -129,7 +131,10 @@ def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
         if isinstance(weight, dict):
             yield from (((what, name), value) for name, value in weight.items())
     for constraint in problem.constraints:
-        yield ("constraint", constraint.name), constraint.expression
+        if constraint.chance is None:
+            yield ("constraint", constraint.name), constraint.expression
+    for chance in problem.chances:
+        yield ("constraint", chance.name), chance.expression
 
 
 def _table(columns: list[str], rows: list[list[str]], code: tuple[int, ...] = ()) -> Section:
@@ -352,7 +357,7 @@ def _cost(problem: Problem, written: _Written) -> Section:
 def _constraints(problem: Problem, written: _Written) -> Section:
     rows = []
     places = {"path": "always", "initial": "at 0", "final": "at T"}
-    for q in problem.constraints:
+    for q in [*(c for c in problem.constraints if c.chance is None), *problem.chances]:
         own = []
         texts = written("constraint", q.name)
         for i, (text, low, high) in enumerate(zip(texts, q.lower, q.upper, strict=True)):
@@ -361,6 +366,28 @@ def _constraints(problem: Problem, written: _Written) -> Section:
             right = f" = {number(high)}" if low == high else f" <= {number(high)}" if np.isfinite(high) else ""
             if not right:
                 left, right = "", f" >= {number(low)}"
-            own.append([name, places[q.at] + (", between the nodes too" if q.between else ""), f"{left}{text}{right}"])
+            place = places[q.at] + (", between the nodes too" if getattr(q, "between", False) else "")
+            own.append([name, place, f"{left}{text}{right}", ""])
+            if isinstance(q, Chance):
+                together = ", together" if q.joint else ""
+                own[-1][3] = f"probability {shown_probability(q.probability)}{together}"
         rows += _shortened(own)
-    return _table(["constraint", "", ""], rows, code=(2,))
+    return [*_table(["constraint", "", "", ""], rows, code=(2,)), *_chance_notes(problem)]
+
+
+def _chance_notes(problem: Problem) -> Section:
+    """By which spread the probabilities are meant, and how several rows share their risk."""
+    chances = problem.chances
+    if not chances:
+        return []
+    if problem.expected is not None:
+        spread = f"the covariance {SPREAD} = E + Xhat of the closed loop"
+    elif problem.measurements:
+        spread = f"the covariance {SPREAD} without feedback, d {SPREAD}/dt = {FILTER.replace('E', SPREAD)}: measuring"
+        spread += " alone makes no system scatter less"
+    else:
+        spread = "E, as nothing is measured or fed back"
+    text = f"Probabilities: by {spread}; to first order"
+    text += ", at each time by itself" if any(q.at == "path" for q in chances) else ""
+    joint = any(q.joint for q in chances)
+    return [Sentence(text + ("; rows that hold together share the risk equally (Boole's bound)" if joint else ""), "")]

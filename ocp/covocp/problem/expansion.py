@@ -20,24 +20,21 @@ from covocp.statement.statement import entry_names, error_size
 
 def expand(problem: Declarations, expected: Expected) -> Expansion:
     """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
-    check_dynamics(problem.states, problem.rates)
-    moving = [state for state in problem.states if state.role == "moving"]
+    rates = _rates(problem)
     at = moved(problem.augmented)
     controls = [entry.symbol for entry in problem.controls]
-    count = sum(entry.size for entry in problem.unknowns)
-    rates = ca.vertcat(*(tangent_rate(problem, state) for state in moving), ca.MX(count, 1))
     running, terminal = at.write(expected.running), at.write(expected.terminal)
-    by_state = _slope(running, at.by).T
-    at_end = _slope(terminal, at.by).T
+    by_state = slope_by(running, at.by).T
+    at_end = slope_by(terminal, at.by).T
     weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
-    end = at.at_rest(_slope(at_end, at.by)) + (0 if weight is None else weight)
+    end = at.at_rest(slope_by(at_end, at.by)) + (0 if weight is None else weight)
     _check_terminal_weights(problem, end)
     return Expansion(
         F=_drift(problem, at, rates),
-        G=_slope(rates, controls),
-        A=at.at_rest(_slope(by_state, at.by)),
-        B=_control_weights(problem, expected, _slope(_slope(expected.running, controls).T, controls)),
-        N=at.at_rest(_slope(by_state, controls)),
+        G=slope_by(rates, controls),
+        A=at.at_rest(slope_by(by_state, at.by)),
+        B=_control_weights(problem, expected, slope_by(slope_by(expected.running, controls).T, controls)),
+        N=at.at_rest(slope_by(by_state, controls)),
         Q=process_noise(problem),
         end=end,
         running=expected.running,
@@ -48,8 +45,27 @@ def expand(problem: Declarations, expected: Expected) -> Expansion:
 
 def _drift(problem: Declarations, at: Moved, rates: Expr) -> Any:
     """F: slope of the rates, and what two states differ by that move along each other."""
-    slope = at.at_rest(_slope(at.write(rates), at.by))
+    slope = at.at_rest(slope_by(at.write(rates), at.by))
     return slope + drift(problem) if at.states else slope
+
+
+def augmented_drift(problem: Declarations) -> Any:
+    """F of the augmented state, shape (n, n)."""
+    return _drift(problem, moved(problem.augmented), _rates(problem))
+
+
+def _rates(problem: Declarations) -> Any:
+    """Velocity of the augmented state."""
+    check_dynamics(problem.states, problem.rates)
+    moving = [state for state in problem.states if state.role == "moving"]
+    count = sum(entry.size for entry in problem.unknowns)
+    return ca.vertcat(*(tangent_rate(problem, state) for state in moving), ca.MX(count, 1))
+
+
+def augmented_slope(problem: Declarations, expression: Expr) -> Any:
+    """Slope of an expression by the augmented state."""
+    at = moved(problem.augmented)
+    return at.at_rest(slope_by(at.write(expression), at.by))
 
 
 def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
@@ -57,11 +73,10 @@ def measurement_slope(problem: Declarations, size: int) -> tuple[Any, Any]:
     if not problem.continuous:
         return ca.MX(0, size), ca.MX(0, 0)
     value = ca.vertcat(*(m.expression for m in problem.continuous))
-    at = moved(problem.augmented)
-    return at.at_rest(_slope(at.write(value), at.by)), ca.diagcat(*(m.noise for m in problem.continuous))
+    return augmented_slope(problem, value), ca.diagcat(*(m.noise for m in problem.continuous))
 
 
-def _slope(expression: Expr, symbols: list[Any]) -> Any:
+def slope_by(expression: Expr, symbols: list[Any]) -> Any:
     """Jacobian by several symbols, side by side.
 
     An interpolation table expands to scalar operations and its derivative does not, so that of its expansion is taken.

@@ -25,6 +25,7 @@ from covocp.problem.measurement_information import check_readings, inverse_densi
 from covocp.problem.rates import process_noise
 from covocp.problem.samples import measured_blocks, samples
 from covocp.problem.stacked import Stacked, stack
+from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Block, Conditions, Duration, Loop, Statement, error_names, error_size
 
 
@@ -77,6 +78,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         path=_conditions(problem, stacked, "path"),
         start=_conditions(problem, stacked, "initial"),
         end=_conditions(problem, stacked, "final"),
+        chances=_chances(problem, stacked),
         state_bounds=_bounds(problem.states),
         control_bounds=_bounds(problem.controls),
         matrix_lower=np.concatenate([np.zeros(0), *(_diagonal_bounds(entry) for entry in problem.matrices)]),
@@ -372,7 +374,7 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Condition
     """The inequalities of one place as one function."""
     chosen: list[Constraint] = [c for c in problem.constraints if c.at == at]
     values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
-    names = [c.name if c.lower.size == 1 else f"{c.name}[{i}]" for c in chosen for i in range(c.lower.size)]
+    names = [name for c in chosen for name in _row_names(c)]
     realised, spread = None, problem.spread
     if spread is not None and any(used_in(problem, c.expression) for c in chosen):
         none: Any = floored(stacked.symbolic.zeros(spread.symbol.shape[0]), spread.size)  # type: ignore[attr-defined]
@@ -387,6 +389,38 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Condition
         upper=np.concatenate([np.zeros(0), *(c.upper for c in chosen)]),
         uses_matrices=bool(chosen and problem.matrices and ca.depends_on(values, stacked.inputs[2])),
     )
+
+
+def _row_names(constraint: Constraint) -> list[str]:
+    """Names of the rows of a constraint."""
+    size = constraint.lower.size
+    return [constraint.name] if size == 1 else [f"{constraint.name}[{i}]" for i in range(size)]
+
+
+def _chances(problem: Declarations, stacked: Stacked) -> tuple[ChanceLimits, ...]:
+    """The conditions on probabilities, as functions of the nominal."""
+    result = []
+    for constraint in problem.constraints:
+        chance = constraint.chance
+        if chance is None:
+            continue
+        assert chance.slopes is not None
+        values = [ca.densify(v) for v in stacked.substitute(chance.expression, *chance.slopes)]
+        result.append(
+            ChanceLimits(
+                name=chance.name,
+                names=tuple(_row_names(constraint)),
+                place=chance.at,
+                lower=chance.lower,
+                upper=chance.upper,
+                probability=chance.probability,
+                each=chance.each,
+                joint=chance.joint,
+                function=stacked.function("chance", values),
+                matrix=chance.spread,
+            )
+        )
+    return tuple(result)
 
 
 def _bounds(entries: Expr) -> tuple[Any, Any]:

@@ -59,6 +59,7 @@ def stack(problem: Declarations) -> Stacked:
     every += [value for m in problem.measurements for value in (m.expression, m.noise)]
     every += [m.information for m in problem.measurements if m.information is not None]
     every += [c.expression for c in problem.constraints] + list(problem.cost or ())
+    every += [slope for c in problem.constraints if c.chance is not None for slope in c.chance.slopes or ()]
     symbolic: type = ca.SX
     try:
         ca.Function("everything", known, every).expand()

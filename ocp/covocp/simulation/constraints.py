@@ -25,6 +25,7 @@ from covocp.simulation.prediction import Prediction
 from covocp.simulation.run_parts import Run, part
 from covocp.simulation.schedule import Nominal
 from covocp.solution.solution import Solution
+from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Conditions, Statement, entry_names
 
 Place = Literal["path", "initial", "final"]
@@ -37,6 +38,8 @@ class Row:
     """One inequality lower <= value <= upper that runs can violate.
 
     bound: whether it is the bound of a state or of a control, whose name it has.
+    chance: whether it is of a condition on a probability. parts: of rows that hold together the positions of these;
+        it is kept where all of them are.
     """
 
     name: str
@@ -44,6 +47,8 @@ class Row:
     lower: float
     upper: float
     bound: bool
+    chance: bool = False
+    parts: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,12 +56,13 @@ class Rows:
     """The inequalities that runs can violate, in their order: those of the path, of the start, of the end.
 
     function: (state, control, matrices, time, duration, parameters) -> their values.
-    left_out: names of the constraints that are not counted, and why.
+    left_out: names of the constraints that are not counted, and why. chances: conditions on probabilities in `rows`.
     """
 
     rows: tuple[Row, ...]
     function: ca.Function
     left_out: Mapping[str, str]
+    chances: tuple[ChanceLimits, ...] = ()
 
     __repr__ = short_repr
 
@@ -88,6 +94,8 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
         function = conditions.function if conditions.realised is None else conditions.realised
         column = function(*a)
         for i, name in enumerate(conditions.names):
+            if any(name in limits.names for limits in st.chances):
+                continue
             low, high = float(conditions.lower[i]), float(conditions.upper[i])
             if low == high:
                 left_out[name] = "an equality, which no noisy run meets exactly"
@@ -98,8 +106,25 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
             else:
                 rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False))
                 values.append(column[i])
+    for limits in st.chances:
+        _add_chance(limits, limits.function(*a)[0], rows, values)
     function = ca.Function("conditions", a, [ca.densify(ca.vertcat(symbolic(0, 1), *values))])
-    return Rows(rows=tuple(rows), function=function, left_out=left_out)
+    return Rows(rows=tuple(rows), function=function, left_out=left_out, chances=st.chances)
+
+
+def _add_chance(limits: ChanceLimits, column: Any, rows: list[Row], values: list[Any]) -> None:
+    """Rows of a condition on a probability: the expression itself, and whether all of them hold together."""
+    first, rooms = len(rows), []
+    for i, name in enumerate(limits.names):
+        low, high = float(limits.lower[i]), float(limits.upper[i])
+        rows.append(Row(name=name, place=limits.place, lower=low, upper=high, bound=False, chance=True))
+        values.append(column[i])
+        rooms.append(1 - beyond(column[i], low, high))
+    if limits.joint:
+        parts = tuple(range(first, len(rows)))
+        one = Row(name=limits.name, place=limits.place, lower=0.5, upper=np.inf, bound=False, chance=True, parts=parts)
+        rows.append(one)
+        values.append(ca.mmin(ca.vertcat(*rooms)))
 
 
 class _Bound(NamedTuple):
@@ -182,6 +207,9 @@ def promised(solution: Solution, design: System, nominal: Nominal, prediction: P
                 known = spread[:, i] == 0.0
                 share[known] = over[known] > MARGIN * max(1.0, abs(limit))
                 result[:, i] += share
+    for i, row in enumerate(chosen.rows):
+        if row.parts:  # Boole's bound
+            result[:, i] = np.minimum(result[:, list(row.parts)].sum(axis=1), 1.0)
     return result
 
 

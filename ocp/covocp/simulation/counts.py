@@ -17,7 +17,8 @@ class Count:
     """How many runs violate one constraint, or a bound, of the problem.
 
     name: of the constraint, or of the state or control whose bound it is. place: "path", "initial" or "final". bound:
-    whether it is a bound.
+    whether it is a bound. chance: whether it is of a condition on a probability. joint: of several rows that hold
+    together; what is promised is then an upper bound.
     runs: that violate it, at any instant of the path; share: of all runs.
     at_end: runs that violate it at the end, those that left the domain among them, and end_share; promised_end: what
     the covariances promise for normal deviations, (low, high): the confidence band of the probability that the runs
@@ -38,11 +39,13 @@ class Count:
     most: float
     most_time: float
     promised_most: float
+    chance: bool = False
+    joint: bool = False
 
     @property
     def as_promised(self) -> bool:
         """Whether the promised probability at the end is inside the confidence band of the runs'."""
-        return self.low <= self.promised_end <= self.high
+        return self.low <= self.promised_end and (self.joint or self.promised_end <= self.high)
 
 
 def count(
@@ -80,6 +83,8 @@ def count(
                 most=float(violating[k, i]),
                 most_time=float(t[k]),
                 promised_most=float(promise[k, i]),
+                chance=row.chance,
+                joint=bool(row.parts),
             )
         )
     return tuple(result)

@@ -18,6 +18,7 @@ from covocp.base.matrices import Array, standard_deviations
 from covocp.base.pages import as_html
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached, methods_one_at_a_time
+from covocp.simulation.chances import Share, chance_shares
 from covocp.simulation.constraints import Rows
 from covocp.simulation.counts import Count, count
 from covocp.simulation.sampling import Moments, degrees_of_freedom, mean_band, mean_square_band, robust_deviation
@@ -284,6 +285,11 @@ class MonteCarlo:
         flags = self.violated, self.at_end, self.violating
         found = count(self.inequalities.rows, *flags, self.promised, self.t, self.level)
         return {entry.name: entry for entry in found}
+
+    @cached
+    def chances(self) -> Mapping[str, Share]:
+        """The share of the runs that met each condition on a probability, by name, with confidence bands."""
+        return chance_shares(self)
 
     @cached
     def verdict(self) -> Verdict:

@@ -8,6 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
+from covocp.simulation.chances import chance_section
 from covocp.simulation.verdict import Component
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ def sections(sample: MonteCarlo) -> list[Section]:
         _entries(sample, "deviation at T", sample.verdict.deviations, sample.design),
         _entries(sample, "error of the filter at T", sample.verdict.errors, sample.design_error),
         _cost(sample),
+        chance_section(sample),
         _violations(sample),
         _shares(sample),
         [Sentence(f"{sample.verdict}{_expectations(sample)}", "", warning=not sample.verdict.holds)],
@@ -110,8 +112,8 @@ def _cost(sample: MonteCarlo) -> Section:
 
 
 def _violations(sample: MonteCarlo) -> Section:
-    """Who violates the constraints of the problem; bounds that no run leaves are left out."""
-    shown = [entry for entry in sample.violations.values() if entry.runs or not entry.bound]
+    """Who violates the constraints of the problem; bounds that no run leaves and chances are left out."""
+    shown = [entry for entry in sample.violations.values() if (entry.runs or not entry.bound) and not entry.chance]
     left_out = sample.inequalities.left_out.items()
     text = [Sentence(f"Not counted: {', '.join(f'{name} ({why})' for name, why in left_out)}.", "")] if left_out else []
     if not shown:

@@ -12,6 +12,7 @@ from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
+from covocp.solution.chances import chance_section
 from covocp.solution.origin import Classical
 from covocp.statement.statement import Block, Role, entry_names, error_names
 
@@ -109,6 +110,7 @@ def sections(solution: Solution) -> list[Section]:
     return [
         _head(solution),
         _violations(solution.violations),
+        chance_section(solution.chances),
         _costs(solution),
         _numbers(solution, "decision"),
         _states(solution),

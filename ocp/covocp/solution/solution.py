@@ -30,6 +30,7 @@ from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
@@ -68,6 +69,7 @@ class Solution:
         augmented: names of the rows of the estimation covariance.
         targets: final values of the states, NaN where they are free.
         constraints: names of the rows of the inequalities, by place: "path", "start", "end".
+        chances: what is reached of the conditions on probabilities, by the linearised spread.
         stored_problem: of a solution read from a file, what its problem was, to tell it from others.
         within: of one of several phases, what the others say of it.
     """
@@ -89,6 +91,7 @@ class Solution:
     targets: Annotated[Array, "x"]
     constraints: Mapping[str, tuple[str, ...]]
     loop: ClosedLoop | None = None
+    chances: tuple[Reached, ...] = ()
     stored_costates: Costates | None = None
     stored_dense: Dense | None = None
     stored_optimality: Optimality | None = None
@@ -122,7 +125,7 @@ class Solution:
             loop=loop,
             within=within,
         )
-        return read_only(solution)
+        return read_only(replace(solution, chances=reached(solution)))
 
     @property
     def mesh(self) -> Mesh:

@@ -23,6 +23,7 @@ from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.path_limits import NOTED
 from covocp.problem.builder import Problem
+from covocp.solution.chances import reached
 from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import check_whole
@@ -222,7 +223,7 @@ def _under(solution: Solution, truth: Given) -> Solution:
             received="inf or NaN on the way",
             remedy="check the variances and densities of truth=, and that the solution converged",
         )
-    return replace(
+    result = replace(
         solution,
         method=METHOD,
         message="evaluated under other statistics than the design's",
@@ -231,6 +232,7 @@ def _under(solution: Solution, truth: Given) -> Solution:
         loop=loop,
         stored_optimality=None,
     )
+    return replace(result, chances=reached(result))
 
 
 def true_statistics(extremal: Extremal, truth: Given) -> Statistics:

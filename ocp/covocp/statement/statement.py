@@ -23,6 +23,7 @@ from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_indices, half_length
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
+from covocp.statement.chances import ChanceLimits
 from covocp.statement.time_data import TimeData, kinks
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
@@ -243,6 +244,7 @@ class Statement:
         measurements: where each of them lies among the measured values.
         information: (state, control, time, duration, parameters) -> the inverse densities that were stated as
             information, which may be zero but not negative; None where none was.
+        chances: conditions on probabilities, which are among those of `path`, `start` and `end`.
         samples: measurements that are taken at instants; None where there are none.
         data: values over time that are in some of these functions.
         geometry: how the state moves where some of it is no vector.
@@ -269,6 +271,7 @@ class Statement:
     path: Conditions
     start: Conditions
     end: Conditions
+    chances: tuple[ChanceLimits, ...]
     state_bounds: tuple[Array, Array]
     control_bounds: tuple[Array, Array]
     matrix_lower: Array
