@@ -76,6 +76,14 @@ def _check_kinds(phase: Declarations) -> None:
             "minimize_expected() or closed_loop_covariance()",
             "state the cost by minimize(), or solve one Problem by itself",
         )
+    for constraint in phase.constraints:
+        if constraint.chance is not None:
+            _refuse(
+                f"The phase '{phase.name}' has the chance constraint '{constraint.chance.name}'.",
+                "subject_to(), also of variances: E[x, x] of the estimation covariance",
+                "chance()",
+                "state the limit with the deviation that it needs: subject_to(x + 3 * sqrt(E[x, x]), upper=...)",
+            )
     for state in phase.states:
         if state.chart is not None:
             _refuse(
