@@ -8,7 +8,7 @@ feedback are chosen together, and the variances are a saw tooth.
 import covocp as co
 
 ocp = co.Problem(duration=12.0, name="position fixes")
-x = ocp.state("x", initial=0.0, variance=4.0, unit="m")
+x = ocp.state("x", initial=0.0, variance=0.25, unit="m")
 v = ocp.state("v", initial=0.0, variance=0.01, unit="m/s")
 drag = ocp.unknown("drag", mean=0.1, variance=0.0003, unit="1/m")
 thrust = ocp.control("thrust", guess=0.3, unit="m/s^2")
@@ -16,7 +16,7 @@ thrust = ocp.control("thrust", guess=0.3, unit="m/s^2")
 ocp.dynamics(x, v)
 ocp.dynamics(v, thrust - drag * v * v, noise=2e-3)
 ocp.measurement("speed", v, noise=0.02)  # all the time, white noise of this density
-ocp.measurement("fix", x, noise=0.25, every=4.0)  # at 4, 8 and 12 s, noise of this variance
+ocp.measurement("fix", x, noise=0.04, every=4.0)  # at 4, 8 and 12 s, noise of this variance
 ocp.minimize_expected(running=0.5 * thrust**2, terminal=5.0 * (x - 10.0) ** 2 + 5.0 * v**2)
 
 solution = co.solve(ocp, intervals=60)

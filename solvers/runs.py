@@ -35,6 +35,8 @@ MAX_ITERATIONS = 1000
 LARGEST_ROUNDS = 6
 # A run that ends after so few iterations had met its tolerance where it began: the next one has this share of it.
 AT_ONCE, STRICTER = 1, 0.03
+# Residuals that are larger by less than this factor are those of the same point.
+UNMOVED = 1.0 + 1e-9
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
@@ -121,7 +123,7 @@ class Runs:
         """
         done = [self._judged(nlp, first, parameters)]
         while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS:
-            best = min(done, key=lambda entry: entry.worst)
+            best = _best(done)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
             at_once = 0 <= done[-1].point.iterations <= AT_ONCE
@@ -133,7 +135,7 @@ class Runs:
             point = self._run(nlp, solver, start, parameters, progress)
             done.append(self._judged(nlp, point, parameters, again=True))
         if not done[-1].converged:
-            done.append(done.pop(done.index(min(done, key=lambda entry: entry.worst))))
+            done.append(done.pop(done.index(_best(done))))
         return done
 
     def _tighten(self) -> None:
@@ -316,3 +318,9 @@ class Runs:
         second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+def _best(rounds: list[Round]) -> Round:
+    """The round with the least residuals; the last one where it did not move but for rounding."""
+    least = min(rounds, key=lambda entry: entry.worst)
+    return rounds[-1] if rounds[-1].worst <= UNMOVED * least.worst else least

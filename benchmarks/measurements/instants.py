@@ -52,7 +52,7 @@ def once(masses: int, sampled: bool, expected: bool) -> tuple[float, float, floa
 def main() -> None:
     """Print the table."""
     print("states  cost       first solve [s]: continuous, sampled, ratio    re-solve: continuous, sampled, ratio")
-    for masses, expected in ((1, False), (2, False), (4, False), (1, True)):
+    for masses, expected in ((1, False), (2, False), (4, False), (1, True), (2, True)):
         runs = [[once(masses, sampled, expected) for sampled in (False, True)] for _ in range(ROUNDS)]
         first, again = ([statistics.median(run[s][i] for run in runs) for s in (0, 1)] for i in (0, 1))
         words = "expected" if expected else "estimation"

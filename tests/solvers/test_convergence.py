@@ -152,3 +152,19 @@ def test_negative_curvature_is_damped() -> None:
     kept = damped(d, np.array([-3.0, 1.0]), image)
     assert d @ kept == pytest.approx(0.2 * (d @ image))
     np.testing.assert_array_equal(damped(d, image, image), image)
+
+
+def test_a_run_that_stands_still_is_asked_for_more() -> None:
+    """Its residuals are those of the round before but for rounding: new scales alone do not move it."""
+    ocp = co.Problem(10.0)
+    x = ocp.state("x", initial=0.0, variance=0.1)
+    v = ocp.state("v", initial=0.0, variance=0.1)
+    k = ocp.unknown("k", mean=1.0, variance=0.05)
+    u = ocp.control("u", guess=0.1)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, -k * (2 * x) - 0.1 * v + u, noise=0.01)
+    ocp.measurement("place", x, 0.2, every=1.0)
+    ocp.minimize_expected((x - 1) ** 2 + 0.1 * u**2, x**2)
+    solution = co.solve(ocp, progress=False)
+    assert solution.optimality.stationarity is not None
+    assert solution.optimality.stationarity < 1e-5

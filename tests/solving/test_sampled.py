@@ -57,12 +57,16 @@ def test_covariances_and_slopes_of_random_systems_are_those_of_scipy(seeds):
         assert own == pytest.approx(true, rel=1e-6, abs=1e-6 * np.abs(slopes).max()), seed
 
 
-@pytest.mark.parametrize("options", [{"covariances": "states"}, {"covariance_step": "rk4"}, {"method": "gradient"}])
+@pytest.mark.parametrize(
+    ("options", "difference"),
+    [({"covariances": "states"}, 1e-8), ({"covariance_step": "rk4"}, 1e-5), ({"method": "gradient"}, 1e-7)],
+)
 @pytest.mark.parametrize("seed", [6, 12])
-def test_formulations_steps_and_methods_agree(seed, options):
+def test_formulations_steps_and_methods_agree(seed, options, difference):
+    """Another step has an error of its own; formulation and method have none."""
     plain = co.solve(random_system(seed).problem(), intervals=48, progress=False)
     other = co.solve(random_system(seed).problem(), intervals=48, progress=False, **options)
-    assert other.cost == pytest.approx(plain.cost, rel=1e-5)
+    assert other.cost == pytest.approx(plain.cost, rel=difference)
     for solution in (plain, other):
         assert solution.optimality.costate_difference < 1e-4
         assert solution.optimality.stationarity < 1e-5

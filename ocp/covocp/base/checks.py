@@ -62,11 +62,14 @@ def as_number(name: str, what: str, value: Given) -> Array:
     try:
         return real_numbers(value)
     except (TypeError, ValueError, OverflowError) as error:
+        listed = isinstance(value, (list, tuple)) and any(is_symbolic(entry) for entry in value)
         raise ProblemError(
             f"The {what} of '{name}' is not a number.",
             expected="a number or an array of numbers",
             received=shown(value, 200),
-            remedy=f"check the {what} of '{name}'",
+            remedy="put expressions into a column by casadi.vertcat(...), not into a list"
+            if listed
+            else f"check the {what} of '{name}'",
         ) from error
 
 

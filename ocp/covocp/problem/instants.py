@@ -102,5 +102,5 @@ def _refused(name: str, expected: str, received: Any) -> ProblemError:
         f"The instants of the measurement '{name}' do not fit.",
         expected=expected,
         received=listed if listed != "[]" else "none",
-        remedy="correct at=; a measurement that is always there takes neither at= nor every=",
+        remedy="correct at= or every=; a measurement that is always there takes neither",
     )
