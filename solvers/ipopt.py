@@ -30,6 +30,7 @@ from covocp.transcription.nlp import QUIET
 from covocp.transcription.program import Arrays, Program, Trajectories, alone, joined
 from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.stiffness import resolve_mesh
+from covocp.transcription.shooting import Passage
 from covocp.transcription.transcribing import transcribe
 
 TOLERANCE = 1e-7
@@ -280,6 +281,8 @@ def _builder(
 ) -> Callable[[Magnitudes | None, Trajectories, Arrays], Program]:
     """What makes the program in some magnitudes, or in those of trajectories where there are none."""
 
+    passage: Passage = "compiled" if limited and chain is None else "plain"
+
     def build(scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> Program:
         pairs = list(zip(statements, meshes, strict=True))
         if scales is None:
@@ -287,7 +290,7 @@ def _builder(
             scales = tuple(choose_scales(*pair, trajectory, own) for pair, trajectory, own in along)
         if limited:
             scales = tuple(evened(own, mesh) for own, mesh in zip(scales, meshes, strict=True))
-        parts = tuple(transcribe(*pair, own) for pair, own in zip(pairs, scales, strict=True))
+        parts = tuple(transcribe(*pair, own, passage) for pair, own in zip(pairs, scales, strict=True))
         return alone(parts[0]) if chain is None else joined(chain, parts)
 
     return build

@@ -204,7 +204,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     weights = ca.MX.sym("weights", statement.ne, n + 1)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage="compiled")
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)

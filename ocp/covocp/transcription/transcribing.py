@@ -14,28 +14,37 @@ from covocp.base.matrices import Array
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import interval_columns, shoot
+from covocp.transcription.shooting import Passage, compiled_steps, interval_columns, shoot
+
+# Adjoint sweeps that a Jacobian takes at once.
+LARGEST_DIRECTIONS = 64
 
 
-def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
+def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = "plain") -> NLP:
     """Build the NLP of a statement on a mesh.
 
     Args:
         statement: the problem.
         mesh: nodes, segments, formulation.
         scales: magnitudes in which the NLP works.
+        passage: of eliminated matrices; compiled, the NLP has slopes of first order only.
 
     Returns:
         The NLP; its functions are not yet differentiated.
     """
     variables = _Variables(statement, mesh, scales)
-    nodes = shoot(statement, mesh, variables)
+    passage = passage if compiled_steps(mesh) else "plain"
+    nodes = shoot(statement, mesh, variables, passage=passage)
     running = ca.sum2(nodes["cost"])
     last_x, last_e = nodes["x"][:, -1], nodes["e"][:, -1]
     terminal = statement.terminal(last_x, last_e, variables.duration, variables.parameters)
     rows = _constraints(statement, mesh, scales, variables, nodes)
     g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
     p = ca.vertcat(variables.p)
+    depending = None
+    if passage == "compiled" and any(entry.dense for entry in rows):
+        seen = shoot(statement, mesh, variables, passage="dependence")
+        depending = _dense(_constraints(statement, mesh, scales, variables, seen))
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
     return NLP(
         statement=statement,
@@ -46,7 +55,7 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
         f=(running + terminal) / variables.cost_scale,
         g=g,
         rows=rows,
-        jacobian=_split_jacobian(variables, rows, g),
+        jacobian=_split_jacobian(variables, rows, g, depending),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
     )
 
@@ -216,11 +225,29 @@ def _final_matrices(statement: Statement, scales: Scales, last: Expr) -> list[Ro
     ]
 
 
-def _split_jacobian(variables: _Variables, rows: tuple[Rows, ...], g: Expr) -> ca.Function | None:
-    """Jacobian of g where it has dense rows: those by their own adjoint sweeps, the rest with its sparsity."""
-    dense = [entry.expression for entry in rows if entry.dense]
-    if not dense:
+def _dense(rows: tuple[Rows, ...]) -> Any:
+    """The rows that depend on eliminated matrices."""
+    return ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows if entry.dense))
+
+
+def _split_jacobian(
+    variables: _Variables, rows: tuple[Rows, ...], g: Expr, depending: Expr
+) -> ca.Function | None:
+    """Jacobian of g where it has dense rows: those by their own adjoint sweeps, the rest with its sparsity.
+
+    `depending`: what depends on the variables as the dense rows do, where the sparsity of these cannot be seen.
+    """
+    dense = _dense(rows)
+    if not dense.shape[0]:
         return None
     sparse = ca.vertcat(*(entry.expression for entry in rows if not entry.dense))
-    blocks = [ca.jacobian(sparse, variables.w), ca.jacobian(ca.vertcat(*dense), variables.w)]
-    return ca.Function("nlp_jac_g", [variables.w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])
+    w = variables.w
+    blocks = [ca.jacobian(sparse, w)]
+    if depending is None:
+        blocks.append(ca.jacobian(dense, w))
+    else:
+        pattern, count = ca.jacobian_sparsity(depending, w), dense.shape[0]
+        unit = ca.horzsplit(ca.DM.eye(count), LARGEST_DIRECTIONS)
+        slopes = ca.horzcat(*(ca.jtimes(dense, w, ca.densify(seeds), True) for seeds in unit))
+        blocks.append(ca.project(slopes.T, pattern))
+    return ca.Function("nlp_jac_g", [w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])

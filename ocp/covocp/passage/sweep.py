@@ -1,0 +1,216 @@
+"""The compiled passage as a node of CasADi expressions: values and exact slopes by symplectic duality."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.base.matrices import half_length
+from covocp.passage.library import functions
+
+# Bytes of passages that are kept for the next call beside the last one.
+KEPT_BYTES = 50_000_000
+
+Pattern = tuple[tuple[int, ...], tuple[int, ...]]
+Buffers = tuple[memoryview | None, ...]
+
+
+def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None) -> Any:
+    """Half-vectors of a covariance after each Gauss step.
+
+    Args:
+        first: half-vector at the start.
+        points: h H of all steps side by side, at the first and at the second Gauss point, of one sparsity each step.
+        size: of the covariance.
+        kicks: added to the half-vectors as they pass, a column for each step; None: nothing.
+
+    Returns:
+        A column for each step; to be differentiated once, by reverse sweeps.
+    """
+    rows, columns = _pattern(points, size)
+    count = points[0].shape[1] // (2 * size)
+    shape = ca.Sparsity.dense(len(rows), count)
+    wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, count)
+    entries = [ca.sparsity_cast(ca.project(point, wide), shape) for point in points]
+    sweep = _sweep(size, (tuple(rows), tuple(columns)), count, kicks is not None)
+    return sweep(first, *entries, *([] if kicks is None else [kicks]))
+
+
+def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None) -> Any:
+    """Something that depends on what `passed_by` depends on, by operations whose sparsity CasADi sees."""
+    count = points[0].shape[1] // (2 * size)
+    each: Any = sum(ca.sum1(ca.reshape(ca.sum1(point), 2 * size, count)) for point in points)
+    if kicks is not None:
+        each = each + ca.sum1(kicks)
+    return ca.repmat(ca.sum1(first) + ca.cumsum(each, 1), half_length(size), 1)
+
+
+def _pattern(points: Sequence[Expr], size: int) -> tuple[list[int], list[int]]:
+    """Rows and columns, column by column, of what may be nonzero in some step."""
+    united = ca.Sparsity(2 * size, 2 * size)
+    for point in points:
+        for part in ca.horzsplit(point.sparsity(), 2 * size):
+            if part != united:
+                united = united + part
+    return cast(tuple[list[int], list[int]], united.get_triplet())
+
+
+class _Workspaces:
+    """Memory of passages: taken for a call, given back after it; what was used last is kept."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[_Sweep, int]] = []
+        self._lock = threading.Lock()
+
+    def take(self, sweep: _Sweep) -> int:
+        """The last memory of a sweep, or new memory."""
+        with self._lock:
+            for place in range(len(self._kept) - 1, -1, -1):
+                if self._kept[place][0] is sweep:
+                    return self._kept.pop(place)[1]
+        return sweep.new_memory()
+
+    def give(self, sweep: _Sweep, memory: int) -> None:
+        """Keep memory for the next call, and free the oldest where it has become too much."""
+        with self._lock:
+            self._kept.append((sweep, memory))
+            while len(self._kept) > 1 and sum(owner.bytes for owner, _ in self._kept) > KEPT_BYTES:
+                _library()["passage_free"](self._kept.pop(0)[1])
+
+
+_WORKSPACES = _Workspaces()
+
+
+def _library() -> dict[str, Callable[..., Any]]:
+    """The library, which is there where a sweep is."""
+    there = functions()
+    assert there is not None
+    return there
+
+
+@lru_cache(maxsize=None)
+def _sweep(size: int, pattern: Pattern, count: int, kicked: bool) -> _Sweep:
+    """A sweep; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
+    return _Sweep(size, pattern, count, kicked)
+
+
+class _Sweep(ca.Callback):
+    """(half-vector at the start, entries of h H at both points[, kicks]) -> half-vectors after the steps."""
+
+    def __init__(self, size: int, pattern: Pattern, count: int, kicked: bool) -> None:
+        ca.Callback.__init__(self)
+        self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
+        self._size = size
+        self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
+        steps = count * (5 * size * size + 2 * self.entries + 2 * self.half)
+        self.bytes = 8 * (steps + 12 * size * size)
+        self._reverse: dict[int, _Slopes] = {}
+        self.construct("passage", {})
+
+    def new_memory(self) -> int:
+        """Memory of the library for one call at a time."""
+        rows, columns = self._rows.ctypes.data, self._columns.ctypes.data
+        memory = _library()["passage_new"](self._size, self.entries, rows, columns, self.count)
+        if not memory:
+            raise MemoryError(f"no memory for the covariances of {self.count} steps")
+        return int(memory)
+
+    def get_n_in(self) -> int:
+        """Of CasADi."""
+        return 4 if self.kicked else 3
+
+    def get_n_out(self) -> int:
+        """Of CasADi."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        shapes = ((self.half, 1), (self.entries, self.count), (self.entries, self.count), (self.half, self.count))
+        return ca.Sparsity.dense(*shapes[i])
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        return ca.Sparsity.dense(self.half, self.count)
+
+    def has_eval_buffer(self) -> bool:
+        """Of CasADi."""
+        return True
+
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
+        """Of CasADi."""
+        given = [_address(argument) for argument in arguments]
+        memory = _WORKSPACES.take(self)
+        _library()["passage_forward"](memory, *given, *([] if self.kicked else [None]), _address(results[0]))
+        _WORKSPACES.give(self, memory)
+        return 0
+
+    def has_reverse(self, nadj: int) -> bool:
+        """Of CasADi."""
+        return True
+
+    def get_reverse(
+        self, nadj: int, name: str, inames: list[str], onames: list[str], opts: dict[str, Any]
+    ) -> ca.Function:
+        """Of CasADi."""
+        if nadj not in self._reverse:
+            self._reverse[nadj] = _Slopes(self, nadj, name, opts)
+        return self._reverse[nadj]
+
+
+class _Slopes(ca.Callback):
+    """(arguments of a sweep, its result, seeds) -> slopes by the arguments, for some directions side by side."""
+
+    def __init__(self, sweep: _Sweep, directions: int, name: str, options: dict[str, Any]) -> None:
+        ca.Callback.__init__(self)
+        self._sweep, self._directions = sweep, directions
+        self.construct(name, options)
+
+    def get_n_in(self) -> int:
+        """Of CasADi."""
+        return self._sweep.get_n_in() + 2
+
+    def get_n_out(self) -> int:
+        """Of CasADi."""
+        return self._sweep.get_n_in()
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        sweep, count = self._sweep, self._sweep.get_n_in()
+        if i < count:
+            return sweep.get_sparsity_in(i)
+        return ca.Sparsity.dense(sweep.half, sweep.count * (1 if i == count else self._directions))
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        return ca.repmat(self._sweep.get_sparsity_in(i), 1, self._directions)
+
+    def has_eval_buffer(self) -> bool:
+        """Of CasADi."""
+        return True
+
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
+        """Of CasADi."""
+        sweep, count = self._sweep, self._sweep.get_n_in()
+        given = [_address(argument) for argument in arguments[:count]]
+        seeds, slopes = _address(arguments[count + 1]), [_address(result) for result in results]
+        if not sweep.kicked:
+            given, slopes = [*given, None], [*slopes, None]
+        lengths = [8 * sweep.get_sparsity_in(i).nnz() for i in range(count)] + [0]
+        memory = _WORKSPACES.take(sweep)
+        for k in range(self._directions):
+            own = [None if slope is None else slope + k * length for slope, length in zip(slopes, lengths)]
+            seed = None if seeds is None else seeds + 8 * k * sweep.half * sweep.count
+            _library()["passage_reverse"](memory, *given, seed, *own)
+        _WORKSPACES.give(sweep, memory)
+        return 0
+
+
+def _address(view: memoryview | None) -> int | None:
+    """Where the numbers of CasADi's buffer lie; None: no numbers are given or wanted."""
+    return None if view is None else int(np.frombuffer(view).ctypes.data)
