@@ -23,6 +23,7 @@
 #include <Python.h>
 
 #include <math.h>
+#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -408,23 +409,11 @@ INLINE void back(
     if (by_first) pack_slopes(&s, n, spare, by_first);
 }
 
-/* Small sizes are compiled each for itself. */
-#define SIZES X(2) X(3) X(4) X(5) X(6) X(8)
-
 /* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT VERSIONS void passage_forward(
     Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, double *after
 ) {
-    switch (p->n) {
-#define X(N)                               \
-    case N:                                \
-        run(p, N, first, h1, h2, kicks);   \
-        break;
-        SIZES
-#undef X
-    default:
-        run(p, p->n, first, h1, h2, kicks);
-    }
+    run(p, p->n, first, h1, h2, kicks);
     if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
 }
 
@@ -433,21 +422,13 @@ EXPORT VERSIONS void passage_reverse(
     Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, const double *seed,
     double *by_first, double *by_h1, double *by_h2, double *by_kicks
 ) {
-    passage_forward(p, first, h1, h2, kicks, NULL);
-    switch (p->n) {
-#define X(N)                                                \
-    case N:                                                 \
-        back(p, N, seed, by_first, by_h1, by_h2, by_kicks); \
-        break;
-        SIZES
-#undef X
-    default:
-        back(p, p->n, seed, by_first, by_h1, by_h2, by_kicks);
-    }
+    run(p, p->n, first, h1, h2, kicks);
+    back(p, p->n, seed, by_first, by_h1, by_h2, by_kicks);
 }
 
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_passage", "The compiled passage of a covariance; called by its C names.", -1, NULL,
+    PyModuleDef_HEAD_INIT, "_passage", "The compiled passage of a covariance; called by its C names.", -1,
+    NULL, NULL, NULL, NULL, NULL,
 };
 
 PyMODINIT_FUNC PyInit__passage(void) { return PyModule_Create(&definition); }
