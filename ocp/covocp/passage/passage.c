@@ -53,6 +53,8 @@
 
 static const double GAP = 0.28867513459481287;
 static const double SHARE = 0.5 - 2.0 * 0.28867513459481287;
+/* Of information times variance in a step, above which the transition is made. */
+static const double MUCH = 100.0;
 
 typedef struct {
     int n, nnz, count, known;
@@ -63,7 +65,7 @@ typedef struct {
     double *after;           /* half-vectors there */
     double *stage1, *stage2; /* of every step, 2n x n, row by row */
     double *factor;          /* of every X', n x n */
-    int *swaps;
+    int *swaps, *exchanged;
     double *work;
 } Passage;
 
@@ -87,9 +89,10 @@ EXPORT Passage *passage_new(int n, int nnz, const int *row, const int *col, int 
     p->across = room(nnz, sizeof(int)), p->which = room(nnz, sizeof(int)), p->swaps = room(steps * n, sizeof(int));
     p->first = room(half, d), p->h1 = room(steps * nnz, d), p->h2 = room(steps * nnz, d);
     p->kicks = room(steps * half, d), p->after = room(steps * half, d), p->factor = room(steps * square, d);
-    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(12 * square, d);
+    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(16 * square, d);
+    p->exchanged = room(2 * n, sizeof(int));
     if (!p->row || !p->col || !p->begin || !p->across || !p->which || !p->swaps || !p->first || !p->h1 || !p->h2 ||
-        !p->kicks || !p->after || !p->factor || !p->stage1 || !p->stage2 || !p->work) {
+        !p->kicks || !p->after || !p->factor || !p->stage1 || !p->stage2 || !p->work || !p->exchanged) {
         passage_free(p);
         return NULL;
     }
@@ -149,44 +152,90 @@ INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) 
         for (int i = j; i < n; ++i, ++t) square[i * n + j] = square[j * n + i] = half[t];
 }
 
-/* One step: E (n x n) becomes the one after it; what slopes need is kept. */
-INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
-    const int m = 2 * n, w = 3 * n, nnz = p->nnz;
+/* I - (H1 + H2)/4 + H2 H1/12 beside I - g H2 (2n columns), or beside (I - g H2) Z0 (n columns). */
+INLINE void assemble(const Passage *p, int n, int k, const double *RESTRICT E, int w, double *RESTRICT a) {
+    const int m = 2 * n, nnz = p->nnz, transition = w == 2 * m;
     const double *RESTRICT h1 = p->h1 + (size_t)k * nnz, *RESTRICT h2 = p->h2 + (size_t)k * nnz;
-    double *RESTRICT a = p->work, *RESTRICT b = p->work + m * w;
-    double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n, *RESTRICT Y2 = p->stage2 + (size_t)k * m * n;
-    double *RESTRICT factor = p->factor + (size_t)k * n * n;
-    int *swaps = p->swaps + (size_t)k * n, *exchanged = (int *)(p->work + 11 * n * n);
     memset(a, 0, sizeof(double) * m * w);
     for (int i = 0; i < m; ++i) a[i * w + i] = 1.0;
-    for (int i = 0; i < n; ++i) {
-        a[i * w + m + i] = 1.0;
-        memcpy(a + (n + i) * w + m, E + i * n, sizeof(double) * n);
-    }
-    for (int q = 0; q < nnz; ++q) { /* I - (H1 + H2)/4 + H2 H1/12 beside (I - g H2) Z0 */
+    for (int i = 0; i < (transition ? m : n); ++i) a[i * w + m + i] = 1.0;
+    if (!transition)
+        for (int i = 0; i < n; ++i) memcpy(a + (n + i) * w + m, E + i * n, sizeof(double) * n);
+    for (int q = 0; q < nnz; ++q) {
         const int r = p->row[q], c = p->col[q];
         double *RESTRICT own = a + r * w;
         const double share = h2[q] / 12.0, moved = -GAP * h2[q];
         own[c] -= 0.25 * (h1[q] + h2[q]);
         for (int t = p->begin[c]; t < p->begin[c + 1]; ++t) own[p->across[t]] += share * h1[p->which[t]];
-        if (c < n)
+        if (transition || c < n)
             own[m + c] += moved;
         else
             for (int j = 0; j < n; ++j) own[m + j] += moved * E[(c - n) * n + j];
     }
-    eliminate(a, m, w, exchanged);
-    for (int i = 0; i < m; ++i) memcpy(Y1 + i * n, a + i * w + m, sizeof(double) * n);
-    /* V = Z+ - Z0 = ((I - g H1) Y1 - Z0)/a, in the place of the second stage */
-    for (int i = 0; i < m * n; ++i) Y2[i] = Y1[i];
-    for (int q = 0; q < nnz; ++q) {
+}
+
+/* V = ((I - g H1) Y1 - Z0)/a, of some columns. */
+INLINE void change(
+    const Passage *p, int n, int k, int columns, const double *RESTRICT Y1, const double *RESTRICT Z0, double *RESTRICT V
+) {
+    const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz;
+    memcpy(V, Y1, sizeof(double) * 2 * n * columns);
+    for (int q = 0; q < p->nnz; ++q) {
         const double share = -GAP * h1[q];
-        double *RESTRICT own = Y2 + p->row[q] * n;
-        const double *RESTRICT y = Y1 + p->col[q] * n;
-        for (int j = 0; j < n; ++j) own[j] += share * y[j];
+        double *RESTRICT own = V + p->row[q] * columns;
+        const double *RESTRICT y = Y1 + p->col[q] * columns;
+        for (int j = 0; j < columns; ++j) own[j] += share * y[j];
     }
-    for (int i = 0; i < n; ++i) Y2[i * n + i] -= 1.0;
-    for (int i = 0; i < n * n; ++i) Y2[n * n + i] -= E[i];
-    for (int i = 0; i < m * n; ++i) Y2[i] *= 1.0 / SHARE;
+    for (int i = 0; i < (Z0 ? n : 2 * n); ++i) V[i * columns + i] -= 1.0;
+    if (Z0)
+        for (int i = 0; i < n * n; ++i) V[n * n + i] -= Z0[i];
+    for (int i = 0; i < 2 * n * columns; ++i) V[i] *= 1.0 / SHARE;
+}
+
+/* D [I; E] of a (2n x 2n) matrix. */
+INLINE void applied(const double *RESTRICT D, const double *RESTRICT E, int n, double *RESTRICT product) {
+    for (int i = 0; i < 2 * n; ++i) {
+        double *RESTRICT own = product + i * n;
+        memcpy(own, D + i * 2 * n, sizeof(double) * n);
+        for (int j = 0; j < n; ++j) {
+            const double share = D[i * 2 * n + n + j];
+            for (int c = 0; c < n; ++c) own[c] += share * E[j * n + c];
+        }
+    }
+}
+
+/* Whether a step measures so much that the covariance loses most of its size: then rounding of E itself would count. */
+static int measures_much(const Passage *p, int k, const double *E) {
+    const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
+    double information = 0.0, largest = 0.0;
+    for (int q = 0; q < p->nnz; ++q)
+        if (p->row[q] < p->n && p->col[q] >= p->n)
+            information = fmax(information, fmax(fabs(h1[q]), fabs(h2[q])));
+    for (int i = 0; i < p->n; ++i) largest = fmax(largest, E[i * p->n + i]);
+    return information * largest > MUCH;
+}
+
+/* One step: E (n x n) becomes the one after it; what slopes need is kept.
+ *
+ * [I; E] goes through the step as it is. Where much is measured the transition D itself is made, from which E's rounding
+ * is apart: the errors of D [I; E] stay in proportion to what they come from.
+ */
+INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
+    const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
+    double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
+    double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n, *RESTRICT Y2 = p->stage2 + (size_t)k * m * n;
+    double *RESTRICT factor = p->factor + (size_t)k * n * n;
+    int *swaps = p->swaps + (size_t)k * n, *exchanged = p->exchanged;
+    assemble(p, n, k, E, w, a);
+    eliminate(a, m, w, exchanged);
+    double *RESTRICT stage = transition ? D : Y1;
+    for (int i = 0; i < m; ++i) memcpy(stage + i * columns, a + i * w + m, sizeof(double) * columns);
+    if (transition) { /* the second stage has the place of V meanwhile */
+        change(p, n, k, m, D, NULL, a);
+        applied(D, E, n, Y1);
+        applied(a, E, n, Y2);
+    } else
+        change(p, n, k, n, Y1, E, Y2);
     /* X' E+ = Y', side by side */
     for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) {
@@ -215,7 +264,7 @@ INLINE void run(Passage *p, int n, const double *first, const double *h1, const 
     memcpy(p->h1, h1, all);
     memcpy(p->h2, h2, all);
     if (kicks) memcpy(p->kicks, kicks, sizeof(double) * half * p->count);
-    double *E = p->work + 8 * n * n;
+    double *E = p->work + 14 * n * n;
     spread(first, n, E);
     for (int k = 0; k < p->count; ++k) {
         step(p, n, k, E);

@@ -109,7 +109,7 @@ class _Sweep(ca.Callback):
         self._size = size
         self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
         steps = count * (5 * size * size + 2 * self.entries + 2 * self.half)
-        self.bytes = 8 * (steps + 12 * size * size)
+        self.bytes = 8 * (steps + 16 * size * size)
         self._reverse: dict[int, _Slopes] = {}
         self.construct("passage", {})
 
