@@ -17,6 +17,7 @@ class BuildPassage(build_ext):
     """Flags of the compiler that is there."""
 
     def build_extensions(self) -> None:
+        """Compile with them."""
         if self.compiler.compiler_type in ("unix", "mingw32"):
             for extension in self.extensions:
                 extension.extra_compile_args = FLAGS

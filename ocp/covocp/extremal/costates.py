@@ -128,7 +128,7 @@ def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array,
 
 
 def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
-    """The same where the matrices pass along the nominal: the costate of one that runs backward runs forward, from zero.
+    """The same where matrices pass along the nominal: the costate of one that runs backward runs forward, from zero.
 
     The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
     both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.

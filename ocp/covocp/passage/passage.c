@@ -72,7 +72,7 @@ typedef struct {
 EXPORT void passage_free(Passage *p) {
     if (!p) return;
     void *owned[] = {p->row,   p->col,    p->begin,  p->across, p->which, p->first, p->h1,  p->h2,
-                     p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->work};
+                     p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->exchanged, p->work};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(p);
 }

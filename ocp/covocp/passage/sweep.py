@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -58,7 +58,7 @@ def _pattern(points: Sequence[Expr], size: int) -> tuple[list[int], list[int]]:
         for part in ca.horzsplit(point.sparsity(), 2 * size):
             if part != united:
                 united = united + part
-    return cast(tuple[list[int], list[int]], united.get_triplet())
+    return united.get_triplet()
 
 
 class _Workspaces:
@@ -94,7 +94,7 @@ def _library() -> dict[str, Callable[..., Any]]:
     return there
 
 
-@lru_cache(maxsize=None)
+@cache
 def _sweep(size: int, pattern: Pattern, count: int, kicked: bool) -> _Sweep:
     """A sweep; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
     return _Sweep(size, pattern, count, kicked)
@@ -155,7 +155,7 @@ class _Sweep(ca.Callback):
         return True
 
     def get_reverse(
-        self, nadj: int, name: str, inames: list[str], onames: list[str], opts: dict[str, Any]
+        self, nadj: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
     ) -> ca.Function:
         """Of CasADi."""
         if nadj not in self._reverse:
@@ -166,7 +166,7 @@ class _Sweep(ca.Callback):
 class _Slopes(ca.Callback):
     """(arguments of a sweep, its result, seeds) -> slopes by the arguments, for some directions side by side."""
 
-    def __init__(self, sweep: _Sweep, directions: int, name: str, options: dict[str, Any]) -> None:
+    def __init__(self, sweep: _Sweep, directions: int, name: str, options: Mapping[str, Any]) -> None:
         ca.Callback.__init__(self)
         self._sweep, self._directions = sweep, directions
         self.construct(name, options)
@@ -201,10 +201,13 @@ class _Slopes(ca.Callback):
         seeds, slopes = _address(arguments[count + 1]), [_address(result) for result in results]
         if not sweep.kicked:
             given, slopes = [*given, None], [*slopes, None]
-        lengths = [8 * sweep.get_sparsity_in(i).nnz() for i in range(count)] + [0]
+        lengths = [8 * sweep.get_sparsity_in(i).nnz() for i in range(count)]
         memory = _WORKSPACES.take(sweep)
         for k in range(self._directions):
-            own = [None if slope is None else slope + k * length for slope, length in zip(slopes, lengths)]
+            own = [
+                None if slope is None else slope + k * length
+                for slope, length in zip(slopes, [*lengths, 0], strict=False)
+            ]
             seed = None if seeds is None else seeds + 8 * k * sweep.half * sweep.count
             _library()["passage_reverse"](memory, *given, seed, *own)
         _WORKSPACES.give(sweep, memory)

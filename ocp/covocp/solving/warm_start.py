@@ -100,9 +100,7 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     )
 
 
-def _resampled(
-    statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, matched: bool
-) -> Trajectory:
+def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, matched: bool) -> Trajectory:
     """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
     duration = solution.duration if statement.duration.free else statement.duration.guess
     sizes, t = mesh.nodes.size, solution.trajectory

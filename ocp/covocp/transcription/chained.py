@@ -1,8 +1,8 @@
 """Slopes of the ends of shooting segments as products of those of their intervals.
 
 Differentiated as a whole a segment of L intervals passes nx + nu (L + 1) directions through each of them. Here every
-interval has its own slopes once, by its state, the controls at its two ends and T, and a segment multiplies them from its
-end: R <- R A, slopes by the controls R B.
+interval has its own slopes once, by its state, the controls at its two ends and T, and a segment multiplies them from
+its end: R <- R A, slopes by the controls R B.
 """
 
 from __future__ import annotations

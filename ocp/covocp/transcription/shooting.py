@@ -16,9 +16,9 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import half_length
 from covocp.passage.library import functions
 from covocp.passage.sweep import depends, passed_by
-from covocp.base.matrices import half_length
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
