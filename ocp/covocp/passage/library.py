@@ -17,6 +17,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passage_free": (None, (_ADDRESS,)),
     "passage_forward": (None, (_ADDRESS,) * 6),
     "passage_reverse": (None, (_ADDRESS,) * 10),
+    "passage_tangent": (_WHOLE, (_ADDRESS,) * 16),
 }
 
 

@@ -13,6 +13,9 @@
  *
  * A cost on few entries of the last E has P = M C M' with few columns and a constant core C: M = X^-1 M+.
  *
+ * How these slopes change along a direction (products with second derivatives) needs one more system a step, that of the
+ * tangent of Y1. It holds, as the slopes do, where H and its direction have this form: Q and W symmetric.
+ *
  * Half-vectors hold the lower triangle column by column. Slopes by a half-vector are those of its entries: both places
  * of a symmetric matrix move with one entry. The nonzeros of H come column by column, step after step.
  *
@@ -67,12 +70,14 @@ typedef struct {
     double *factor;          /* of every X', n x n */
     int *swaps, *exchanged;
     double *work;
+    double *moved; /* tangents of the stages and of X, of every step; NULL until they are asked for */
 } Passage;
 
 EXPORT void passage_free(Passage *p) {
     if (!p) return;
     void *owned[] = {p->row,   p->col,    p->begin,  p->across, p->which, p->first, p->h1,  p->h2,
-                     p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->exchanged, p->work};
+                     p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->exchanged,
+                     p->work,  p->moved};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(p);
 }
@@ -89,7 +94,7 @@ EXPORT Passage *passage_new(int n, int nnz, const int *row, const int *col, int 
     p->across = room(nnz, sizeof(int)), p->which = room(nnz, sizeof(int)), p->swaps = room(steps * n, sizeof(int));
     p->first = room(half, d), p->h1 = room(steps * nnz, d), p->h2 = room(steps * nnz, d);
     p->kicks = room(steps * half, d), p->after = room(steps * half, d), p->factor = room(steps * square, d);
-    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(16 * square, d);
+    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(17 * square + nnz, d);
     p->exchanged = room(2 * n, sizeof(int));
     if (!p->row || !p->col || !p->begin || !p->across || !p->which || !p->swaps || !p->first || !p->h1 || !p->h2 ||
         !p->kicks || !p->after || !p->factor || !p->stage1 || !p->stage2 || !p->work || !p->exchanged) {
@@ -332,6 +337,27 @@ INLINE void at_nonzeros(
     }
 }
 
+/* P += the slopes of one step's result. */
+INLINE void add_seed(int n, const double *RESTRICT seed, double *RESTRICT P) {
+    for (int j = 0, t = 0; j < n; ++j)
+        for (int i = j; i < n; ++i, ++t) {
+            P[i * n + j] += i == j ? seed[t] : 0.5 * seed[t];
+            if (i != j) P[j * n + i] += 0.5 * seed[t];
+        }
+}
+
+/* X^-1 P X^-T, symmetric. */
+INLINE void congruent(Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
+    const double *factor = p->factor + (size_t)k * n * n;
+    const int *swaps = p->swaps + (size_t)k * n;
+    divide(factor, swaps, n, n, P);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) spare[i * n + j] = P[j * n + i];
+    divide(factor, swaps, n, n, spare);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) P[i * n + j] = 0.5 * (spare[i * n + j] + spare[j * n + i]);
+}
+
 /* What follows has the slopes P as a matrix (few = 0) or as M C M' with few columns. */
 typedef struct {
     int few, any;
@@ -377,12 +403,7 @@ INLINE void join(Slopes *s, int n, const double *RESTRICT seed) {
         return;
     }
     if (s->few) write_out(s, n, s->P), s->few = 0;
-    for (int j = 0, t = 0; j < n; ++j)
-        for (int i = j; i < n; ++i, ++t) {
-            const double share = i == j ? seed[t] : 0.5 * seed[t];
-            s->P[i * n + j] += share;
-            if (i != j) s->P[j * n + i] += share;
-        }
+    add_seed(n, seed, s->P);
 }
 
 INLINE void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRICT half) {
@@ -416,19 +437,11 @@ INLINE void back_few(Passage *p, int n, int r, int k, Slopes *s, double *RESTRIC
 
 /* The same with all of P. */
 INLINE void back_all(Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
-    const double *factor = p->factor + (size_t)k * n * n;
-    const int *swaps = p->swaps + (size_t)k * n;
-    double *RESTRICT P = s->P;
-    divide(factor, swaps, n, n, P);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) spare[i * n + j] = P[j * n + i];
-    divide(factor, swaps, n, n, spare);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) P[i * n + j] = 0.5 * (spare[i * n + j] + spare[j * n + i]);
+    congruent(p, n, k, s->P, spare);
     for (int stage = 0; stage < 2; ++stage) {
         const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n;
         if (!(stage ? s2 : s1)) continue;
-        times(Y, P, n, n, spare);
+        times(Y, s->P, n, n, spare);
         at_nonzeros(p, n, n, spare, Y, stage ? s2 : s1);
     }
 }
@@ -458,6 +471,166 @@ INLINE void back(
     if (by_first) pack_slopes(&s, n, spare, by_first);
 }
 
+/* X' M = B solved in place, B (n x n); X' = P' L U. */
+INLINE void divide_transposed(const double *RESTRICT factor, const int *RESTRICT swaps, int n, double *RESTRICT B) {
+    for (int k = 0; k < n; ++k) {
+        if (swaps[k] != k)
+            for (int c = 0; c < n; ++c) {
+                const double kept = B[k * n + c];
+                B[k * n + c] = B[swaps[k] * n + c], B[swaps[k] * n + c] = kept;
+            }
+    }
+    for (int i = 0; i < n; ++i)
+        for (int k = 0; k < i; ++k) {
+            const double share = factor[i * n + k];
+            for (int c = 0; c < n; ++c) B[i * n + c] -= share * B[k * n + c];
+        }
+    for (int i = n - 1; i >= 0; --i) {
+        for (int k = i + 1; k < n; ++k) {
+            const double share = factor[i * n + k];
+            for (int c = 0; c < n; ++c) B[i * n + c] -= share * B[k * n + c];
+        }
+        const double inverse = 1.0 / factor[i * n + i];
+        for (int c = 0; c < n; ++c) B[i * n + c] *= inverse;
+    }
+}
+
+/* product += share H Y of a matrix H by its nonzeros, Y (2n x n). */
+INLINE void add_sparse(
+    const Passage *p, int n, double share, const double *RESTRICT h, const double *RESTRICT Y, double *RESTRICT product
+) {
+    for (int q = 0; q < p->nnz; ++q) {
+        const double weight = share * h[q];
+        double *RESTRICT own = product + p->row[q] * n;
+        const double *RESTRICT other = Y + p->col[q] * n;
+        for (int j = 0; j < n; ++j) own[j] += weight * other[j];
+    }
+}
+
+/* [top; E], top the identity or zero. */
+INLINE void stack(int n, int identity, const double *RESTRICT E, double *RESTRICT Z) {
+    memset(Z, 0, sizeof(double) * n * n);
+    for (int i = 0; identity && i < n; ++i) Z[i * n + i] = 1.0;
+    memcpy(Z + n * n, E, sizeof(double) * n * n);
+}
+
+/* The tangent of one step: dE becomes that after it; those of the stages and of X are kept. */
+INLINE void tangent_step(
+    Passage *p, int n, int k, const double *E, const double *next, const double *d1, const double *d2,
+    double *RESTRICT dE, double *RESTRICT spare
+) {
+    const int m = 2 * n, w = 3 * n;
+    const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
+    const double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n;
+    double *RESTRICT dY1 = p->moved + (size_t)k * 5 * n * n, *RESTRICT dY2 = dY1 + m * n, *RESTRICT dX = dY2 + m * n;
+    double *RESTRICT a = p->work, *RESTRICT Z = spare, *RESTRICT dZ = Z + m * n, *RESTRICT inner = dZ + m * n;
+    double *RESTRICT right = inner + m * n;
+    stack(n, 1, E, Z);
+    stack(n, 0, dE, dZ);
+    memcpy(right, dZ, sizeof(double) * m * n); /* the tangent of (I - g H2) Z0 - A Y1, Y1 held */
+    add_sparse(p, n, -GAP, h2, dZ, right);
+    add_sparse(p, n, -GAP, d2, Z, right);
+    add_sparse(p, n, 0.25, d1, Y1, right);
+    add_sparse(p, n, 0.25, d2, Y1, right);
+    memset(inner, 0, sizeof(double) * m * n);
+    add_sparse(p, n, 1.0, h1, Y1, inner);
+    add_sparse(p, n, -1.0 / 12.0, d2, inner, right);
+    memset(inner, 0, sizeof(double) * m * n);
+    add_sparse(p, n, 1.0, d1, Y1, inner);
+    add_sparse(p, n, -1.0 / 12.0, h2, inner, right);
+    assemble(p, n, k, E, w, a);
+    for (int i = 0; i < m; ++i) memcpy(a + i * w + m, right + i * n, sizeof(double) * n);
+    eliminate(a, m, w, p->exchanged);
+    for (int i = 0; i < m; ++i) memcpy(dY1 + i * n, a + i * w + m, sizeof(double) * n);
+    memcpy(inner, dY1, sizeof(double) * m * n); /* dV = (dY1 - g (dH1 Y1 + H1 dY1) - dZ0)/a */
+    add_sparse(p, n, -GAP, d1, Y1, inner);
+    add_sparse(p, n, -GAP, h1, dY1, inner);
+    for (int i = 0; i < m * n; ++i) inner[i] = (inner[i] - dZ[i]) / SHARE, dY2[i] = dY1[i] + 2.0 * GAP * inner[i];
+    memcpy(dX, inner, sizeof(double) * n * n);
+    for (int i = 0; i < n; ++i) /* dE+ X = dY - E+ dX, transposed */
+        for (int j = 0; j < n; ++j) {
+            double sum = dE[i * n + j] + inner[(n + i) * n + j];
+            for (int c = 0; c < n; ++c) sum -= next[i * n + c] * dX[c * n + j];
+            right[j * n + i] = sum;
+        }
+    divide_transposed(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, right);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) dE[i * n + j] = 0.5 * (right[i * n + j] + right[j * n + i]);
+}
+
+/* Tangents along the passage, of the half-vectors after each step where they are wanted. */
+INLINE void tangents(
+    Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_kicks,
+    double *d_after
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
+    spread(p->first, n, E);
+    spread(d_first, n, dE);
+    for (int k = 0; k < p->count; ++k) {
+        const double *after = p->after + k * half;
+        spread(after, n, next);
+        if (p->known == 2)
+            for (int j = 0, t = 0; j < n; ++j)
+                for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - p->kicks[k * half + t];
+        tangent_step(p, n, k, E, next, d1 + k * nnz, d2 + k * nnz, dE, spare);
+        spread(after, n, E);
+        if (d_kicks)
+            for (int j = 0, t = 0; j < n; ++j)
+                for (int i = j; i < n; ++i, ++t) {
+                    dE[i * n + j] += d_kicks[k * half + t];
+                    if (i != j) dE[j * n + i] += d_kicks[k * half + t];
+                }
+        if (d_after)
+            for (int j = 0, t = 0; j < n; ++j)
+                for (int i = j; i < n; ++i, ++t) d_after[k * half + t] = dE[i * n + j];
+    }
+}
+
+/* How the slopes of `back` move along the tangents. */
+INLINE void back_tangents(
+    Passage *p, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
+    double *d_by_kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    const int m = 2 * n;
+    double *P = p->work, *dP = P + n * n, *K = dP + n * n, *spare = K + n * n, *left = spare + m * n, *other = left + m * n;
+    memset(P, 0, sizeof(double) * 2 * n * n);
+    for (int k = p->count - 1; k >= 0; --k) {
+        const double *moved = p->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
+        add_seed(n, seed + k * half, P);
+        if (d_seed) add_seed(n, d_seed + k * half, dP);
+        Slopes s = {0, 1, dP, NULL, NULL};
+        if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + k * half);
+        congruent(p, n, k, P, spare);
+        congruent(p, n, k, dP, spare);
+        memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
+        divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, n, K);
+        for (int i = 0; i < n; ++i)
+            for (int j = 0; j < n; ++j) {
+                double sum = 0.0;
+                for (int c = 0; c < n; ++c) sum += K[i * n + c] * P[c * n + j];
+                spare[i * n + j] = sum;
+            }
+        for (int i = 0; i < n; ++i)
+            for (int j = 0; j < n; ++j) dP[i * n + j] -= spare[i * n + j] + spare[j * n + i];
+        for (int stage = 0; stage < 2; ++stage) {
+            const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
+            double *out = stage ? d_by_h2 : d_by_h1;
+            if (!out) continue;
+            times(dY, P, n, n, left);
+            times(Y, dP, n, n, spare);
+            for (int i = 0; i < m * n; ++i) left[i] += spare[i];
+            at_nonzeros(p, n, n, left, Y, out + k * nnz);
+            times(Y, P, n, n, left);
+            at_nonzeros(p, n, n, left, dY, other);
+            for (size_t q = 0; q < nnz; ++q) out[k * nnz + q] += other[q];
+        }
+    }
+    Slopes s = {0, 1, dP, NULL, NULL};
+    if (d_by_first) pack_slopes(&s, n, spare, d_by_first);
+}
+
 /* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT VERSIONS void passage_forward(
     Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, double *after
@@ -473,6 +646,24 @@ EXPORT VERSIONS void passage_reverse(
 ) {
     run(p, p->n, first, h1, h2, kicks);
     back(p, p->n, seed, by_first, by_h1, by_h2, by_kicks);
+}
+
+/* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
+ *
+ * Results that are NULL are left out; seed is NULL where no slopes are wanted, tangents of kicks and seeds where they
+ * are zero.
+ */
+EXPORT VERSIONS int passage_tangent(
+    Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, const double *seed,
+    const double *d_first, const double *d_h1, const double *d_h2, const double *d_kicks, const double *d_seed,
+    double *d_after, double *d_by_first, double *d_by_h1, double *d_by_h2, double *d_by_kicks
+) {
+    if (!p->moved) p->moved = room((size_t)p->count * 5 * p->n * p->n, sizeof(double));
+    if (!p->moved) return 1;
+    run(p, p->n, first, h1, h2, kicks);
+    tangents(p, p->n, d_first, d_h1, d_h2, d_kicks, d_after);
+    if (seed) back_tangents(p, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_kicks);
+    return 0;
 }
 
 static struct PyModuleDef definition = {

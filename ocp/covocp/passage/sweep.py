@@ -19,6 +19,7 @@ KEPT_BYTES = 50_000_000
 
 Pattern = tuple[tuple[int, ...], tuple[int, ...]]
 Buffers = tuple[memoryview | None, ...]
+Given = Mapping[str, Any]
 
 
 def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None) -> Any:
@@ -31,7 +32,8 @@ def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None
         kicks: added to the half-vectors as they pass, a column for each step; None: nothing.
 
     Returns:
-        A column for each step; to be differentiated once, by reverse sweeps.
+        A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps),
+        but its sparsity is not seen: no Jacobians of it.
     """
     rows, columns = _pattern(points, size)
     count = points[0].shape[1] // (2 * size)
@@ -108,9 +110,10 @@ class _Sweep(ca.Callback):
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
         self._size = size
         self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
-        steps = count * (5 * size * size + 2 * self.entries + 2 * self.half)
-        self.bytes = 8 * (steps + 16 * size * size)
+        steps = count * (10 * size * size + 2 * self.entries + 2 * self.half)
+        self.bytes = 8 * (steps + 17 * size * size)
         self._reverse: dict[int, _Slopes] = {}
+        self._forward: dict[int, _Tangents] = {}
         self.construct("passage", {})
 
     def new_memory(self) -> int:
@@ -120,6 +123,42 @@ class _Sweep(ca.Callback):
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
+
+    @property
+    def shapes(self) -> list[ca.Sparsity]:
+        """Of the arguments."""
+        return [self.get_sparsity_in(i) for i in range(self.get_n_in())]
+
+    def padded(self, addresses: list[int | None]) -> list[int | None]:
+        """With a place for the kicks, which the library has always."""
+        return addresses if self.kicked else [*addresses, None]
+
+    def direction(self, addresses: list[int | None], k: int) -> list[int | None]:
+        """Where the part of direction k begins, of all arguments."""
+        lengths = (8 * shape.nnz() for shape in self.shapes)
+        return [None if at is None else at + k * length for at, length in zip(addresses, lengths, strict=True)]
+
+    def seed(self, address: int | None, k: int) -> int | None:
+        """The same of results."""
+        return None if address is None else address + 8 * k * self.half * self.count
+
+    def tangent(
+        self,
+        given: list[int | None],
+        seed: int | None,
+        moved: list[int | None],
+        moved_seed: int | None,
+        after: int | None,
+        slopes: list[int | None],
+    ) -> None:
+        """One direction: tangents of the arguments -> of the result, of its slopes, where there is a place for them."""
+        zero = np.zeros(max(self.half, self.entries * self.count))  # what CasADi leaves out is zero
+        moved = [zero.ctypes.data if at is None and i < 3 else at for i, at in enumerate(moved)]
+        memory = _WORKSPACES.take(self)
+        failed = _library()["passage_tangent"](memory, *given, seed, *self.padded(moved), moved_seed, after, *slopes)
+        _WORKSPACES.give(self, memory)
+        if failed:
+            raise MemoryError(f"no memory for the tangents of {self.count} steps")
 
     def get_n_in(self) -> int:
         """Of CasADi."""
@@ -144,9 +183,9 @@ class _Sweep(ca.Callback):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        given = [_address(argument) for argument in arguments]
+        given = self.padded([_address(argument) for argument in arguments])
         memory = _WORKSPACES.take(self)
-        _library()["passage_forward"](memory, *given, *([] if self.kicked else [None]), _address(results[0]))
+        _library()["passage_forward"](memory, *given, _address(results[0]))
         _WORKSPACES.give(self, memory)
         return 0
 
@@ -155,62 +194,134 @@ class _Sweep(ca.Callback):
         return True
 
     def get_reverse(
-        self, nadj: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+        self, nadj: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Given
     ) -> ca.Function:
         """Of CasADi."""
         if nadj not in self._reverse:
             self._reverse[nadj] = _Slopes(self, nadj, name, opts)
         return self._reverse[nadj]
 
+    def has_forward(self, nfwd: int) -> bool:
+        """Of CasADi."""
+        return True
 
-class _Slopes(ca.Callback):
-    """(arguments of a sweep, its result, seeds) -> slopes by the arguments, for some directions side by side."""
+    def get_forward(
+        self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Given
+    ) -> ca.Function:
+        """Of CasADi."""
+        if nfwd not in self._forward:
+            self._forward[nfwd] = _Tangents(self, nfwd, name, opts)
+        return self._forward[nfwd]
 
-    def __init__(self, sweep: _Sweep, directions: int, name: str, options: Mapping[str, Any]) -> None:
+
+class _Derived(ca.Callback):
+    """What the derivatives of a sweep have in common: sparsities that are given, evaluation through buffers."""
+
+    def __init__(self, inputs: list[ca.Sparsity], outputs: list[ca.Sparsity], name: str, options: Given) -> None:
         ca.Callback.__init__(self)
-        self._sweep, self._directions = sweep, directions
-        self.construct(name, options)
+        self._inputs, self._outputs = inputs, outputs
+        self.construct(name, dict(options))
 
     def get_n_in(self) -> int:
         """Of CasADi."""
-        return self._sweep.get_n_in() + 2
+        return len(self._inputs)
 
     def get_n_out(self) -> int:
         """Of CasADi."""
-        return self._sweep.get_n_in()
+        return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         """Of CasADi."""
-        sweep, count = self._sweep, self._sweep.get_n_in()
-        if i < count:
-            return sweep.get_sparsity_in(i)
-        return ca.Sparsity.dense(sweep.half, sweep.count * (1 if i == count else self._directions))
+        return self._inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         """Of CasADi."""
-        return ca.repmat(self._sweep.get_sparsity_in(i), 1, self._directions)
+        return self._outputs[i]
 
     def has_eval_buffer(self) -> bool:
         """Of CasADi."""
         return True
 
+
+class _Slopes(_Derived):
+    """(arguments of a sweep, its result, seeds) -> slopes by the arguments, for some directions side by side."""
+
+    def __init__(self, sweep: _Sweep, directions: int, name: str, options: Given) -> None:
+        self._sweep, self._directions = sweep, directions
+        self._forward: dict[int, _MovedSlopes] = {}
+        result = sweep.get_sparsity_out(0)
+        inputs = [*sweep.shapes, result, ca.repmat(result, 1, directions)]
+        super().__init__(inputs, [ca.repmat(shape, 1, directions) for shape in sweep.shapes], name, options)
+
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         sweep, count = self._sweep, self._sweep.get_n_in()
-        given = [_address(argument) for argument in arguments[:count]]
+        given = sweep.padded([_address(argument) for argument in arguments[:count]])
         seeds, slopes = _address(arguments[count + 1]), [_address(result) for result in results]
-        if not sweep.kicked:
-            given, slopes = [*given, None], [*slopes, None]
-        lengths = [8 * sweep.get_sparsity_in(i).nnz() for i in range(count)]
         memory = _WORKSPACES.take(sweep)
         for k in range(self._directions):
-            own = [
-                None if slope is None else slope + k * length
-                for slope, length in zip(slopes, [*lengths, 0], strict=False)
-            ]
-            seed = None if seeds is None else seeds + 8 * k * sweep.half * sweep.count
-            _library()["passage_reverse"](memory, *given, seed, *own)
+            own = sweep.padded(sweep.direction(slopes, k))
+            _library()["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
         _WORKSPACES.give(sweep, memory)
+        return 0
+
+    def has_forward(self, nfwd: int) -> bool:
+        """Of CasADi."""
+        return True
+
+    def get_forward(
+        self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Given
+    ) -> ca.Function:
+        """Of CasADi."""
+        if nfwd not in self._forward:
+            self._forward[nfwd] = _MovedSlopes(self._sweep, self._directions, nfwd, name, opts)
+        return self._forward[nfwd]
+
+
+class _Tangents(_Derived):
+    """(arguments of a sweep, its result, tangents of the arguments) -> tangents of the result, side by side."""
+
+    def __init__(self, sweep: _Sweep, tangents: int, name: str, options: Given) -> None:
+        self._sweep, self._tangents = sweep, tangents
+        result = sweep.get_sparsity_out(0)
+        inputs = [*sweep.shapes, result, *(ca.repmat(shape, 1, tangents) for shape in sweep.shapes)]
+        super().__init__(inputs, [ca.repmat(result, 1, tangents)], name, options)
+
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
+        """Of CasADi."""
+        sweep, count = self._sweep, self._sweep.get_n_in()
+        given = sweep.padded([_address(argument) for argument in arguments[:count]])
+        moved = [_address(argument) for argument in arguments[count + 1 :]]
+        for k in range(self._tangents):
+            after = sweep.seed(_address(results[0]), k)
+            sweep.tangent(given, None, sweep.direction(moved, k), None, after, [None] * 4)
+        return 0
+
+
+class _MovedSlopes(_Derived):
+    """Tangents of `_Slopes`: (its arguments, its results, tangents of its arguments) -> tangents of its results."""
+
+    def __init__(self, sweep: _Sweep, directions: int, tangents: int, name: str, options: Given) -> None:
+        self._sweep, self._directions, self._tangents = sweep, directions, tangents
+        result = sweep.get_sparsity_out(0)
+        of = [*sweep.shapes, result, ca.repmat(result, 1, directions)]
+        slopes = [ca.repmat(shape, 1, directions) for shape in sweep.shapes]
+        moved = [[ca.repmat(shape, 1, tangents) for shape in shapes] for shapes in (of, slopes)]
+        super().__init__([*of, *slopes, *moved[0]], moved[1], name, options)
+
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
+        """Of CasADi."""
+        sweep, count = self._sweep, self._sweep.get_n_in()
+        given = sweep.padded([_address(argument) for argument in arguments[:count]])
+        seeds = _address(arguments[count + 1])
+        moved = [_address(argument) for argument in arguments[2 * count + 2 : 3 * count + 2]]
+        moved_seeds, slopes = _address(arguments[-1]), [_address(result) for result in results]
+        for t in range(self._tangents):
+            along = sweep.direction(moved, t)
+            for k in range(self._directions):
+                place = t * self._directions + k
+                own = sweep.padded(sweep.direction(slopes, place))
+                sweep.tangent(given, sweep.seed(seeds, k), along, sweep.seed(moved_seeds, place), None, own)
         return 0
 
 

@@ -40,8 +40,8 @@ from covocp.transcription.steps import (
 # Steps that a sequence of numbers takes at a time.
 NUMERIC_RUN = 10
 
-# How eliminated matrices pass: by CasADi's operations; where the steps allow it in compiled code, which has slopes of
-# first order by reverse sweeps only; or something that depends on what they depend on.
+# How eliminated matrices pass: by CasADi's operations; where the steps allow it in compiled code, of which CasADi sees
+# no sparsity (slopes along directions, no Jacobians); or something that depends on what they depend on.
 Passage = Literal["plain", "compiled", "dependence"]
 
 # (value, arguments, count) -> what a sequence of steps gives, a column for each step.
