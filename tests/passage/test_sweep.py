@@ -179,6 +179,42 @@ def test_slopes_against_finite_differences(n):
         assert slope == pytest.approx(difference, rel=1e-7, abs=1e-7 * abs(float(f(*given)[0])))
 
 
+@pytest.mark.parametrize("kicked", [False, True])
+@pytest.mark.parametrize("n", [1, 2, 5, 12])
+def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked):
+    """Along directions of the form of H, Q and W symmetric."""
+    rng = np.random.default_rng(n)
+    E, h1, h2 = systems(n, n)
+    shape = (half_length(n), STEPS)
+    weights, moved = rng.normal(size=shape), systems(n, n + 100)[1:]
+    directions = [rng.normal(size=shape[0]), *moved, rng.normal(size=shape)][: 4 if kicked else 3]
+    given = [pack(E), h1, h2, 1e-3 * rng.normal(size=shape)][: len(directions)]
+    arguments, passed = node(n, kicked=kicked)
+    found = []
+    for result in (passed, by_casadi(n, arguments)):
+        value = ca.dot(weights, result) + ca.sumsqr(result) / 2
+        slopes = ca.Function("slopes", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
+        t = ca.MX.sym("t")
+        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
+        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
+        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+    for own, other in zip(*found, strict=True):
+        assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
+
+
+def test_tangents_of_several_entries_at_once():
+    """Jacobian times directions, several of both: every entry of the last covariance by E(0)."""
+    n = 3
+    E, h1, h2 = systems(n, 1)
+    arguments, passed = node(n)
+    unit = ca.DM.eye(half_length(n))
+    forward = ca.jtimes(passed[:, -1], arguments[0], unit)
+    backward = ca.jtimes(passed[:, -1], arguments[0], unit, True).T
+    function = ca.Function("f", arguments, [forward, backward])
+    one, other = (np.asarray(v.full()) for v in function(pack(E), h1, h2))
+    np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14)
+
+
 def test_several_directions_at_once():
     n = 3
     E, h1, h2 = systems(n, 0)
