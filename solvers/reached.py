@@ -28,6 +28,9 @@ Evaluated = tuple[Trajectories, dict[str, Any]]
 # Magnitudes of each part of a program.
 Magnitudes = tuple[Scales, ...]
 
+# Ipopt's word for a point that does not meet its tolerance.
+ACCEPTABLE = "Solved_To_Acceptable_Level"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
@@ -191,7 +194,10 @@ def residuals(
     size = sum(abs(costs["running"]) + abs(costs["terminal"]) for costs in values["parts"])
     if not np.isfinite([slope, rest, missed, worst, size]).all():
         return Residuals(slope=np.inf, complementarity=np.inf, infeasibility=np.inf, violation=np.inf)
-    if not bound and max(slope, rest, missed) > LIMIT * size:
+    met = (
+        point.status != ACCEPTABLE
+    )  # where not even its own tolerance is, an unstable plant makes any change look large
+    if met and not bound and max(slope, rest, missed) > LIMIT * size:
         size = max(size, VANISHING * _change(first, point.w, by_w, nlp.units(scales), parameters))
     size = max(size, float(np.finfo(float).tiny))
     return Residuals(slope=slope / size, complementarity=rest / size, infeasibility=missed / size, violation=worst)
