@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.costates import discrete_costates, terminal_costates
+from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
 from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
@@ -68,6 +68,8 @@ class Within:
         by_duration: slope of what the later statements cost by the duration, through the link.
         end: slopes of what the later ones cost by the state at the end, (nx,).
         end_matrices: by the half-vectors there, (ne,).
+        deviations: [E Z; Z' Xhat] of the closed loop at the start, (2n, 2n); empty without one.
+        handed: 1/2 tr S Xhat there, less that where the next one starts: what the statement's form of the cost lacks.
     """
 
     others: float
@@ -76,6 +78,8 @@ class Within:
     by_duration: float
     end: Annotated[Array, "x"]
     end_matrices: Annotated[Array, "e"]
+    deviations: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    handed: float = 0.0
 
     __repr__ = short_repr
 
@@ -110,9 +114,10 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         links: of the chain.
     """
     sizes = [sum(abs(value) for value in terms.values()) for terms in outcome.cost_terms]
+    extremals = _with_weights(outcome.extremals, links)
     result: list[Passed] = []
-    for i in range(len(outcome.extremals) - 1, -1, -1):
-        extremal = outcome.extremals[i]
+    for i in range(len(extremals) - 1, -1, -1):
+        extremal = extremals[i]
         st = extremal.statement
         slopes = LinkSlopes(state=np.zeros(st.nx), matrices=np.zeros(st.ne), duration=0.0)
         if result:
@@ -136,6 +141,20 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         )
         result.append(Passed(extremal=extremal, costates=discrete_costates(extremal)[0], within=within))
     return tuple(result[::-1])
+
+
+def _with_weights(extremals: tuple[Extremal, ...], links: tuple[Link, ...]) -> list[Extremal]:
+    """The extremals with the slopes of what earlier ones cost by what runs backward, from the first to the last."""
+    result: list[Extremal] = []
+    for i, extremal in enumerate(extremals):
+        if i and links[i - 1].weights:
+            before, link = result[-1], links[i - 1]
+            ended = discrete_costates(before)[0].matrices[-1, before.statement.entries(before.statement.behind)]
+            matrices = extremal.multipliers.matrices.copy()
+            matrices[0, list(link.behind)] = passage_end(before, ended)[2][list(link.weights)]
+            extremal = replace(extremal, multipliers=replace(extremal.multipliers, matrices=matrices))
+        result.append(without_passage(extremal))
+    return result
 
 
 def link_slopes(link: Link, before: Extremal, after: Extremal, costates: Costates) -> LinkSlopes:

@@ -56,7 +56,8 @@ class NLP:
     """A transcribed problem: minimise f(w, p) subject to bounds on w and g(w, p); everything scaled.
 
     `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
-    nodes (columns), the terminal time, running cost, terminal cost and g.
+    nodes (columns), the terminal time, running cost, terminal cost and g. `backward` maps them to the half-vectors at
+    the start of the matrices that run backward; None where none does.
     """
 
     statement: Statement
@@ -69,6 +70,7 @@ class NLP:
     rows: tuple[Rows, ...]
     jacobian: ca.Function | None
     evaluate: ca.Function
+    backward: ca.Function | None = None
 
     __repr__ = short_repr
 

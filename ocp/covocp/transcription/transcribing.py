@@ -14,7 +14,7 @@ from covocp.base.matrices import Array
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import interval_columns, shoot
+from covocp.transcription.shooting import backward_at_start, interval_columns, shoot
 
 
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
@@ -48,7 +48,19 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
         rows=rows,
         jacobian=_split_jacobian(variables, rows, g),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
+        backward=_backward(statement, mesh, variables, p),
     )
+
+
+def _backward(statement: Statement, mesh: Mesh, variables: _Variables, p: Expr) -> ca.Function | None:
+    """(w, p) -> half-vectors at the start of the matrices that run backward; None where none does."""
+    if not statement.behind:
+        return None
+    if mesh.eliminated:
+        start = backward_at_start(statement, mesh, variables)
+    else:
+        start = variables.e[statement.entries(statement.behind), 0]
+    return ca.Function("backward", [variables.w, p], [start])
 
 
 class _Variables:
