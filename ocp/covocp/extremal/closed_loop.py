@@ -96,9 +96,7 @@ class ClosedLoop:
         return float(sum(self.cost.values()))
 
 
-def close_loop(
-    extremal: Extremal, truth: Statistics | None = None, start: Array | None = None
-) -> ClosedLoop | None:
+def close_loop(extremal: Extremal, truth: Statistics | None = None, start: Array | None = None) -> ClosedLoop | None:
     """Propagate the covariances of the loop along a solution.
 
     Args:
@@ -160,9 +158,7 @@ def covariances_along(extremal: Extremal, fine: Array, start: Array | None = Non
     return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
 
 
-def _joint_covariances(
-    extremal: Extremal, fine: Array, statistics: Statistics, start: Array | None
-) -> Array:
+def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, start: Array | None) -> Array:
     """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
     st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
     size = len(st.augmented)

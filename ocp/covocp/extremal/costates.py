@@ -414,7 +414,9 @@ def given_costates(
     if not rows:
         return np.zeros((n, points, 0)), np.zeros(0)
     sweep = forward_costates(statement, pairs).mapaccum("forward", n)
-    ends, inside = sweep(np.zeros(rows) if first is None else first, values.transpose(2, 0, 1).reshape(size, -1), *common)
+    ends, inside = sweep(
+        np.zeros(rows) if first is None else first, values.transpose(2, 0, 1).reshape(size, -1), *common
+    )
     at_points = np.asarray(inside.full()).reshape(rows, n, points).transpose(1, 2, 0)
     return at_points, np.asarray(ends.full())[:, -1]
 

@@ -63,9 +63,7 @@ def noted(effect: MeanEffect | None) -> dict[str, Any]:
     return {} if effect is None else {NOTE + f.name: getattr(effect, f.name) for f in fields(MeanEffect)}
 
 
-def mean_effect(
-    extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array] | None = None
-) -> MeanEffect | None:
+def mean_effect(extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array] | None = None) -> MeanEffect | None:
     """The effect of the rates' and measurements' curvature along a solution.
 
     None where rates contain a matrix, where the loop leaves the range of numbers or a step cannot be solved. `start` is

@@ -37,7 +37,7 @@ class PhaseLoop:
 def phase_loops(extremals: Sequence[Extremal], links: Sequence[Link]) -> tuple[PhaseLoop, ...]:
     """The loops of all phases along their extremals."""
     first = design_statistics(extremals[0]).initial
-    start = np.kron(np.diag([1.0, 0.0]), first)
+    start: Array = np.asarray(np.kron(np.diag([1.0, 0.0]), first), dtype=float)
     means: tuple[Array, Array] | None = (np.zeros(first.shape[0]), np.zeros(first.shape[0]))
     result: list[PhaseLoop] = []
     for k, extremal in enumerate(extremals):

@@ -30,7 +30,8 @@ def expand(problem: Declarations, expected: Expected, later: Expr = None) -> Exp
     by_state = slope_by(running, at.by).T
     at_end = slope_by(terminal, at.by).T
     weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
-    end = at.at_rest(slope_by(at_end, at.by)) + (0 if weight is None else weight)
+    end = at.at_rest(slope_by(at_end, at.by))
+    end = end if weight is None else end + weight  # a zero that is added to an empty matrix of one row fills it
     _check_terminal_weights(problem, end if later is None else end + later)
     return Expansion(
         F=_drift(problem, at, rates),

@@ -95,10 +95,11 @@ def _refuse(what: str, expected: str, received: str, remedy: str) -> NoReturn:
 def _followed(before: Declarations, after: Declarations, jumps: Jumps) -> tuple[Declarations, Any]:
     """A phase with S of the next one as a parameter, and J' S J of it: what deviations at its end cost later."""
     size = sum(error_size(entry) for entry in after.augmented)
-    own = {"name": WEIGHT, "size": half_length(size), "where": "minimize_expected()", "unit": ""}
-    symbol = ca.MX.sym(WEIGHT, own["size"])
+    count = half_length(size)
+    symbol = ca.MX.sym(WEIGHT, count)
     J = tangent(before, after, jumps)[1]
-    weight = Parameter(**own, symbol=symbol, value=np.zeros(own["size"]))  # type: ignore[arg-type]
+    where, value = "minimize_expected()", np.zeros(count)
+    weight = Parameter(name=WEIGHT, symbol=symbol, size=count, where=where, unit="", value=value)
     return before.adding(parameters=weight), J.T @ unpack_symbolic(symbol, size) @ J
 
 

@@ -26,11 +26,11 @@ from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.links import Within
 from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
-from covocp.extremal.phase_loops import PhaseLoop
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.extremal.phase_loops import PhaseLoop
 from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
@@ -101,7 +101,7 @@ class Solution:
 
     @staticmethod
     def of(outcome: Outcome, method: str, within: Within | None = None, closed: PhaseLoop | None = None) -> Solution:
-        """The solution of an outcome, with the estimate of its mesh error; `closed` is the loop of one of several phases."""
+        """The solution of an outcome, with the estimate of its mesh error; `closed`: its loop, of one of several phases."""
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
         loop = None if closed is None else closed.loop

@@ -152,7 +152,7 @@ def passages(
     kicks: Expr = None,
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
-    n, m = mesh.intervals, mesh.substeps
+    n = mesh.intervals
     e0 = statement.started(x[:, 0], parameters)[1] if e0 is None else e0
     starts = x[:, :n]
     if mesh.step == "rk4" and not statement.behind:
