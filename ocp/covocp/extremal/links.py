@@ -20,9 +20,6 @@ from covocp.statement.chain import Link
 from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.steps import KEPT
 
-# Distance from a bound, relative to the largest magnitude of a state, below which it holds the state.
-AT_BOUND = 1e-4
-
 
 @dataclass(frozen=True, kw_only=True)
 class ChainOutcome:
@@ -34,6 +31,7 @@ class ChainOutcome:
     Attributes:
         extremals: the last iterate.
         link_multipliers: of the states that each link gives.
+        bounds_at_ends: multipliers of the bounds on the states where each statement begins and ends, (nx,) each.
         cost_terms: terminal and running cost of each.
         converged: whether the method's own test was met.
         message: how it ended, a sentence.
@@ -43,6 +41,7 @@ class ChainOutcome:
 
     extremals: tuple[Extremal, ...]
     link_multipliers: tuple[Array, ...]
+    bounds_at_ends: tuple[tuple[Array, Array], ...]
     cost_terms: tuple[Mapping[str, float], ...]
     converged: bool
     message: str
@@ -86,11 +85,12 @@ class Within:
 
 @dataclass(frozen=True, kw_only=True)
 class Passed:
-    """An extremal of a chain with its costates, and what the rest of the chain says of it."""
+    """An extremal of a chain with its costates, what the rest of the chain says of it, and what bounds do at its ends."""
 
     extremal: Extremal
     costates: Costates
     within: Within
+    bounds: tuple[Array, Array]
 
     __repr__ = short_repr
 
@@ -122,7 +122,7 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         slopes = LinkSlopes(state=np.zeros(st.nx), matrices=np.zeros(st.ne), duration=0.0)
         if result:
             later = result[-1]
-            slopes = link_slopes(links[i], extremal, later.extremal, later.costates)
+            slopes = link_slopes(links[i], extremal, later)
             if extremal.mesh.eliminated and st.matrices:
                 m = extremal.multipliers
                 through = replace(m, final_matrices=m.final_matrices + slopes.matrices)
@@ -139,7 +139,8 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
             end=slopes.state,
             end_matrices=slopes.matrices,
         )
-        result.append(Passed(extremal=extremal, costates=discrete_costates(extremal)[0], within=within))
+        costates = discrete_costates(extremal)[0]
+        result.append(Passed(extremal=extremal, costates=costates, within=within, bounds=outcome.bounds_at_ends[i]))
     return tuple(result[::-1])
 
 
@@ -157,20 +158,21 @@ def _with_weights(extremals: tuple[Extremal, ...], links: tuple[Link, ...]) -> l
     return result
 
 
-def link_slopes(link: Link, before: Extremal, after: Extremal, costates: Costates) -> LinkSlopes:
+def link_slopes(link: Link, before: Extremal, after: Passed) -> LinkSlopes:
     """Slopes of what the later statements cost by what the statement before a link ends with.
 
-    For a jump x+ = J(x) these are J_x' p+, and for its covariance E+ = J_x E J_x' + N the slopes of tr(P+ E+).
+    For a jump x+ = J(x) these are J_x' (p+ + mu+), mu+ the multipliers of bounds that x+ is at, and for its covariance
+    E+ = J_x E J_x' + N the slopes of tr(P+ E+).
 
     Args:
         link: between both.
         before: the extremal that ends there.
-        after: the extremal that begins there.
-        costates: of the latter.
+        after: what begins there.
     """
-    by_x, by_e = slopes_at_start(after, costates)
+    by_x, by_e = slopes_at_start(after.extremal, after.costates)
+    by_x = by_x + after.bounds[0]
     t = before.trajectory
-    ends = (t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters)
+    ends = (t.x[-1], t.e[-1], t.duration, before.parameters, after.extremal.parameters)
     values = _slopes(link)(*ends, by_x[list(link.states)], by_e[list(link.matrices)])
     state, matrices, duration = (np.asarray(v.full()).ravel() for v in values)
     return LinkSlopes(state=state, matrices=matrices, duration=float(duration[0]))
@@ -201,9 +203,10 @@ def _slopes(link: Link) -> ca.Function:
 
 
 def link_residual(before: Passed, after: Passed, link: Link) -> float:
-    """Largest difference of p(T) and k_x + J_x' p+ at a link, and of p+ and zero where a state starts free.
+    """Largest difference of p(T) and k_x + mu + J_x' (p+ + mu+) at a link, of p+ + mu+ and zero where a state is free.
 
-    Of states that are neither prescribed nor held by a bound there; relative to the largest costate on both sides.
+    mu and mu+ are the multipliers of bounds that act there, which may hold a state on either side of the link. Of
+    states that are not prescribed; relative to the largest costate on both sides.
 
     Args:
         before: what ends there.
@@ -215,8 +218,8 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     own = terminal_slopes(
         first.statement, first.trajectory, first.parameters, first.multipliers.end, first.multipliers.path[-1]
     )[0]
-    missed = (end - own - before.within.end)[_loose(first, -1)]
-    start = slopes_at_start(second, after.costates)[0]
+    missed = (end - own - before.within.end - before.bounds[1])[_loose(first, -1)]
+    start = slopes_at_start(second, after.costates)[0] + after.bounds[0]
     given = np.isin(np.arange(start.size), link.states)
     free = _loose(second, 0) & ~given
     missed = np.concatenate([missed, start[free], (start + after.within.start)[given & _loose(second, 0)]])
@@ -225,10 +228,8 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
 
 
 def _loose(extremal: Extremal, node: int) -> Any:
-    """Entries of the state at the first or last node that are neither prescribed nor at a bound."""
-    st, x = extremal.statement, extremal.trajectory.x
+    """Entries of the state at the first or last node that are not prescribed, there or by equal bounds."""
+    st = extremal.statement
     lower, upper = st.state_bounds
     known = st.boundary_values(extremal.parameters)[0 if node == 0 else 1]
-    size = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
-    inside = np.minimum(x[node] - lower, upper - x[node]) > AT_BOUND * size
-    return np.isnan(known) & inside
+    return np.isnan(known) & (lower < upper)

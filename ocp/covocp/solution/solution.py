@@ -101,7 +101,7 @@ class Solution:
 
     @staticmethod
     def of(outcome: Outcome, method: str, within: Within | None = None, closed: PhaseLoop | None = None) -> Solution:
-        """The solution of an outcome, with the estimate of its mesh error; `closed`: its loop, of one of several phases."""
+        """The solution of an outcome, with the estimate of its mesh error; `closed`: its loop, of a phase."""
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
         loop = None if closed is None else closed.loop

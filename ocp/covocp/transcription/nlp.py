@@ -201,6 +201,15 @@ class NLP:
             inside_states=inside_states,
         )
 
+    def bounds_at_ends(self, lam_x: Array) -> tuple[Array, Array]:
+        """Multipliers of the bounds on the states at the first and at the last node, (nx,) each.
+
+        Without those of decisions, which are among the multipliers of states (`unpack_multipliers`).
+        """
+        states = self._split(lam_x)["x"] / self.scales.x
+        states[:, self.statement.decisions] = 0.0
+        return states[0], states[-1]
+
     def _acting(self, controls: Array) -> Array:
         """Multipliers of the control bounds, none where another control acts."""
         controls[self.mesh.idle] = 0.0

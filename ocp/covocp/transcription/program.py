@@ -178,6 +178,10 @@ class Program:
             offset += sum(len(entries) for entries in _linked(link, part).values())
         return tuple(result)
 
+    def bounds_at_ends(self, lam_x: Array) -> tuple[tuple[Array, Array], ...]:
+        """Multipliers of the bounds on the states where each part begins and ends (for a cost scale of 1)."""
+        return tuple(part.bounds_at_ends(lam_x[span]) for part, span in zip(self.parts, self._spans(), strict=True))
+
     def units(self, scales: tuple[Scales, ...]) -> Array:
         """Other magnitudes of the variables, in the units of this program, an entry for each variable."""
         return np.concatenate([part.units(own) for part, own in zip(self.parts, scales, strict=True)])
