@@ -85,7 +85,7 @@ class Within:
 
 @dataclass(frozen=True, kw_only=True)
 class Passed:
-    """An extremal of a chain with its costates, what the rest of the chain says of it, and what bounds do at its ends."""
+    """An extremal of a chain with its costates, what the rest of the chain says of it, what bounds do at its ends."""
 
     extremal: Extremal
     costates: Costates
