@@ -131,7 +131,7 @@ class Space(Unknowns):
 
     def first(self, guess: Guess) -> Iterate:
         """The iterate of a guess: its controls, terminal time and free initial values."""
-        return self.at(_point(self, guess.trajectory))
+        return self.at(point_of(self, guess.trajectory))
 
     def with_weights(self, weights: Weights) -> Space:
         """The same with other penalties."""
@@ -332,7 +332,7 @@ class Space(Unknowns):
         return dict(sorted(result.items(), key=lambda entry: -entry[1]))
 
 
-def _point(space: Space, trajectory: Trajectory) -> Array:
+def point_of(space: Space, trajectory: Trajectory) -> Array:
     """The point of a trajectory."""
     duration = [trajectory.duration] if space.sweeps.statement.duration.free else []
     start = np.concatenate([trajectory.x[0], trajectory.e[0]])
