@@ -2,8 +2,9 @@
 
 At a link z+(0) = J(z(T), T). The costates of the cost, and the influence functions of the conditions of all phases that
 follow, go on as J_z' p+; by T the slope J_T' p+ is added. So each phase has, beside those of its own conditions, an
-influence function for every condition behind it. A step moves the controls, free durations and free initial values of
-all phases at once.
+influence function for every condition behind it. In a closed loop S runs backward through all phases once x and E are
+known, and its costate Y forward from the first to the last, before p and P. A step moves the controls, free durations
+and free initial values of all phases at once.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.descent import Step
-from covocp.solvers.gradient.influence import Later, Run
+from covocp.solvers.gradient.influence import Later, Run, given_at_end
 from covocp.solvers.gradient.iterate import Space
 from covocp.solvers.gradient.penalty import Group, Indices, Penalty, Weights
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
 from covocp.solvers.gradient.unknowns import Unknowns, of_part
 from covocp.statement.chain import Link
+from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
 from covocp.transcription.trajectory import Multipliers
 
@@ -159,6 +161,13 @@ class ChainSpace(Unknowns):
                 part = started(part, self.links[i - 1], spaces[-1], found[-1].run)
             spaces.append(part)
             found.append(part.at(point[span]))
+        for i in range(len(self.links) - 1, -1, -1):  # S runs backward along what was found
+            link = self.links[i]
+            if link.weights:
+                nx = spaces[i + 1].sweeps.statement.nx
+                weight = found[i + 1].run.z[0, [nx + k for k in link.behind]]
+                spaces[i] = replace(spaces[i], parameters=link.weighed(spaces[i].parameters, weight))
+                found[i] = spaces[i].at(point[self.spans[i]])
         runs = [entry.run for entry in found]
         joined = Run(
             u=np.zeros((0, 0)),
@@ -176,9 +185,10 @@ class ChainSpace(Unknowns):
         assert isinstance(iterate, ChainIterate)
         parts: list[Linear] = []
         later: list[Later | None] = [None]
+        firsts = self._firsts(iterate)
         for i in range(len(self.parts) - 1, -1, -1):
             space, own = iterate.spaces[i], iterate.parts[i]
-            parts.insert(0, space.linearise(own, later[0]))
+            parts.insert(0, space.linearise(own, later[0], firsts[i]))
             if i:
                 link, before = self.links[i - 1], iterate.parts[i - 1].run
                 weights = _by_given(space, link, own.run, parts[0])
@@ -190,6 +200,20 @@ class ChainSpace(Unknowns):
         return ChainLinear(
             slope=slope, rows=rows, sizes=sizes, slopes=parts[0].slopes, parts=tuple(parts), later=tuple(later)
         )
+
+    def _firsts(self, iterate: ChainIterate) -> list[Array | None]:
+        """What the costates Y of S begin with in each phase: slopes of Y' S(T) before the link by S behind it."""
+        result: list[Array | None] = [None]
+        for i, link in enumerate(self.links):
+            space, run = iterate.spaces[i], iterate.parts[i].run
+            if not link.weights:
+                result.append(None)
+                continue
+            ended = given_at_end(space.sweeps, run, space.parameters, result[-1])
+            x = run.z[-1, : space.sweeps.statement.nx]
+            slopes = _weight_slopes(link, space.sweeps.statement)(x, run.duration, space.parameters, ended)
+            result.append(np.asarray(slopes.full()).ravel())
+        return result
 
     def cost_size(self, iterate: Iterate) -> float:
         """Sum of the absolute terms of the cost of all phases."""
@@ -306,6 +330,16 @@ def _jacobians(link: Link) -> ca.Function:
     given = ca.vertcat(*link.function.call(inputs, True, False))
     by_z = ca.horzcat(ca.jacobian(given, inputs[0]), ca.jacobian(given, inputs[1]))
     return ca.Function("jacobians", inputs, [ca.densify(by_z), ca.densify(ca.jacobian(given, inputs[2]))])
+
+
+@lru_cache(maxsize=KEPT)
+def _weight_slopes(link: Link, before: Statement) -> ca.Function:
+    """(x(T), T, parameters, Y(T)) -> slopes of Y' S(T) by S where the next phase begins."""
+    assert before.matrix_end is not None
+    x, duration, p = ca.MX.sym("x", before.nx), ca.MX.sym("T"), ca.MX.sym("p", before.np)
+    y = ca.MX.sym("y", len(before.entries(before.behind)))
+    slope = ca.gradient(ca.dot(y, before.matrix_end(x, duration, p)), p)
+    return ca.Function("weight_slopes", [x, duration, p, y], [ca.densify(slope[list(link.weights)])])
 
 
 def _together(penalties: list[Penalty]) -> Penalty:

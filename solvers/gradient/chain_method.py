@@ -31,7 +31,7 @@ def check_phases(chain: Chain, settings: Settings) -> None:
     """What the method does not do for phases, by name.
 
     Raises:
-        ProblemError: expected costs, bounds of states and inequalities, the chord variant, a metric that is an array.
+        ProblemError: bounds of states and inequalities, the chord variant, a metric that is an array.
     """
     for st in chain.statements:
         bounded = [f"bounds of {st.state_names[i]}" for i in st.bounded_states]
@@ -39,12 +39,12 @@ def check_phases(chain: Chain, settings: Settings) -> None:
         limited += [n for n, a, b in zip(st.end.names, st.end.lower, st.end.upper, strict=True) if a != b]
         if st.tied is not None:
             limited = [name for name in limited if name not in st.start.names[st.start.size - len(st.tied.states) :]]
-        if st.loop is not None or limited:
+        if limited:
             raise ProblemError(
                 f"The gradient method does not solve the phase '{st.name}'.",
-                expected="phases with minimize(), bounds of controls, durations and decisions, and equalities at the "
-                "end; no inequalities of states or covariances",
-                received="minimize_expected()" if st.loop is not None else ", ".join(limited),
+                expected="phases with bounds of controls, durations and decisions, and equalities at the end; no "
+                "inequalities of states or covariances",
+                received=", ".join(limited),
                 remedy="use method='ipopt'",
             )
     for link, before, after in zip(chain.links, chain.statements[:-1], chain.statements[1:], strict=True):
@@ -149,8 +149,8 @@ class GradientChainSolver:
             further, by_matrices = 0, False
             for st, mesh, pairs in reversed(list(zip(statements, self._meshes, self._pairs, strict=True))):
                 self._sweeps.insert(0, build_sweeps(st, mesh, pairs, further, by_matrices=by_matrices))
-                own = terminal_conditions(st)
-                further, by_matrices = further + len(own.names), by_matrices or own.matrices
+                end = terminal_conditions(st)
+                further, by_matrices = further + len(end.names), by_matrices or end.matrices
         parts: list[Space] = []
         for i, (sweeps, own, guess) in enumerate(zip(self._sweeps, parameters, guesses, strict=True)):
             st = sweeps.statement

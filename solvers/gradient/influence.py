@@ -353,7 +353,14 @@ class Later(NamedTuple):
     duration: Array
 
 
-def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array, later: Later | None = None) -> Slopes:
+def sweep_backward(
+    sweeps: Sweeps,
+    run: Run,
+    parameters: Array,
+    jumps: Array,
+    later: Later | None = None,
+    first: Array | None = None,
+) -> Slopes:
     """Integrate Y forward, p, P and R backward, and form the integrals of h_u and H_u (steps 3 to 6).
 
     Args:
@@ -362,13 +369,13 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array, la
         parameters: of the statement.
         jumps: of the costates at the nodes (N + 1, size), from the penalties; the last is added to the terminal value.
         later: of the phases that follow, where the sweeps were built for some.
+        first: Y at the start, where a phase goes before; None: zero.
     """
     mesh, pairs = sweeps.mesh, sweeps.pairs
     n, size = mesh.intervals, run.z.shape[1]
-    common = interval_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
-    points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+    common, points = _points(sweeps, run, parameters)
     z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
-    given, given_end = _given(sweeps, points, common)
+    given, given_end = _given(sweeps, points, common, first)
     _, _, last, by_duration = (
         np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters, given_end)
     )
@@ -389,12 +396,24 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array, la
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
-def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...]) -> tuple[Array, Array]:
+def _points(sweeps: Sweeps, run: Run, parameters: Array) -> tuple[Interval, Any]:
+    """The intervals of a run, and z at the starts, middles and ends of their pairs."""
+    common = interval_columns(sweeps.mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
+    return common, sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+
+
+def given_at_end(sweeps: Sweeps, run: Run, parameters: Array, first: Array | None) -> Array:
+    """Y at T, (rows,), from what it begins with."""
+    common, points = _points(sweeps, run, parameters)
+    return _given(sweeps, points, common, first)[1]
+
+
+def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...], first: Array | None) -> tuple[Array, Array]:
     """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
     shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
     if sweeps.given is None:
         return np.zeros(shape), np.zeros(0)
-    ends, inside = sweeps.given(np.zeros(shape[2]), points, *common)
+    ends, inside = sweeps.given(np.zeros(shape[2]) if first is None else first, points, *common)
     return np.asarray(inside.full()).T.reshape(shape), np.asarray(ends.full())[:, -1]
 
 

@@ -137,9 +137,15 @@ class Space(Unknowns):
         """The same with other penalties."""
         return replace(self, weights=weights)
 
-    def linearise(self, iterate: Iterate, later: Later | None = None) -> Linear:
-        """Backward sweep at an iterate; `later`: what phases that follow say of its end."""
-        slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps, later)
+    def linearise(self, iterate: Iterate, later: Later | None = None, first: Array | None = None) -> Linear:
+        """Backward sweep at an iterate.
+
+        Args:
+            iterate: where.
+            later: what phases that follow say of its end.
+            first: what Y begins with where a phase goes before.
+        """
+        slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps, later, first)
         return self._linear(iterate.penalty, slopes, iterate.run.z[0, : self.sweeps.statement.nx])
 
     def _linear(self, penalty: Penalty, slopes: Slopes, start_state: Array) -> Linear:

@@ -140,7 +140,9 @@ def test_jumps_that_do_not_fit_are_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"method": "gradient"}, "Phases are not solved that way"),
+        ({"method": "gradient", "variant": "chord"}, "'variant' of the gradient method does not apply to phases"),
+        ({"method": "gradient", "weight": [1.0]}, "'weight' of the gradient method does not apply to phases"),
+        ({"method": "gradient", "covariances": "states"}, "'covariances' of the gradient method"),
         ({"nominal": "deterministic"}, "Phases are not solved that way"),
         ({"guess": "multistart"}, "Phases are not solved that way"),
         ({"guess": [None]}, "does not fit the phases"),
