@@ -104,3 +104,19 @@ def test_what_the_method_does_not_do_for_phases_is_refused() -> None:
     unreachable = co.Phases([limited("one"), limited("two")])
     with pytest.raises(co.ProblemError, match="not solved that way"):
         co.solve(unreachable, method="gradient", nominal="deterministic", **QUIET)
+
+
+def test_a_comparison_of_phases_is_a_table_of_both_methods() -> None:
+    table = co.compare(_parts(), intervals=[6, 8, 10], **QUIET)
+    assert table.converged
+    assert table["gradient"].cost == pytest.approx(table["ipopt"].cost, rel=1e-7)
+    assert [phase.mesh.intervals for phase in table["gradient"]] == [6, 8, 10]
+    text = str(table)
+    assert "gradient" in text
+    assert "ipopt" in text
+    with pytest.raises(co.ProblemError, match="not drawn in one figure"):
+        table.plot()
+    assert "<table" in table._repr_html_()
+    failed = co.compare(_parts(), methods=["ipopt", ("chord", "gradient", {"variant": "chord"})], intervals=5, **QUIET)
+    assert not failed.converged
+    assert "does not apply to phases" in str(failed)
