@@ -255,18 +255,25 @@ class ChainSpace(Unknowns):
         """No phases are solved by the chord variant; `prepare_chain` refuses it."""
         raise NotImplementedError
 
-    def multipliers(self, iterate: ChainIterate, linear: ChainLinear, measures: Measures) -> tuple[Multipliers, ...]:
-        """Those of each phase; the multipliers of its final states contain what the later phases cost by them."""
-        result = []
+    def multipliers(
+        self, iterate: ChainIterate, linear: ChainLinear, measures: Measures
+    ) -> tuple[tuple[Multipliers, ...], tuple[Array, ...]]:
+        """Those of each phase, and of the bounds on its states at its end, (nx,).
+
+        The multipliers of the final states contain what bounds do there, and what the later phases cost by them.
+        """
+        result, bounds = [], []
         each = zip(self._each(iterate, linear), self.spans, linear.later, strict=True)
         for (space, own, _, rows), span, later in each:
             found = space.multipliers(own, of_part(measures, rows, span))
+            fixed = np.isin(np.arange(found.final.size), space.sweeps.terminal.fixed)
+            bounds.append(np.where(fixed, 0.0, found.final))
             if later is not None:
                 behind = measures.ell[rows][space.conditions :]
                 by_end = later.columns[: space.sweeps.statement.nx]
                 found = replace(found, final=found.final + by_end[:, 0] + by_end[:, 1:] @ behind)
             result.append(found)
-        return tuple(result)
+        return tuple(result), tuple(bounds)
 
     def link_multipliers(self, iterate: ChainIterate, linear: ChainLinear, measures: Measures) -> tuple[Array, ...]:
         """Minus the slopes of the Lagrangian by the states that each link gives."""

@@ -31,22 +31,8 @@ def check_phases(chain: Chain, settings: Settings) -> None:
     """What the method does not do for phases, by name.
 
     Raises:
-        ProblemError: bounds of states and inequalities, the chord variant, a metric that is an array.
+        ProblemError: bounds of a decision that differ, the chord variant, a metric that is an array.
     """
-    for st in chain.statements:
-        bounded = [f"bounds of {st.state_names[i]}" for i in st.bounded_states]
-        limited = [*bounded, *st.path.names, *st.start.names[: st.start.size]]
-        limited += [n for n, a, b in zip(st.end.names, st.end.lower, st.end.upper, strict=True) if a != b]
-        if st.tied is not None:
-            limited = [name for name in limited if name not in st.start.names[st.start.size - len(st.tied.states) :]]
-        if limited:
-            raise ProblemError(
-                f"The gradient method does not solve the phase '{st.name}'.",
-                expected="phases with bounds of controls, durations and decisions, and equalities at the end; no "
-                "inequalities of states or covariances",
-                received=", ".join(limited),
-                remedy="use method='ipopt'",
-            )
     for link, before, after in zip(chain.links, chain.statements[:-1], chain.statements[1:], strict=True):
         _check_decisions(link, before, after)
     if settings.variant != "gradient" or (not isinstance(settings.weight, str) and np.ndim(settings.weight) > 0):
@@ -116,7 +102,7 @@ class GradientChainSolver:
         assert isinstance(iterate, ChainIterate)
         linear = space.linearise(iterate)
         assert isinstance(linear, ChainLinear)
-        found = space.multipliers(iterate, linear, measures)
+        found, at_ends = space.multipliers(iterate, linear, measures)
         parts = zip(iterate.spaces, iterate.parts, found, strict=True)
         extremals = tuple(
             with_tied_multipliers(
@@ -130,11 +116,10 @@ class GradientChainSolver:
             )
             for part, own, multipliers in parts
         )
-        nothing = [np.zeros(st.nx) for st in self._chain.statements]
         return ChainOutcome(
             extremals=extremals,
             link_multipliers=space.link_multipliers(iterate, linear, measures),
-            bounds_at_ends=tuple((none, none) for none in nothing),
+            bounds_at_ends=tuple((np.zeros_like(last), last) for last in at_ends),
             cost_terms=tuple({"terminal": own.run.terminal, "running": own.run.running} for own in iterate.parts),
             converged=end.status is Status.SOLVED,
             message=str(end.status),
@@ -155,7 +140,7 @@ class GradientChainSolver:
         for i, (sweeps, own, guess) in enumerate(zip(self._sweeps, parameters, guesses, strict=True)):
             st = sweeps.statement
             given = given_entries(self._chain.links[i - 1], st.nx) if i else ()
-            groups = penalty_groups(st, sweeps.mesh, sweeps.terminal.rows)
+            groups = penalty_groups(st, sweeps.mesh, sweeps.terminal.rows, follows=i > 0)
             parts.append(make_space(sweeps, groups, own, guess, given))
         return ChainSpace(parts=tuple(parts), links=self._chain.links)
 

@@ -301,7 +301,7 @@ class Space(Unknowns):
             elif group.kind == "end":
                 end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
             else:
-                bounds[1:, limited(st)] = values
+                bounds[-values.shape[0] :, limited(st)] = values
         held = -np.where(measures.active, measures.residual, 0.0)
         chosen = np.isin(self.free, st.decisions)
         bounds[0, self.free[chosen]] = held[self.controls + int(st.duration.free) :][chosen]

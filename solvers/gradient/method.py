@@ -141,7 +141,7 @@ def prepare_chain(
     """Compile the sweeps for several phases; arguments and errors as of `prepare`.
 
     Args:
-        chain: the phases; without inequalities of states or covariances.
+        chain: the phases.
         options: mesh of each.
         variant: "gradient".
         weight: W: "adaptive", "curvature" or a number.

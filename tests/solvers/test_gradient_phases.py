@@ -88,22 +88,19 @@ def test_three_phases_with_a_decision_and_a_free_start(bounds: dict[str, float])
 
 
 def test_what_the_method_does_not_do_for_phases_is_refused() -> None:
-    def limited(name: str, **given: Any) -> co.Problem:
+    def limited(name: str) -> co.Problem:
         ocp = co.Problem(1.0, name=name)
-        x = ocp.state("x", initial=0.0 if name == "one" else None, **given)
+        x = ocp.state("x", initial=0.0 if name == "one" else None)
         d, u = ocp.decision("d", guess=0.5, lower=0.0, upper=2.0 if name == "one" else 1.0), ocp.control("u")
         ocp.dynamics(x, u + d)
         ocp.minimize(running=u**2 + d**2 + x**2)
         return ocp
 
-    with pytest.raises(co.ProblemError, match="does not solve the phase 'two'") as caught:
-        co.solve(co.Phases([limited("one"), limited("two", upper=1.0)]), method="gradient", **QUIET)
-    assert "bounds of x" in str(caught.value)
     with pytest.raises(co.ProblemError, match="The bounds of the decision 'd' in 'one' and 'two' differ"):
         co.solve(co.Phases([limited("one"), limited("two")]), method="gradient", **QUIET)
-    unreachable = co.Phases([limited("one"), limited("two")])
+    phases = co.Phases([limited("one"), limited("two")])
     with pytest.raises(co.ProblemError, match="not solved that way"):
-        co.solve(unreachable, method="gradient", nominal="deterministic", **QUIET)
+        co.solve(phases, method="gradient", nominal="deterministic", **QUIET)
 
 
 def test_a_comparison_of_phases_is_a_table_of_both_methods() -> None:
@@ -120,3 +117,28 @@ def test_a_comparison_of_phases_is_a_table_of_both_methods() -> None:
     failed = co.compare(_parts(), methods=["ipopt", ("chord", "gradient", {"variant": "chord"})], intervals=5, **QUIET)
     assert not failed.converged
     assert "does not apply to phases" in str(failed)
+
+
+def test_a_bound_holds_what_a_jump_gives_and_has_the_multiplier_of_shooting() -> None:
+    """y(0) = x(T)/2 <= 0.4 binds at the first node of the later phase alone."""
+
+    def phases() -> co.Phases:
+        one, two = co.Problem(1.0, name="one"), co.Problem(1.0, name="two")
+        x, u = one.state("x", initial=0.0), one.control("u")
+        one.dynamics(x, u)
+        one.minimize(running=0.5 * u**2, terminal=(x - 2.0) ** 2)
+        y, w = two.state("y", initial=None, upper=0.4), two.control("w", lower=-3.0)
+        two.dynamics(y, w)
+        two.minimize(running=0.5 * w**2 + y**2)
+        result = co.Phases([one, two])
+        result.jump(y, 0.5 * x)
+        return result
+
+    by_gradient = co.solve(phases(), method="gradient", intervals=8, **QUIET)
+    by_shooting = co.solve(phases(), intervals=8, points=1, tolerance=1e-9, **QUIET)
+    assert by_gradient["two"]["y"][0] == pytest.approx(0.4, abs=1e-5)
+    assert by_gradient.cost == pytest.approx(by_shooting.cost, rel=1e-5)
+    for solution in (by_gradient, by_shooting):
+        assert solution.link_residuals[0] < 1e-6
+        # p(T) of x is minus its control, and 2 (x - 2) + mu/2 + p+/2 of the jump; x is held at 0.8
+        assert solution["one"].costate("x")[-1] == pytest.approx(-0.8, rel=1e-3)
