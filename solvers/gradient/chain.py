@@ -9,7 +9,7 @@ and free initial values of all phases at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -58,57 +58,21 @@ class ChainLinear(Linear):
 class ChainSpace(Unknowns):
     """The unknowns of several phases, one after the other.
 
-    parts: of each phase, at the guess. links: between them.
+    parts: of each phase, at the guess. links: between them. The others: as of `Unknowns`, of all phases.
     """
 
     parts: tuple[Space, ...]
     links: tuple[Link, ...]
+    groups: tuple[Group, ...]
+    weights: Weights
+    unit: Array
+    lower: Array
+    upper: Array
+    fixed_metric: Array
+    miss_scale: Array
+    extra: Array
 
     __repr__ = short_repr
-
-    def _joined(self, value: Callable[[Space], Array]) -> Array:
-        return np.concatenate([value(part) for part in self.parts])
-
-    @property
-    def unit(self) -> Array:  # type: ignore[override]
-        """Typical magnitudes of the entries of a point."""
-        return self._joined(lambda part: part.unit)
-
-    @property
-    def lower(self) -> Array:  # type: ignore[override]
-        """Lower bounds of a point."""
-        return self._joined(lambda part: part.lower)
-
-    @property
-    def upper(self) -> Array:  # type: ignore[override]
-        """Upper bounds of a point."""
-        return self._joined(lambda part: part.upper)
-
-    @property
-    def fixed_metric(self) -> Array:  # type: ignore[override]
-        """Diagonal of the metric of the stop test."""
-        return self._joined(lambda part: part.fixed_metric)
-
-    @property
-    def miss_scale(self) -> Array:  # type: ignore[override]
-        """Magnitudes of the terminal conditions."""
-        return self._joined(lambda part: part.miss_scale)
-
-    @property
-    def extra(self) -> Array:  # type: ignore[override]
-        """Weights of durations and of free initial values."""
-        return self._joined(lambda part: part.extra)
-
-    @property
-    def groups(self) -> tuple[Group, ...]:  # type: ignore[override]
-        """Inequalities of all phases."""
-        return tuple(group for part in self.parts for group in part.groups)
-
-    @property
-    def weights(self) -> Weights:  # type: ignore[override]
-        """Of the penalties of all phases."""
-        fields = ("weights", "shifts", "scales")
-        return Weights(**{f: tuple(v for part in self.parts for v in getattr(part.weights, f)) for f in fields})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,12 +109,13 @@ class ChainSpace(Unknowns):
             offset = own.stop
             chosen = {name: getattr(weights, name)[own] for name in ("weights", "shifts", "scales")}
             parts.append(part.with_weights(Weights(**chosen)))
-        return replace(self, parts=tuple(parts))
+        return chain_space(tuple(parts), self.links)
 
     def with_extra(self, extra: Array) -> ChainSpace:
         """The same with other weights of what is no control value."""
         spans = _consecutive([part.extra.size for part in self.parts])
-        return replace(self, parts=tuple(part.with_extra(extra[s]) for part, s in zip(self.parts, spans, strict=True)))
+        parts = tuple(part.with_extra(extra[span]) for part, span in zip(self.parts, spans, strict=True))
+        return chain_space(parts, self.links)
 
     def at(self, point: Array) -> ChainIterate:
         """Forward sweeps from the first phase to the last."""
@@ -297,6 +262,28 @@ class ChainSpace(Unknowns):
         assert isinstance(iterate, ChainIterate)
         assert isinstance(linear, ChainLinear)
         return zip(iterate.spaces, iterate.parts, linear.parts, self.ells, strict=True)
+
+
+def chain_space(parts: tuple[Space, ...], links: tuple[Link, ...]) -> ChainSpace:
+    """The unknowns of several phases from those of each."""
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    fields = ("weights", "shifts", "scales")
+    weights = {name: tuple(value for part in parts for value in getattr(part.weights, name)) for name in fields}
+    return ChainSpace(
+        parts=parts,
+        links=links,
+        groups=tuple(group for part in parts for group in part.groups),
+        weights=Weights(**weights),
+        unit=joined("unit"),
+        lower=joined("lower"),
+        upper=joined("upper"),
+        fixed_metric=joined("fixed_metric"),
+        miss_scale=joined("miss_scale"),
+        extra=joined("extra"),
+    )
 
 
 def given_entries(link: Link, nx: int) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ from covocp.base.progress import Progress
 from covocp.extremal.decisions import with_tied_multipliers
 from covocp.extremal.extremal import Extremal, Guess
 from covocp.extremal.links import ChainOutcome
-from covocp.solvers.gradient.chain import ChainIterate, ChainLinear, ChainSpace, given_entries
+from covocp.solvers.gradient.chain import ChainIterate, ChainLinear, ChainSpace, chain_space, given_entries
 from covocp.solvers.gradient.influence import Sweeps, build_sweeps, terminal_conditions
 from covocp.solvers.gradient.iterate import Space, make_space, point_of
 from covocp.solvers.gradient.penalty import penalty_groups
@@ -142,7 +142,7 @@ class GradientChainSolver:
             given = given_entries(self._chain.links[i - 1], st.nx) if i else ()
             groups = penalty_groups(st, sweeps.mesh, sweeps.terminal.rows, follows=i > 0)
             parts.append(make_space(sweeps, groups, own, guess, given))
-        return ChainSpace(parts=tuple(parts), links=self._chain.links)
+        return chain_space(tuple(parts), self._chain.links)
 
     def _check(self, current: ChainIterate) -> None:
         """The first trajectory must stay in the domain of the model."""

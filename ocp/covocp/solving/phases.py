@@ -76,7 +76,7 @@ def solve_phases(
         asked = f"nominal='{nominal}'" if nominal != "combined" else f"guess={guess!r}"
         raise ProblemError(
             "Phases are not solved that way.",
-            expected="method='ipopt', nominal='combined', and a guess for each phase or none",
+            expected="nominal='combined', and a guess for each phase or none",
             received=f"method='{method}'" if prepare is None else asked,
             remedy="leave the option out",
         )
