@@ -100,8 +100,18 @@ class Solution:
     within: Within | None = None
 
     @staticmethod
-    def of(outcome: Outcome, method: str, within: Within | None = None, closed: PhaseLoop | None = None) -> Solution:
-        """The solution of an outcome, with the estimate of its mesh error; `closed`: its loop, of a phase."""
+    def of(
+        outcome: Outcome,
+        method: str,
+        within: Within | None = None,
+        closed: PhaseLoop | None = None,
+        *,
+        assess: bool = True,
+    ) -> Solution:
+        """The solution of an outcome, with the estimate of its mesh error, or nan in its place.
+
+        `closed` is the loop of one of several phases, which begins where that before it ends.
+        """
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
         loop = None if closed is None else closed.loop
@@ -118,7 +128,7 @@ class Solution:
             rates=rates,
             end_rates=end_rates,
             filter_gain=filter_gains(extremal),
-            mesh_error=mesh_error(extremal, outcome.cost_terms["running"], within),
+            mesh_error=mesh_error(extremal, outcome.cost_terms["running"], within) if assess else np.nan,
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),
             blocks=st.blocks,
