@@ -284,6 +284,7 @@ class ChainSolver:
         return ChainOutcome(
             extremals=extremals(last, parameters),
             link_multipliers=last.nlp.link_multipliers(last.point.lam_g),
+            bounds_at_ends=last.nlp.bounds_at_ends(last.point.lam_x),
             cost_terms=tuple(costs),
             converged=last.converged,
             message=self._runs.message(last),

@@ -6,3 +6,4 @@ from covocp.solvers.gradient.method import GradientSolver as GradientSolver
 from covocp.solvers.gradient.method import Iteration as Iteration
 from covocp.solvers.gradient.method import one_iteration as one_iteration
 from covocp.solvers.gradient.method import prepare as prepare
+from covocp.solvers.gradient.method import prepare_chain as prepare_chain

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -147,21 +147,25 @@ class Slopes:
     __repr__ = short_repr
 
 
-def build_sweeps(statement: Statement, mesh: Mesh, pairs: int) -> Sweeps:
+def build_sweeps(
+    statement: Statement, mesh: Mesh, pairs: int, further: int = 0, *, by_matrices: bool = False
+) -> Sweeps:
     """Compile the sweeps.
 
     Args:
         statement: the problem.
         mesh: nodes, control, integration of the cost.
         pairs: Runge-Kutta steps of the costates in each interval.
+        further: number of conditions in phases that follow, whose influence functions pass through this one.
+        by_matrices: whether the matrices have an influence on these.
     """
     terminal = terminal_conditions(statement)
-    n, count = mesh.intervals, len(terminal.names)
+    n, count, matrices = mesh.intervals, len(terminal.names) + further, terminal.matrices or by_matrices
     make = hamiltonian(statement)
     curvature = make("curvature", lambda h, x, u, e, t: [ca.hessian(h, u)[0] if statement.nu else ca.DM(0, 0)])
     given = _flat(statement, pairs, forward_costates(statement, pairs)) if statement.behind else None
-    backward = _flat(statement, pairs, backward_interval(statement, pairs, count, matrices=terminal.matrices))
-    quadrature = _flat(statement, pairs, quadrature_interval(statement, pairs, count, matrices=terminal.matrices))
+    backward = _flat(statement, pairs, backward_interval(statement, pairs, count, matrices=matrices))
+    quadrature = _flat(statement, pairs, quadrature_interval(statement, pairs, count, matrices=matrices))
     return Sweeps(
         statement=statement,
         mesh=mesh,
@@ -341,7 +345,24 @@ def sweep_forward(sweeps: Sweeps, u: Array, duration: float, start: Array, param
     )
 
 
-def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) -> Slopes:
+class Later(NamedTuple):
+    """What phases that follow say of the end of one: slopes of their cost, and of each of their conditions.
+
+    columns: by z(T), (size, 1 + further); duration: by T, (1 + further,).
+    """
+
+    columns: Array
+    duration: Array
+
+
+def sweep_backward(
+    sweeps: Sweeps,
+    run: Run,
+    parameters: Array,
+    jumps: Array,
+    later: Later | None = None,
+    first: Array | None = None,
+) -> Slopes:
     """Integrate Y forward, p, P and R backward, and form the integrals of h_u and H_u (steps 3 to 6).
 
     Args:
@@ -349,18 +370,24 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
         run: where to linearise.
         parameters: of the statement.
         jumps: of the costates at the nodes (N + 1, size), from the penalties; the last is added to the terminal value.
+        later: of the phases that follow, where the sweeps were built for some.
+        first: Y at the start, where a phase goes before; None: zero.
     """
     mesh, pairs = sweeps.mesh, sweeps.pairs
     n, size = mesh.intervals, run.z.shape[1]
-    common = interval_columns(mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
-    points = sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+    common, points = _points(sweeps, run, parameters)
     z = np.asarray(points.full()).T.reshape(n, 2 * pairs + 1, size)
-    given, given_end = _given(sweeps, points, common)
+    given, given_end = _given(sweeps, points, common, first)
     _, _, last, by_duration = (
         np.asarray(v.full()) for v in sweeps.terminal.function(run.z[-1], run.duration, parameters, given_end)
     )
     behind = [sweeps.statement.nx + k for k in sweeps.statement.entries(sweeps.statement.behind)]
     last[:, 0] += jumps[-1]
+    if later is not None:
+        last, by_duration = (
+            np.hstack([own[:, :1] + others[:, :1], own[:, 1:], others[:, 1:]])
+            for own, others in ((last, later.columns), (by_duration, later.duration[None]))
+        )
     last[behind, 0] = given_end
     order = list(range(n - 1, -1, -1))
     along = [ca.DM(v[::-1].transpose(2, 0, 1).reshape(v.shape[2], n * v.shape[1])) for v in (z, given)]
@@ -371,12 +398,24 @@ def sweep_backward(sweeps: Sweeps, run: Run, parameters: Array, jumps: Array) ->
     return _slopes(sweeps, run.u, run.duration, parameters, middles)
 
 
-def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...]) -> tuple[Array, Array]:
+def _points(sweeps: Sweeps, run: Run, parameters: Array) -> tuple[Interval, Any]:
+    """The intervals of a run, and z at the starts, middles and ends of their pairs."""
+    common = interval_columns(sweeps.mesh, ca.DM(run.u.T), run.duration, ca.DM(parameters))
+    return common, sweeps.refine(ca.DM(run.z[:-1].T), ca.DM(run.z[1:].T), *common)
+
+
+def given_at_end(sweeps: Sweeps, run: Run, parameters: Array, first: Array | None) -> Array:
+    """Y at T, (rows,), from what it begins with."""
+    common, points = _points(sweeps, run, parameters)
+    return _given(sweeps, points, common, first)[1]
+
+
+def _given(sweeps: Sweeps, points: Expr, common: tuple[Any, ...], first: Array | None) -> tuple[Array, Array]:
     """Y at the starts, middles and ends of the pairs of all intervals (N, 2 pairs + 1, rows), and at T (rows,)."""
     shape = (sweeps.mesh.intervals, 2 * sweeps.pairs + 1, len(sweeps.statement.entries(sweeps.statement.behind)))
     if sweeps.given is None:
         return np.zeros(shape), np.zeros(0)
-    ends, inside = sweeps.given(np.zeros(shape[2]), points, *common)
+    ends, inside = sweeps.given(np.zeros(shape[2]) if first is None else first, points, *common)
     return np.asarray(inside.full()).T.reshape(shape), np.asarray(ends.full())[:, -1]
 
 

@@ -13,11 +13,11 @@ from scipy import sparse
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
-from covocp.base.residuals import VANISHING, Residuals
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
-from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_gram, solve_step, with_extra
+from covocp.solvers.gradient.descent import Step, control_metric, positive_definite, solve_step, with_extra
 from covocp.solvers.gradient.influence import (
+    Later,
     Run,
     Slopes,
     Sweeps,
@@ -37,9 +37,9 @@ from covocp.solvers.gradient.penalty import (
     first_weights,
     limited,
     limits,
-    violation,
 )
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
+from covocp.solvers.gradient.unknowns import Unknowns
 from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
@@ -47,21 +47,16 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Eigenvalues of H_uu, in units of the control scales, are not taken below this share of the largest.
 SMALLEST_CURVATURE = 1e-3
-# Relative change of T and of free initial values by which their curvature is measured, and of the controls in a probe.
-DIFFERENCE = 1e-4
-SMALLEST_EXTRA = 1e-3
 # T changes by no more than these shares of itself in one step.
 SHORTEN, LENGTHEN = 0.3, 0.5
 # Controls below this share of their scale at the start are zero.
 ZERO = 1e-12
-# Terms of H_u that change the cost by less than this share where a control moves by its scale are roundoff.
-FAINT = 1e-8
 CHORD_STEPS = 60
 CHORD_TOLERANCE = 1e-13
 
 
 @dataclass(frozen=True, kw_only=True)
-class Space:
+class Space(Unknowns):
     """The unknowns, their scales and bounds, and the compiled sweeps.
 
     Args:
@@ -96,9 +91,19 @@ class Space:
     __repr__ = short_repr
 
     @property
-    def conditions(self) -> int:
-        """Number of terminal conditions with influence functions."""
-        return len(self.sweeps.terminal.names)
+    def names(self) -> tuple[str, ...]:
+        """Of the terminal conditions with influence functions."""
+        return self.sweeps.terminal.names
+
+    @property
+    def others(self) -> Indices:
+        """Entries of a point that are no control values: durations and free initial values."""
+        return np.arange(self.controls, self.unit.size)
+
+    @property
+    def durations(self) -> Indices:
+        """Entries of a point that are durations."""
+        return self.others[: int(self.sweeps.statement.duration.free)]
 
     @property
     def controls(self) -> int:
@@ -126,15 +131,21 @@ class Space:
 
     def first(self, guess: Guess) -> Iterate:
         """The iterate of a guess: its controls, terminal time and free initial values."""
-        return self.at(_point(self, guess.trajectory))
+        return self.at(point_of(self, guess.trajectory))
 
     def with_weights(self, weights: Weights) -> Space:
         """The same with other penalties."""
         return replace(self, weights=weights)
 
-    def linearise(self, iterate: Iterate) -> Linear:
-        """Backward sweep at an iterate."""
-        slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps)
+    def linearise(self, iterate: Iterate, later: Later | None = None, first: Array | None = None) -> Linear:
+        """Backward sweep at an iterate.
+
+        Args:
+            iterate: where.
+            later: what phases that follow say of its end.
+            first: what Y begins with where a phase goes before.
+        """
+        slopes = sweep_backward(self.sweeps, iterate.run, self.parameters, iterate.penalty.jumps, later, first)
         return self._linear(iterate.penalty, slopes, iterate.run.z[0, : self.sweeps.statement.nx])
 
     def _linear(self, penalty: Penalty, slopes: Slopes, start_state: Array) -> Linear:
@@ -143,23 +154,23 @@ class Space:
         by_time[0] += penalty.duration
         control = slopes.control.copy()
         control[0] += self._fold(penalty.control)
-        start = slopes.start @ self._tied_slopes(start_state)
+        start = slopes.start @ self.tied_slopes(start_state, self.free)
         stacked = np.hstack([control.reshape(control.shape[0], count), by_time[:, None][:, : int(free)], start])
         cost = np.abs(slopes.cost).ravel()
         sizes = np.abs(stacked[0])
         sizes[:count] = cost + np.abs(control[0].ravel() - slopes.cost.ravel())
         return Linear(slope=stacked[0], rows=stacked[1:], sizes=sizes, slopes=slopes)
 
-    def _tied_slopes(self, state: Array) -> Array:
-        """Slopes of z(0) by its free entries: those that decisions give follow them."""
+    def tied_slopes(self, state: Array, entries: Indices) -> Array:
+        """Slopes of z(0) by some of its entries: those that decisions give follow them."""
         st, size = self.sweeps.statement, self.start.size
-        result = np.eye(size)[:, self.free]
+        result = np.eye(size)[:, entries]
         if st.tied is None:
             return result
         rows = [*st.tied.states, *(st.nx + k for k in st.tied.matrices)]
         by_state = np.zeros((len(rows), size))
         by_state[:, : st.nx] = np.asarray(st.tied.slopes(state, self.parameters).full())
-        result[rows] = by_state[:, self.free]
+        result[rows] = by_state[:, entries]
         return result
 
     def _fold(self, nodal: Array) -> Array:
@@ -174,91 +185,53 @@ class Space:
         """Sum of the absolute terms of the cost."""
         return abs(iterate.run.running) + abs(iterate.run.terminal)
 
+    def size_of(self, iterate: Iterate, linear: Linear) -> float:
+        """Size of the cost, of its slopes where it is next to nothing."""
+        return max(self.cost_size(iterate), SMALLEST_CURVATURE * self.slope_size(linear))
+
     def slope_size(self, linear: Linear) -> float:
         """Sum of the absolute changes of the cost by the control values, each in its unit."""
         count = self.controls
         return float(np.abs(linear.slope[:count] * self.unit[:count]).sum())
 
-    def violation(self, iterate: Iterate) -> Array:
-        """Largest relative violation of each group of inequalities."""
-        return violation(iterate.penalty, self.weights)
-
-    def measure(self, iterate: Iterate, linear: Linear) -> Measures:
-        """Norms of the stop test, with the multiplier that makes the first of them least."""
-        inverse = 1.0 / self.fixed_metric
-        at_lower, at_upper = iterate.point <= self.lower, iterate.point >= self.upper
-        active = np.zeros(iterate.point.size, dtype=bool)
-        ell = np.zeros(self.conditions)
-        for _ in range(10):
-            weight = np.where(active, 0.0, inverse)
-            ell = solve_gram((linear.rows * weight) @ linear.rows.T, -(linear.rows * weight) @ linear.slope)
-            residual = linear.lagrangian(ell)
-            new = (at_lower & (residual > 0)) | (at_upper & (residual < 0))
-            if (new == active).all():
-                break
-            active = new
-        residual = linear.lagrangian(ell)
-        left = np.where(active, 0.0, residual)
-        count = self.controls
+    def sizes_along(self, iterate: Iterate, linear: Linear, ell: Array) -> Array:
+        """Sizes of the slopes by the control values from those of H_u at the nodes."""
         nodal = control_sizes(self.sweeps, iterate.run, linear.slopes.columns, ell, self.parameters)
         weights = quadrature_weights(self.sweeps.mesh)[:, None] * iterate.run.duration
-        sizes = (linear.sizes + np.abs(linear.rows).T @ np.abs(ell))[:count]
-        sizes = np.maximum(sizes, (weights * nodal[: weights.size]).ravel())
-        norm = np.sqrt(np.sum(inverse[:count] * left[:count] ** 2))
-        size = np.sqrt(np.sum(inverse[:count] * sizes**2))
-        total = max(self.cost_size(iterate), np.finfo(float).tiny)
-        size = max(size, FAINT * total / np.sqrt(iterate.run.duration))  # where the best control is none
-        slope = float(norm / size) if size > 0 else 0.0
-        extra = np.abs(left[count:] * self.unit[count:]).max(initial=0.0) / total
-        return Measures(
-            ell=ell,
-            residual=residual,
-            active=active,
-            slope=max(slope, float(extra)),
-            miss=float((np.abs(iterate.run.miss) / self._miss_scale(iterate, linear)).max(initial=0.0)),
-            transversality=float(residual[count]) if self.sweeps.statement.duration.free else 0.0,
-        )
+        return np.asarray((weights * nodal[: weights.size]).ravel())
 
-    def _miss_scale(self, iterate: Iterate, linear: Linear) -> Array:
-        """Magnitudes of the terminal conditions along the run, where they are below those of the start."""
-        along = np.abs(linear.slopes.columns[-1][:, 1:]).T @ np.abs(iterate.run.z).max(axis=0)
-        return np.where(along > 0, np.minimum(along, self.miss_scale), self.miss_scale)
+    def reach(self, iterate: Iterate, linear: Linear) -> Array:
+        """What changes of z at the end by its largest values along the run make of each terminal condition."""
+        columns = linear.slopes.columns[-1][:, 1 : 1 + self.conditions]
+        return np.asarray(np.abs(columns).T @ np.abs(iterate.run.z).max(axis=0))
 
-    def reached(self, iterate: Iterate, linear: Linear, measures: Measures) -> Residuals:
-        """What is left, by changes of the controls and the other unknowns by their own magnitudes at this point."""
+    def reached_units(self, iterate: Iterate, linear: Linear, measures: Measures) -> tuple[Array, float]:
+        """Magnitudes of the entries of a point there, and the change of the cost by those of the controls."""
         run, st = iterate.run, self.sweeps.statement
         trajectory = Trajectory(x=run.z[:, : st.nx], u=run.u, e=run.z[:, st.nx :], duration=run.duration)
         at_controls = choose_scales(st, self.sweeps.mesh, trajectory, self.parameters).u
         at_controls = np.maximum(at_controls, ZERO * self.unit[: st.nu])
         unit = np.concatenate([np.tile(at_controls, run.u.shape[0]), self.unit[self.controls :]])
-        slope = float(np.abs(np.where(measures.active, 0.0, measures.residual)) @ unit)
-        missed, rest = float(np.abs(measures.ell) @ np.abs(run.miss)), 0.0
-        penalty = iterate.penalty
-        for multipliers, excess, room in zip(penalty.multipliers, penalty.excess, penalty.room, strict=True):
-            missed += float(np.sum(np.abs(multipliers * excess)))
-            rest += float(np.sum(np.abs(multipliers * room)))
         columns = linear.slopes.columns
         curvature = control_curvature(self.sweeps, run, run.u, columns, measures.ell, self.parameters)
         weights = quadrature_weights(replace(self.sweeps.mesh, control="linear")) * run.duration
         change = float(np.einsum("kij,i,j,k->", np.abs(curvature), at_controls, at_controls, weights)) if st.nu else 0.0
-        size = max(self.cost_size(iterate), VANISHING * change, float(np.finfo(float).tiny))
-        return Residuals(
-            slope=slope / size,
-            complementarity=rest / size,
-            infeasibility=missed / size,
-            violation=measures.miss,
-        )
+        return unit, change
 
     def metric(self, iterate: Iterate, linear: Linear, ell: Array, weight: Expr) -> Any:
         """Matrix of int du' W du dt + b dT^2 + ...: W = H_uu made positive definite, or the given one."""
-        return self._metric(iterate.run, iterate.run.u, linear, ell, weight, iterate.penalty.curvature)
+        return self.metric_along(iterate, iterate.run.u, linear, ell, weight)
 
-    def _metric(self, run: Run, u: Array, linear: Linear, ell: Array, weight: Expr, penalty: Array) -> Any:
+    def metric_along(
+        self, iterate: Iterate, u: Array, linear: Linear, ell: Array, weight: Expr, size: float | None = None
+    ) -> Any:
+        """`metric` with another control along the same z; `size`: of the cost, None: of this part alone."""
+        run, penalty = iterate.run, iterate.penalty.curvature
         st, mesh = self.sweeps.statement, self.sweeps.mesh
         if isinstance(weight, str):
             blocks = control_curvature(self.sweeps, run, u, linear.slopes.columns, ell, self.parameters)
             # where the cost is zero its slopes tell its unit; where they too are zero any metric will do
-            size = max(abs(run.running) + abs(run.terminal), SMALLEST_CURVATURE * self.slope_size(linear))
+            size = self.size_of(iterate, linear) if size is None else size
             unit = (size if size > np.finfo(float).tiny / np.finfo(float).eps else 1.0) / run.duration
             blocks = np.where(np.isfinite(blocks).all(axis=(1, 2), keepdims=True), blocks, 0.0)
             blocks = positive_definite(blocks, self.scales.u, unit, SMALLEST_CURVATURE)
@@ -279,37 +252,9 @@ class Space:
             lower[at], upper[at] = max(lower[at], -SHORTEN * duration), min(upper[at], LENGTHEN * duration)
         return lower, upper
 
-    def with_extra_weights(self, linear: Linear, iterate: Iterate, ell: Array) -> Space:
-        """b of T and of the free initial values from the curvature of the Lagrangian by each of them."""
-        extra = self.extra.copy()
-        for i in range(extra.size):
-            at = self.controls + i
-            change = DIFFERENCE * self.unit[at] * (1.0 if iterate.point[at] < self.upper[at] else -1.0)
-            moved = iterate.point.copy()
-            moved[at] += change
-            other = self.at(moved)
-            if not other.run.finite:
-                continue
-            turned = (self.linearise(other).lagrangian(ell) - linear.lagrangian(ell))[at] / change
-            extra[i] = max(abs(float(turned)), SMALLEST_EXTRA * extra[i]) if np.isfinite(turned) else extra[i]
+    def with_extra(self, extra: Array) -> Space:
+        """The same with other weights of what is no control value."""
         return replace(self, extra=extra)
-
-    def probe(self, iterate: Iterate, linear: Linear, metric: Expr) -> float:
-        """Curvature of the Lagrangian along the step that the metric would take, in units of the metric."""
-        lower, upper = self.room(iterate)
-        still = np.zeros(self.conditions)
-        step = solve_step(learnt(metric, ()), linear.slope, linear.rows, still, lower, upper)
-        size = (np.abs(step.change) / self.unit).max(initial=0.0)
-        if size == 0:
-            return 1.0
-        change = min(1.0, DIFFERENCE / size) * step.change
-        other = self.at(iterate.point + change)
-        if not other.run.finite:
-            return 1.0
-        turned = self.linearise(other).lagrangian(step.ell) - linear.lagrangian(step.ell)
-        along, squared = abs(float(turned @ change)), float(change @ (metric @ change))
-        value = along / squared if squared > 0 else 1.0  # a step so small that its square is nothing
-        return value if np.isfinite(value) and value > 0 else 1.0
 
     def chord(self, iterate: Iterate, linear: Linear, active: Array | None) -> Step:
         """The change to u_c, which minimises the Hamiltonian along the present x, E, p, P [4.2-10].
@@ -322,7 +267,7 @@ class Space:
         step = None
         u = iterate.run.u
         for _ in range(CHORD_STEPS):
-            metric = learnt(self._metric(iterate.run, u, linear, ell, "curvature", iterate.penalty.curvature), ())
+            metric = learnt(self.metric_along(iterate, u, linear, ell, "curvature"), ())
             slope = present.slope.copy()
             slope[self.controls :] = linear.slope[self.controls :] + self.extra * total[self.controls :]
             step = solve_step(metric, slope, present.rows, target, lower - total, upper - total, active)
@@ -342,9 +287,10 @@ class Space:
         zero = Multipliers.zero(st, mesh)
         terminal = self.sweeps.terminal
         final = np.zeros(st.nx + st.ne)
-        final[list(terminal.fixed)] += measures.ell[: len(terminal.fixed)]
+        ell = measures.ell[: self.conditions]
+        final[list(terminal.fixed)] += ell[: len(terminal.fixed)]
         end, bounds = zero.end.copy(), np.zeros((mesh.intervals + 1, st.nx + st.ne))
-        end[list(terminal.rows)] = measures.ell[len(terminal.fixed) :]
+        end[list(terminal.rows)] = ell[len(terminal.fixed) :]
         path, start = zero.path, zero.start
         for group, values in zip(self.groups, iterate.penalty.multipliers, strict=True):
             if group.kind == "path":
@@ -355,7 +301,7 @@ class Space:
             elif group.kind == "end":
                 end[[i for i in range(st.end.size) if i not in terminal.rows]] = values[0]
             else:
-                bounds[1:, limited(st)] = values
+                bounds[-values.shape[0] :, limited(st)] = values
         held = -np.where(measures.active, measures.residual, 0.0)
         chosen = np.isin(self.free, st.decisions)
         bounds[0, self.free[chosen]] = held[self.controls + int(st.duration.free) :][chosen]
@@ -392,7 +338,7 @@ class Space:
         return dict(sorted(result.items(), key=lambda entry: -entry[1]))
 
 
-def _point(space: Space, trajectory: Trajectory) -> Array:
+def point_of(space: Space, trajectory: Trajectory) -> Array:
     """The point of a trajectory."""
     duration = [trajectory.duration] if space.sweeps.statement.duration.free else []
     start = np.concatenate([trajectory.x[0], trajectory.e[0]])
@@ -400,7 +346,9 @@ def _point(space: Space, trajectory: Trajectory) -> Array:
     return np.asarray(np.clip(point, space.lower, space.upper))
 
 
-def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, guess: Guess) -> Space:
+def make_space(
+    sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, guess: Guess, given: tuple[int, ...] = ()
+) -> Space:
     """The unknowns at a guess, which gives the scales.
 
     Args:
@@ -408,6 +356,7 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
         groups: inequalities met by penalties.
         parameters: of the statement.
         guess: where the iterations start.
+        given: entries of z(0) that a phase before gives, as the guess has them.
     """
     st, mesh = sweeps.statement, sweeps.mesh
     x0, _, e0, _ = st.boundary_values(parameters)
@@ -415,7 +364,7 @@ def make_space(sweeps: Sweeps, groups: tuple[Group, ...], parameters: Array, gue
     known = np.concatenate([x0, e0])
     if st.tied is not None:  # they follow the decisions
         known[[*st.tied.states, *(st.nx + k for k in st.tied.matrices)]] = 0.0
-    free = np.flatnonzero(np.isnan(known))
+    free = np.setdiff1d(np.flatnonzero(np.isnan(known)), given)
     guessed = np.concatenate([guess.trajectory.x[0], guess.trajectory.e[0]])
     start = np.where(np.isnan(known), guessed, known)
     start = np.concatenate(st.started(start[: st.nx], parameters, start[st.nx :]))

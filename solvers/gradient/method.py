@@ -40,6 +40,7 @@ from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.decisions import with_tied_multipliers
 from covocp.extremal.extremal import Extremal, Guess, Outcome
+from covocp.solvers.gradient.chain_method import GradientChainSolver, check_phases
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
 from covocp.solvers.gradient.iterate import Space, make_space
@@ -48,6 +49,7 @@ from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.records import Iterate
 from covocp.solvers.gradient.search import End, Search, Settings, Variant
 from covocp.solvers.gradient.statuses import Status
+from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh, Options
@@ -63,15 +65,17 @@ STIFFNESS_PER_PAIR = 0.25
 SYMMETRIC = 1e-9
 
 
-@checked(
-    "the method 'gradient'",
-    variant=one_of("gradient", "chord"),
-    weight_factor=positive,
-    fraction=share,
-    tolerance=positive,
-    violation_tolerance=positive,
-    max_iterations=whole(1),
-)
+KINDS = {
+    "variant": one_of("gradient", "chord"),
+    "weight_factor": positive,
+    "fraction": share,
+    "tolerance": positive,
+    "violation_tolerance": positive,
+    "max_iterations": whole(1),
+}
+
+
+@checked("the method 'gradient'", **KINDS)
 def prepare(
     statement: Statement,
     options: Options,
@@ -115,18 +119,75 @@ def prepare(
     Raises:
         ProblemError: an option is wrong.
     """
+    mesh, pairs = _meshed(statement, options)
+    _check_weight(weight, statement.nu, mesh.nodes.size)
+    settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
+    return GradientSolver(statement, mesh, pairs, settings)
+
+
+@checked("the method 'gradient'", **KINDS)
+def prepare_chain(
+    chain: Chain,
+    options: tuple[Options, ...],
+    *,
+    variant: Variant = "gradient",
+    weight: Given = "adaptive",
+    weight_factor: float = 1.0,
+    fraction: float = 1.0,
+    tolerance: float = 1e-6,
+    violation_tolerance: float = 1e-6,
+    max_iterations: int = 2000,
+) -> GradientChainSolver:
+    """Compile the sweeps for several phases; arguments and errors as of `prepare`.
+
+    Args:
+        chain: the phases.
+        options: mesh of each.
+        variant: "gradient".
+        weight: W: "adaptive", "curvature" or a number.
+        weight_factor: factor on W.
+        fraction: d of step 5.
+        tolerance: on the slopes, relative to those of all phases.
+        violation_tolerance: on terminal conditions.
+        max_iterations: of all passes together.
+    """
+    settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
+    check_phases(chain, settings)
+    _check_weight(weight, 1, 0)
+    pairs = [_meshed(st, own) for st, own in zip(chain.statements, options, strict=True)]
+    return GradientChainSolver(chain, tuple(mesh for mesh, _ in pairs), tuple(count for _, count in pairs), settings)
+
+
+def _meshed(statement: Statement, options: Options) -> tuple[Mesh, int]:
+    """The mesh in one segment with propagated matrices, and the steps of an interval backward.
+
+    Raises:
+        ProblemError: an option of shooting.
+    """
     for name in ("segments", "covariances"):
         if getattr(options, name) != "auto":
             raise _option_error(name, "nothing: it belongs to shooting", getattr(options, name))
     if options.points not in ("auto", 1):
         raise _option_error("points", "'auto' or 1: its penalties act at the nodes; 'ipopt' has more", options.points)
     mesh = resolve_mesh(statement, options, statement.values)
-    _check_weight(weight, statement.nu, mesh.nodes.size)
     mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
     found = stiffness(statement, options, statement.values)
     stiff = max(found.nominal, found.matrices)
     pairs = int(np.clip(np.ceil(stiff / STIFFNESS_PER_PAIR), mesh.substeps, max(LARGEST_PAIRS, mesh.substeps)))
-    settings = Settings(
+    return mesh, pairs
+
+
+def _settings(
+    variant: Variant,
+    weight: Given,
+    weight_factor: float,
+    fraction: float,
+    tolerance: float,
+    violation_tolerance: float,
+    max_iterations: int,
+) -> Settings:
+    """Options as plain numbers."""
+    return Settings(
         variant=variant,
         weight=weight,
         weight_factor=float(weight_factor),
@@ -135,7 +196,6 @@ def prepare(
         violation_tolerance=float(violation_tolerance),
         max_iterations=int(max_iterations),
     )
-    return GradientSolver(statement, mesh, pairs, settings)
 
 
 def _check_weight(weight: Given, nu: int, nodes: int) -> None:

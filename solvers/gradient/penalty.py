@@ -96,14 +96,18 @@ def limited(statement: Statement) -> Indices:
     return np.setdiff1d(bounded, statement.decisions)
 
 
-def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> tuple[Group, ...]:
+def penalty_groups(
+    statement: Statement, mesh: Mesh, exact: tuple[int, ...], *, follows: bool = False
+) -> tuple[Group, ...]:
     """The groups of a statement that have rows.
 
     Args:
         statement: the problem.
         mesh: its nodes.
         exact: rows of the final conditions that influence functions meet, not penalties.
+        follows: whether a phase before it gives z(0), which is then bounded by penalties too.
     """
+    first = 0 if follows else 1
     n = mesh.intervals
     shares = quadrature_weights(replace(mesh, control="linear")) * statement.duration.guess
     every, once = np.arange(n + 1), np.ones(1)
@@ -138,8 +142,8 @@ def penalty_groups(statement: Statement, mesh: Mesh, exact: tuple[int, ...]) -> 
             statement,
             "bounds",
             tuple(f"bounds of {names[i]}" for i in bounded),
-            every[1:],
-            shares[1:],
+            every[first:],
+            shares[first:],
             lambda *arguments: _entries(arguments[0], arguments[2], bounded.tolist()),
             lower[bounded],
             upper[bounded],

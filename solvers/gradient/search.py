@@ -18,11 +18,11 @@ from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
 from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.descent import Step, solve_gram, solve_step, solve_tangent, unreachable
-from covocp.solvers.gradient.iterate import Space
 from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
 from covocp.solvers.gradient.penalty import next_weights
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
 from covocp.solvers.gradient.statuses import Status
+from covocp.solvers.gradient.unknowns import Unknowns
 
 # On the slopes, unless the user gives another.
 TOLERANCE = 1e-6
@@ -101,7 +101,7 @@ class End(NamedTuple):
 class Search:
     """The iterations: passes of the penalties outside, gradient steps inside."""
 
-    def __init__(self, space: Space, settings: Settings, progress: Progress) -> None:
+    def __init__(self, space: Unknowns, settings: Settings, progress: Progress) -> None:
         self.space, self.settings, self.progress = space, settings, progress
         self.control = _Control(weight=1.0, fraction=settings.fraction, merit=np.zeros(space.conditions))
         self.passes = 0
@@ -201,16 +201,14 @@ class Search:
         space = self.space
         gram = (linear.rows / space.fixed_metric) @ linear.rows.T
         hopeless = np.abs(unreachable(gram, current.run.miss)) / space.miss_scale
-        names = [n for n, v in zip(space.sweeps.terminal.names, hopeless, strict=True) if v > 1e-6]
+        names = [n for n, v in zip(space.names, hopeless, strict=True) if v > 1e-6]
         if names:
             raise ProblemError(
                 "Terminal conditions cannot be met: the controls have no influence on " + ", ".join(names) + ".",
                 expected="D = int H_u H_u' dt invertible: influence functions of the terminal conditions that are "
                 "linearly independent",
                 received="a miss of "
-                + ", ".join(
-                    f"{m:.4g} ({n})" for n, m in zip(space.sweeps.terminal.names, current.run.miss, strict=True)
-                ),
+                + ", ".join(f"{m:.4g} ({n})" for n, m in zip(space.names, current.run.miss, strict=True)),
                 remedy="free one of these final values, or start where the controls act on them",
             )
 

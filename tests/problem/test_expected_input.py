@@ -269,3 +269,13 @@ def test_unknown_kind_of_nominal():
     d = Declared()
     d.expect()
     refused(lambda: co.solve(d.ocp, nominal="classical"), "'nominal'", "'combined' or 'deterministic'", "'classical'")
+
+
+def test_a_prescribed_end_needs_a_weight_also_where_there_is_one_state_alone() -> None:
+    ocp = co.Problem(1.0, name="one")
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, u, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize_expected(running=u**2)
+    with pytest.raises(co.ProblemError, match="The final value of 'x' is prescribed, but nothing says"):
+        co.solve(ocp, progress=False)

@@ -44,12 +44,27 @@ def attitude() -> co.Problem:
     return ocp
 
 
-def closed() -> co.Problem:
-    ocp = co.Problem(1.0, name="closed")
-    x, u = ocp.state("x", initial=None), ocp.control("u")
-    ocp.dynamics(x, u, noise=0.1)
+def closed(name: str = "closed", *, noise: float = 0.1, final: float | None = None, **given: Any) -> co.Problem:
+    ocp = co.Problem(1.0, name=name)
+    x, u = ocp.state("x", initial=0.0 if name == "open" else None, final=final), ocp.control("u")
+    ocp.dynamics(x, u, noise=noise)
     ocp.measurement("m", x, noise=0.1)
-    ocp.minimize_expected(running=u**2, terminal_weight={x: 1.0})
+    ocp.minimize_expected(running=u**2, **given)
+    return ocp
+
+
+def ending(final: float | None) -> list[co.Problem]:
+    """A state with a final value that the later phase does not have."""
+    one, two = closed("open"), closed()
+    y = one.state("y", initial=0.0, final=final)
+    one.dynamics(y, one.controls[0].symbol)
+    return [one, two]
+
+
+def spread_limit() -> co.Problem:
+    ocp = closed()
+    X = ocp.closed_loop_covariance()
+    ocp.subject_to(X[ocp.states[0].symbol, ocp.states[0].symbol], upper=1.0, name="spread")
     return ocp
 
 
@@ -76,7 +91,12 @@ WRONG: dict[str, tuple[Callable[[], list[co.Problem]], str]] = {
     "unused": (lambda: [first(decision=True), part(decision=True)], "Nothing depends on the decision 'd'"),
     "attitude": (lambda: [first(), attitude()], "The phase 'turning' has the attitude 'C'"),
     "chance": (lambda: [first(), risky()], "The phase 'risky' has the chance constraint 'wall'"),
-    "expected": (lambda: [first(), closed()], "The phase 'closed' has an expected cost"),
+    "mixed": (lambda: [first(), closed()], "The phase 'first' has no expected cost, and others have one"),
+    "gain": (lambda: [closed("open"), closed(gain=co.Gain())], "The gain of the phase 'closed' is not the best one"),
+    "spread": (lambda: [closed("open"), spread_limit()], "The gain of the phase 'closed' is not the best one"),
+    "certain": (lambda: [closed("open", noise=0.0), closed(noise=0.0)], "nothing in the system is uncertain"),
+    "missed": (lambda: [closed("open"), closed(final=1.0)], "In the phase 'closed': The final value of 'x' is presc"),
+    "missed before": (lambda: ending(1.0), "In the phase 'open': The final value of 'y' is prescribed"),
 }
 
 
@@ -120,7 +140,9 @@ def test_jumps_that_do_not_fit_are_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"method": "gradient"}, "Phases are not solved that way"),
+        ({"method": "gradient", "variant": "chord"}, "'variant' of the gradient method does not apply to phases"),
+        ({"method": "gradient", "weight": [1.0]}, "'weight' of the gradient method does not apply to phases"),
+        ({"method": "gradient", "covariances": "states"}, "'covariances' of the gradient method"),
         ({"nominal": "deterministic"}, "Phases are not solved that way"),
         ({"guess": "multistart"}, "Phases are not solved that way"),
         ({"guess": [None]}, "does not fit the phases"),
@@ -139,10 +161,12 @@ def test_options_that_mean_nothing_to_phases_are_refused(options: dict[str, Any]
 def test_what_takes_one_problem_says_so() -> None:
     phases = co.Phases([first(), part()])
     solution = co.solve(phases, intervals=2, progress=False)
-    for function in (co.Solver, co.evaluate, co.compare, co.worth, co.certify):
+    for function in (co.Solver, co.evaluate, co.worth, co.certify):
         for given in (phases, solution):
             with pytest.raises(co.ProblemError, match="phase"):
                 function(given)
+    with pytest.raises(co.ProblemError, match="phase"):
+        co.compare(solution)
     with pytest.raises(co.ProblemError, match="phase"):
         co.simulate(solution, 10, seed=1)
     with pytest.raises(co.ExportError, match="phase"):

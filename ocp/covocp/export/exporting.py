@@ -40,6 +40,7 @@ from covocp.export.text.self_test import self_test
 from covocp.export.text.source import source
 from covocp.problem.builder import Problem
 from covocp.solution.flight import interpolated_flight
+from covocp.solution.phases import check_begins
 from covocp.solution.solution import Solution
 
 PRECISIONS = {"double": "double", "single": "float"}
@@ -223,6 +224,7 @@ def _solution(
     tables = history(solution, precision)
     laws = [sample_law(solution, tables, tolerance)]
     if solution.loop is not None and feedback:
+        check_begins(solution, "A controller")
         design = design_of(solution, limits)
         warn_outside(design.statement, design.limits, tables)
         if period is None:

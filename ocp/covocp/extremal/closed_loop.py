@@ -96,12 +96,13 @@ class ClosedLoop:
         return float(sum(self.cost.values()))
 
 
-def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoop | None:
+def close_loop(extremal: Extremal, truth: Statistics | None = None, start: Array | None = None) -> ClosedLoop | None:
     """Propagate the covariances of the loop along a solution.
 
     Args:
         extremal: of a statement with a loop.
         truth: the true statistics; None: the design's.
+        start: [E Z; Z' Xhat] at the start, (2n, 2n), where a loop has gone before; None: nothing is estimated yet.
 
     Returns:
         Covariances, gains and costs at the nodes; None where they leave the range of numbers, as along the last iterate
@@ -109,20 +110,20 @@ def close_loop(extremal: Extremal, truth: Statistics | None = None) -> ClosedLoo
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            loop = _propagated(extremal, truth)
+            loop = _propagated(extremal, truth, start)
     except (RuntimeError, np.linalg.LinAlgError):  # a step that cannot be solved: CasADi's error, or numpy's
         return None
     return loop if np.isfinite(loop.expected_cost) else None
 
 
-def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
+def _propagated(extremal: Extremal, truth: Statistics | None, start: Array | None) -> ClosedLoop:
     """What `close_loop` returns."""
     st, mesh = extremal.statement, extremal.mesh
     size = len(st.augmented)
     statistics = truth if truth is not None else design_statistics(extremal)
     n, m = mesh.intervals, loop_substeps(extremal)
     fine = fine_trajectory(extremal, m)
-    values = _joint_covariances(extremal, fine, statistics)
+    values = _joint_covariances(extremal, fine, statistics, start)
     cost, other = _costs(extremal, fine, values, truth is None)
     at = values[::m]
     columns = extremal.columns()
@@ -139,24 +140,25 @@ def _propagated(extremal: Extremal, truth: Statistics | None) -> ClosedLoop:
     )
 
 
-def covariances_along(extremal: Extremal, fine: Array) -> Array:
+def covariances_along(extremal: Extremal, fine: Array, start: Array | None = None) -> Array:
     """Covariances of the deviations at the nodes where the gains are taken from a given course of x, E and S.
 
     Args:
         extremal: of a statement with a loop.
         fine: x and the half-vectors at the starts of equal parts of all intervals and at the ends, (N, m + 1, size).
+        start: as of `close_loop`.
 
     Returns:
         (N + 1, n, n); not finite where such a loop diverges.
     """
     size = len(extremal.statement.augmented)
     with np.errstate(over="ignore", invalid="ignore"):
-        joint = _joint_covariances(extremal, fine, design_statistics(extremal))[:: fine.shape[1] - 1]
+        joint = _joint_covariances(extremal, fine, design_statistics(extremal), start)[:: fine.shape[1] - 1]
     E, Z, Xhat = joint[:, :size, :size], joint[:, :size, size:], joint[:, size:, size:]
     return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
 
 
-def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) -> Array:
+def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, start: Array | None) -> Array:
     """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
     st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
     size = len(st.augmented)
@@ -167,6 +169,8 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics) 
     jumps = {entry.interval: _jump(extremal, entry, statistics) for entry in readings_along(extremal)}
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
     values[0, :size, :size] = statistics.initial
+    if start is not None:
+        values[0] = start
     for k, D in enumerate(stacked(step, n * m)):
         values[k + 1] = lyapunov_after(D, values[k])
         if k % m == m - 1 and k // m in jumps:
@@ -376,8 +380,10 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
     if not best:
         return terms, None
     block = st.matrices[st.behind[0]]
-    at_start = unpack(t.e[0, block.span], size)
-    return terms, float(k.item()) + running + 0.5 * float(np.sum(at_start * joint[0][:size, :size])) + other
+    at_start, at_end = (unpack(t.e[node, block.span], size) for node in (0, -1))
+    first = joint[0][:size, :size] + joint[0][size:, size:]
+    paid_later = 0.5 * float(np.sum((at_end - S) * spread))  # by the phases that follow, where there are some
+    return terms, float(k.item()) + running + 0.5 * float(np.sum(at_start * first)) + other - paid_later
 
 
 @lru_cache(maxsize=KEPT)

@@ -128,7 +128,9 @@ def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array,
 
 
 def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
-    """The same where matrices pass along the nominal: the costate of one that runs backward runs forward, from zero.
+    """The same where matrices pass along the nominal: the costate of one that runs backward runs forward.
+
+    It begins with zero, or with what is before a link.
 
     The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
     both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.
@@ -171,8 +173,8 @@ def without_passage(extremal: Extremal) -> Extremal:
     return replace(extremal, multipliers=replace(m, final=m.final - through))
 
 
-def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float]:
-    """Slopes by x(T) and by T through the matrices that start at T, nu' S(T), nu = k_S - P_S.
+def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float, Array]:
+    """Slopes by x(T), by T and by the parameters through the matrices that start at T, nu' S(T), nu = k_S - P_S.
 
     Args:
         extremal: the solution.
@@ -180,14 +182,14 @@ def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float]:
     """
     st, t = extremal.statement, extremal.trajectory
     if st.matrix_end is None:
-        return np.zeros(st.nx), 0.0
+        return np.zeros(st.nx), 0.0, np.zeros(st.np)
     behind = st.entries(st.behind)
     nu = terminal_costates(extremal)[1][behind] - extremal.multipliers.final_matrices[behind] - given
-    x, duration = ca.MX.sym("x", st.nx), ca.MX.sym("T")
-    value = ca.dot(ca.DM(nu), st.matrix_end(x, duration, extremal.parameters))
-    function = ca.Function("passage_end", [x, duration], [ca.gradient(value, x), ca.gradient(value, duration)])
-    by_x, by_duration = function(t.x[-1], t.duration)
-    return np.asarray(by_x.full()).ravel(), float(by_duration)
+    symbols = [ca.MX.sym("x", st.nx), ca.MX.sym("T"), ca.MX.sym("p", st.np)]
+    value = ca.dot(ca.DM(nu), st.matrix_end(*symbols))
+    function = ca.Function("passage_end", symbols, [ca.densify(ca.gradient(value, symbol)) for symbol in symbols])
+    by_x, by_duration, by_p = function(t.x[-1], t.duration, extremal.parameters)
+    return np.asarray(by_x.full()).ravel(), float(by_duration), np.asarray(by_p.full()).ravel()
 
 
 @lru_cache(maxsize=KEPT)
@@ -380,9 +382,13 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     start, _ = interval(keep * after + known, *rest)
     sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
     backward = list(range(n - 1, -1, -1))
-    given, last_given = given_costates(st, values, extremal.intervals, pairs)
+    behind = st.entries(st.behind)
+    jumps = impulses(extremal)
+    first = -jumps[0, [st.nx + k for k in behind]]
+    jumps[0, [st.nx + k for k in behind]] = 0.0  # these costates are given
+    given, last_given = given_costates(st, values, extremal.intervals, pairs, first)
     points = values[backward].transpose(2, 0, 1).reshape(size, -1)
-    stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), impulses(extremal)[:-1].T)]
+    stacked = [ca.DM(column)[:, backward] for column in (*_restarts(extremal), jumps[:-1].T)]
     last = np.concatenate(terminal_costates(extremal))
     last[_behind(st)] = last_given
     last[: st.nx] += passage_end(extremal, last_given)[0]
@@ -392,7 +398,9 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
 
 
-def given_costates(statement: Statement, values: Array, common: Interval, pairs: int) -> tuple[Array, Array]:
+def given_costates(
+    statement: Statement, values: Array, common: Interval, pairs: int, first: Array | None = None
+) -> tuple[Array, Array]:
     """Costates of the matrices that run backward along a trajectory; none where none does.
 
     Args:
@@ -400,6 +408,7 @@ def given_costates(statement: Statement, values: Array, common: Interval, pairs:
         values: x and e at the starts, middles and ends of the pairs of all intervals, (N, 2 pairs + 1, size).
         common: the intervals, a column for each.
         pairs: Runge-Kutta steps an interval.
+        first: at the start, (rows,); None: zero.
 
     Returns:
         At the same points (N, 2 pairs + 1, rows), and at the end (rows,).
@@ -409,7 +418,9 @@ def given_costates(statement: Statement, values: Array, common: Interval, pairs:
     if not rows:
         return np.zeros((n, points, 0)), np.zeros(0)
     sweep = forward_costates(statement, pairs).mapaccum("forward", n)
-    ends, inside = sweep(np.zeros(rows), values.transpose(2, 0, 1).reshape(size, -1), *common)
+    ends, inside = sweep(
+        np.zeros(rows) if first is None else first, values.transpose(2, 0, 1).reshape(size, -1), *common
+    )
     at_points = np.asarray(inside.full()).reshape(rows, n, points).transpose(1, 2, 0)
     return at_points, np.asarray(ends.full())[:, -1]
 

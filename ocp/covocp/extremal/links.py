@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -12,16 +12,13 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.costates import discrete_costates, terminal_costates
+from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
 from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.chain import Link
 from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.steps import KEPT
-
-# Distance from a bound, relative to the largest magnitude of a state, below which it holds the state.
-AT_BOUND = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +31,7 @@ class ChainOutcome:
     Attributes:
         extremals: the last iterate.
         link_multipliers: of the states that each link gives.
+        bounds_at_ends: multipliers of the bounds on the states where each statement begins and ends, (nx,) each.
         cost_terms: terminal and running cost of each.
         converged: whether the method's own test was met.
         message: how it ended, a sentence.
@@ -43,6 +41,7 @@ class ChainOutcome:
 
     extremals: tuple[Extremal, ...]
     link_multipliers: tuple[Array, ...]
+    bounds_at_ends: tuple[tuple[Array, Array], ...]
     cost_terms: tuple[Mapping[str, float], ...]
     converged: bool
     message: str
@@ -68,6 +67,8 @@ class Within:
         by_duration: slope of what the later statements cost by the duration, through the link.
         end: slopes of what the later ones cost by the state at the end, (nx,).
         end_matrices: by the half-vectors there, (ne,).
+        deviations: [E Z; Z' Xhat] of the closed loop at the start, (2n, 2n); empty without one.
+        handed: 1/2 tr S Xhat there, less that where the next one starts: what the statement's form of the cost lacks.
     """
 
     others: float
@@ -76,17 +77,20 @@ class Within:
     by_duration: float
     end: Annotated[Array, "x"]
     end_matrices: Annotated[Array, "e"]
+    deviations: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    handed: float = 0.0
 
     __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True)
 class Passed:
-    """An extremal of a chain with its costates, and what the rest of the chain says of it."""
+    """An extremal of a chain with its costates, what the rest of the chain says of it, what bounds do at its ends."""
 
     extremal: Extremal
     costates: Costates
     within: Within
+    bounds: tuple[Array, Array]
 
     __repr__ = short_repr
 
@@ -110,14 +114,15 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         links: of the chain.
     """
     sizes = [sum(abs(value) for value in terms.values()) for terms in outcome.cost_terms]
+    extremals = _with_weights(outcome.extremals, links)
     result: list[Passed] = []
-    for i in range(len(outcome.extremals) - 1, -1, -1):
-        extremal = outcome.extremals[i]
+    for i in range(len(extremals) - 1, -1, -1):
+        extremal = extremals[i]
         st = extremal.statement
         slopes = LinkSlopes(state=np.zeros(st.nx), matrices=np.zeros(st.ne), duration=0.0)
         if result:
             later = result[-1]
-            slopes = link_slopes(links[i], extremal, later.extremal, later.costates)
+            slopes = link_slopes(links[i], extremal, later)
             if extremal.mesh.eliminated and st.matrices:
                 m = extremal.multipliers
                 through = replace(m, final_matrices=m.final_matrices + slopes.matrices)
@@ -134,24 +139,40 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
             end=slopes.state,
             end_matrices=slopes.matrices,
         )
-        result.append(Passed(extremal=extremal, costates=discrete_costates(extremal)[0], within=within))
+        costates = discrete_costates(extremal)[0]
+        result.append(Passed(extremal=extremal, costates=costates, within=within, bounds=outcome.bounds_at_ends[i]))
     return tuple(result[::-1])
 
 
-def link_slopes(link: Link, before: Extremal, after: Extremal, costates: Costates) -> LinkSlopes:
+def _with_weights(extremals: tuple[Extremal, ...], links: tuple[Link, ...]) -> list[Extremal]:
+    """The extremals with the slopes of what earlier ones cost by what runs backward, from the first to the last."""
+    result: list[Extremal] = []
+    for i, extremal in enumerate(extremals):
+        if i and links[i - 1].weights:
+            before, link = result[-1], links[i - 1]
+            ended = discrete_costates(before)[0].matrices[-1, before.statement.entries(before.statement.behind)]
+            matrices = extremal.multipliers.matrices.copy()
+            matrices[0, list(link.behind)] = passage_end(before, ended)[2][list(link.weights)]
+            extremal = replace(extremal, multipliers=replace(extremal.multipliers, matrices=matrices))
+        result.append(without_passage(extremal))
+    return result
+
+
+def link_slopes(link: Link, before: Extremal, after: Passed) -> LinkSlopes:
     """Slopes of what the later statements cost by what the statement before a link ends with.
 
-    For a jump x+ = J(x) these are J_x' p+, and for its covariance E+ = J_x E J_x' + N the slopes of tr(P+ E+).
+    For a jump x+ = J(x) these are J_x' (p+ + mu+), mu+ the multipliers of bounds that x+ is at, and for its covariance
+    E+ = J_x E J_x' + N the slopes of tr(P+ E+).
 
     Args:
         link: between both.
         before: the extremal that ends there.
-        after: the extremal that begins there.
-        costates: of the latter.
+        after: what begins there.
     """
-    by_x, by_e = slopes_at_start(after, costates)
+    by_x, by_e = slopes_at_start(after.extremal, after.costates)
+    by_x = by_x + after.bounds[0]
     t = before.trajectory
-    ends = (t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters)
+    ends = (t.x[-1], t.e[-1], t.duration, before.parameters, after.extremal.parameters)
     values = _slopes(link)(*ends, by_x[list(link.states)], by_e[list(link.matrices)])
     state, matrices, duration = (np.asarray(v.full()).ravel() for v in values)
     return LinkSlopes(state=state, matrices=matrices, duration=float(duration[0]))
@@ -182,9 +203,10 @@ def _slopes(link: Link) -> ca.Function:
 
 
 def link_residual(before: Passed, after: Passed, link: Link) -> float:
-    """Largest difference of p(T) and k_x + J_x' p+ at a link, and of p+ and zero where a state starts free.
+    """Largest difference of p(T) and k_x + mu + J_x' (p+ + mu+) at a link, of p+ + mu+ and zero where a state is free.
 
-    Of states that are neither prescribed nor held by a bound there; relative to the largest costate on both sides.
+    mu and mu+ are the multipliers of bounds that act there, which may hold a state on either side of the link. Of
+    states that are not prescribed; relative to the largest costate on both sides.
 
     Args:
         before: what ends there.
@@ -196,8 +218,8 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     own = terminal_slopes(
         first.statement, first.trajectory, first.parameters, first.multipliers.end, first.multipliers.path[-1]
     )[0]
-    missed = (end - own - before.within.end)[_loose(first, -1)]
-    start = slopes_at_start(second, after.costates)[0]
+    missed = (end - own - before.within.end - before.bounds[1])[_loose(first, -1)]
+    start = slopes_at_start(second, after.costates)[0] + after.bounds[0]
     given = np.isin(np.arange(start.size), link.states)
     free = _loose(second, 0) & ~given
     missed = np.concatenate([missed, start[free], (start + after.within.start)[given & _loose(second, 0)]])
@@ -206,10 +228,8 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
 
 
 def _loose(extremal: Extremal, node: int) -> Any:
-    """Entries of the state at the first or last node that are neither prescribed nor at a bound."""
-    st, x = extremal.statement, extremal.trajectory.x
+    """Entries of the state at the first or last node that are not prescribed, there or by equal bounds."""
+    st = extremal.statement
     lower, upper = st.state_bounds
     known = st.boundary_values(extremal.parameters)[0 if node == 0 else 1]
-    size = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
-    inside = np.minimum(x[node] - lower, upper - x[node]) > AT_BOUND * size
-    return np.isnan(known) & inside
+    return np.isnan(known) & (lower < upper)

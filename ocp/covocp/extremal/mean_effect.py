@@ -63,10 +63,11 @@ def noted(effect: MeanEffect | None) -> dict[str, Any]:
     return {} if effect is None else {NOTE + f.name: getattr(effect, f.name) for f in fields(MeanEffect)}
 
 
-def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
+def mean_effect(extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array] | None = None) -> MeanEffect | None:
     """The effect of the rates' and measurements' curvature along a solution.
 
-    None where rates contain a matrix, where the loop leaves the range of numbers or a step cannot be solved.
+    None where rates contain a matrix, where the loop leaves the range of numbers or a step cannot be solved. `start` is
+    what d and y begin with where a phase went before; None: zero.
     """
     st = extremal.statement
     if st.nominal is None or st.loop is None:
@@ -76,7 +77,10 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop) -> MeanEffect | None:
     if not all(np.isfinite(values).all() for side in sides for values in side):
         return None
     state, h, cost = np.zeros(2 * n), np.diff(extremal.time), 0.0
+    if start is not None:
+        state = np.concatenate(start)
     states = np.zeros((count + 1, 2 * n))
+    states[0] = state
     jumps = {
         entry.interval: (entry.gain @ entry.H, entry.gain @ bent) for entry, bent in _bent_readings(extremal, loop)
     }

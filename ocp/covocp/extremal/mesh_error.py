@@ -80,6 +80,9 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
         weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
     change = float(np.sum(weights * jumps)) + finer.running - running
     change += _at_the_end(extremal, finer.matrices[-1]) - _at_the_end(extremal, t.e[-1])
+    if st.behind:  # what the phases before a link cost by what runs backward, at the start
+        behind = st.entries(st.behind)
+        change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
     return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
 
 

@@ -18,8 +18,11 @@ from covocp.problem.tangents import Moved, drift, moved, tangent_rate
 from covocp.statement.statement import entry_names, error_size
 
 
-def expand(problem: Declarations, expected: Expected) -> Expansion:
-    """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet."""
+def expand(problem: Declarations, expected: Expected, later: Expr = None) -> Expansion:
+    """Slopes of the rates and second derivatives of the cost [Schmidt 6.2, 6.3]; the gain is not known yet.
+
+    `later` is what deviations at the end cost in phases that follow; None: nothing.
+    """
     rates = _rates(problem)
     at = moved(problem.augmented)
     controls = [entry.symbol for entry in problem.controls]
@@ -27,8 +30,9 @@ def expand(problem: Declarations, expected: Expected) -> Expansion:
     by_state = slope_by(running, at.by).T
     at_end = slope_by(terminal, at.by).T
     weight = _weight_matrix(expected.terminal_weight, problem.augmented, "terminal weight")
-    end = at.at_rest(slope_by(at_end, at.by)) + (0 if weight is None else weight)
-    _check_terminal_weights(problem, end)
+    end = at.at_rest(slope_by(at_end, at.by))
+    end = end if weight is None else end + weight  # a zero that is added to an empty matrix of one row fills it
+    _check_terminal_weights(problem, end if later is None else end + later)
     return Expansion(
         F=_drift(problem, at, rates),
         G=slope_by(rates, controls),

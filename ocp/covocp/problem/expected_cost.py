@@ -137,11 +137,13 @@ def statement_of(problem: Declarations) -> Statement:
     return freeze(problem)
 
 
-def derive(problem: Declarations) -> Declarations:
+def derive(problem: Declarations, *, part: bool = False, later: Expr = None) -> Declarations:
     """The deterministic vector-matrix problem of a problem with an expected cost.
 
     Args:
         problem: with `minimize_expected`.
+        part: whether it is one of several phases: what is uncertain may then come from another one.
+        later: weight of the deviations at its end, (n, n), that the phases after it ask for; None: nothing follows.
 
     Returns:
         Declarations on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
@@ -152,7 +154,8 @@ def derive(problem: Declarations) -> Declarations:
     """
     expected = problem.expected
     assert expected is not None
-    _check_random(problem)
+    if not part:
+        check_random((problem,))
     _check_contents(problem, expected)
     check_expected(problem, [expected.running, expected.terminal])
     check_order(problem)
@@ -163,7 +166,7 @@ def derive(problem: Declarations) -> Declarations:
         derived = with_estimation(derived)
     _check_free_names(derived)
     assert problem.expected is not None
-    expansion = with_weights(problem, expand(derived, problem.expected), *spread)
+    expansion = with_weights(problem, expand(derived, problem.expected, later), *spread)
     E = next(matrix.matrix for matrix in derived.matrices if matrix.estimation)
     size = E.shape[0]
     jacobian, density = measurement_slope(derived, size)
@@ -173,7 +176,8 @@ def derive(problem: Declarations) -> Declarations:
         blocks = [(entry.noise, entry.information) for entry in derived.continuous]
         information = innovation @ inverse_density(density, blocks, _inverse) @ innovation.T
     if gain is None:
-        derived, S, expansion = _with_feedback(derived, expansion)
+        end = expansion.end if later is None else expansion.end + later
+        derived, S, expansion = _with_feedback(derived, expansion, end)
         fed = S @ expansion.G + expansion.N
         regained = _trace(S, expansion.Q) + _trace(fed @ _inverse(expansion.B) @ fed.T, E)
         expansion = replace(expansion, alternative=expansion.running + regained / 2, product=_trace(S, E) / 2)
@@ -239,12 +243,13 @@ def deterministic(problem: Declarations) -> Declarations:
     return replace(problem, cost=cost, expected=None, matrices=matrices)
 
 
-def _check_random(problem: Declarations) -> None:
-    """Something must be uncertain, or the expected cost is the deterministic one."""
-    variances = [entry.variance for entry in problem.augmented]
-    densities = [entry.noise for entry in problem.rates.values() if entry.noise is not None]
-    started = [m.initial for m in problem.matrices if m.estimation]
-    uncertain = [*(started or variances), *densities]
+def check_random(problems: Sequence[Declarations]) -> None:
+    """Something must be uncertain in a problem or in several phases, or the expected cost is the deterministic one."""
+    uncertain: list[Any] = []
+    for problem in problems:
+        started = [m.initial for m in problem.matrices if m.estimation]
+        uncertain += started or [entry.variance for entry in problem.augmented]
+        uncertain += [entry.noise for entry in problem.rates.values() if entry.noise is not None]
     if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
         raise ProblemError(
             "The expected cost is deterministic: nothing in the system is uncertain.",
@@ -318,13 +323,13 @@ def _inverse(density: Expr) -> Any:
     return ca.Function("inverse", [entries], [ca.inv(entries)])(density)
 
 
-def _with_feedback(problem: Declarations, expansion: Expansion) -> tuple[Declarations, Any, Expansion]:
-    """Add the backward matrix S with its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
+def _with_feedback(problem: Declarations, expansion: Expansion, end: Expr) -> tuple[Declarations, Any, Expansion]:
+    """Add the backward matrix S with S(T) and its Riccati form in forward time; S and the gain C = B^-1 (G' S + N')."""
     labels = error_names(problem.augmented)
     F, G, A, N = expansion.F, expansion.G, expansion.A, expansion.N
     weight = _inverse(expansion.B)
     form = (-(F - G @ weight @ N.T).T, -(A - N @ weight @ N.T), -(G @ weight @ G.T))
-    backward = Backward(end=expansion.end, form=form)
+    backward = Backward(end=end, form=form)
     feedback = declare_matrix(FEEDBACK, labels=labels, where="minimize_expected()", backward=backward)
     S = feedback.matrix
     return problem.adding(matrices=feedback), S, replace(expansion, gain=weight @ (G.T @ S + N.T))

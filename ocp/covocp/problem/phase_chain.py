@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NoReturn
@@ -11,12 +11,14 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, pack_symbolic
 from covocp.problem.decisions import decisions_of, matters
-from covocp.problem.declarations import Declarations, Matrix, Parameter, State, Unknown
+from covocp.problem.declarations import Declarations, Matrix, Parameter
 from covocp.problem.freeze import freeze
+from covocp.problem.phase_feedback import WEIGHT, deviations, in_phase, tangent, with_feedback
 from covocp.statement.chain import Chain, Link
-from covocp.statement.statement import Statement, entries_of, entry_names
+from covocp.statement.statement import Statement, entries_of, entry_names, error_size
 
 
 def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], jumps: Sequence[Any]) -> Chain:
@@ -34,10 +36,11 @@ def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], ju
     phases = [replace(phase, name=own) for phase, own in zip(phases, names, strict=True)]
     for phase in phases:
         _check_kinds(phase)
-    _check_cost(phases)
     _check_constants(phases)
-    _check_decisions(phases, jumps)
     jumping = [{j.name: j for j in jumps if j.phase == k} for k in range(len(phases))]
+    phases = with_feedback(phases, jumping)
+    _check_cost(phases)
+    _check_decisions(phases, jumps)
     own = [replace(phases[0], cost=phases[0].cost or _no_cost())]
     links: list[Link] = []
     for k in range(1, len(phases)):
@@ -46,7 +49,18 @@ def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], ju
         later = _carrying(phases[k], carried)
         links.append(_link(own[-1], later, carried, jumping[k]))
         own.append(replace(later, cost=later.cost or _no_cost()))
-    return Chain(name=name, statements=tuple(_frozen(phase) for phase in own), links=tuple(links))
+    statements = tuple(_frozen(phase) for phase in own)
+    return Chain(name=name, statements=statements, links=tuple(_weighed(statements, links)))
+
+
+def _weighed(statements: Sequence[Statement], links: Sequence[Link]) -> Iterator[Link]:
+    """The links with the places of S of a closed loop: at the later start, and among the parameters before it."""
+    for link, before, after in zip(links, statements[:-1], statements[1:], strict=True):
+        if not after.behind:
+            yield link
+            continue
+        span = next(block.span for block in before.of_kind("parameter") if block.name == WEIGHT)
+        yield replace(link, behind=tuple(after.entries(after.behind)), weights=tuple(range(span.start, span.stop)))
 
 
 def _frozen(phase: Declarations) -> Statement:
@@ -54,8 +68,7 @@ def _frozen(phase: Declarations) -> Statement:
     try:
         return freeze(phase, part=True)
     except ProblemError as error:
-        own = {name: getattr(error, name) for name in ("expected", "received", "remedy")}
-        raise ProblemError(f"In the phase '{phase.name}': {error.problem}", **own) from error
+        raise in_phase(phase, error) from error
 
 
 def _no_cost() -> tuple[ca.MX, ca.MX]:
@@ -69,13 +82,6 @@ def _refuse(what: str, expected: str, received: str, remedy: str) -> NoReturn:
 
 def _check_kinds(phase: Declarations) -> None:
     """What phases cannot have, by name."""
-    if phase.expected is not None or phase.spread is not None:
-        _refuse(
-            f"The phase '{phase.name}' has an expected cost or the covariance of a closed loop.",
-            "minimize(): phases have a nominal and its estimation covariance, without feedback",
-            "minimize_expected() or closed_loop_covariance()",
-            "state the cost by minimize(), or solve one Problem by itself",
-        )
     for constraint in phase.constraints:
         if constraint.chance is not None:
             _refuse(
@@ -238,7 +244,7 @@ def _check_pair(before: Declarations, after: Declarations, jumps: dict[str, Any]
                 f"none in '{before.name}'",
                 "call estimation_covariance() there too: what is not measured there grows with its noise",
             )
-        plain = not matrix.estimation and matrix.role == "moving" and matrix.name in names
+        plain = not matrix.estimation and matrix.role == "moving" and matrix.name in names and matrix.backward is None
         if plain and not _free_matrix(matrix):
             _refuse(
                 f"The matrix '{matrix.name}' goes on {pair} and has an initial value too.",
@@ -277,7 +283,7 @@ def _carried(before: Declarations, after: Declarations) -> list[tuple[Matrix, Pa
     names = {matrix.name for matrix in before.matrices if matrix.role == "moving"}
     result = []
     for matrix in after.matrices:
-        if matrix.role != "moving" or matrix.name not in names:
+        if matrix.role != "moving" or matrix.backward is not None or matrix.name not in names:
             continue
         name, size = f"{matrix.name}(0)", half_length(matrix.size)
         start = np.asarray(ca.evalf(pack_symbolic(ca.MX.eye(matrix.size))).full()).ravel()
@@ -327,6 +333,9 @@ def _link(
         halves.append(earlier[matrix.name].symbol if after_jump is None else pack_symbolic(after_jump))
         places += span
         names += [f"continuity of {name} from '{before.name}' to '{after.name}'" for name in entries_of(matrix)]
+    expected = before.expansion is not None
+    size = sum(error_size(entry) for entry in before.augmented)
+    covariance = ca.MX.sym("X", size, size)
     first = sum(p.size for p in after.parameters) - sum(p.size for _, p in carried)
     count = sum(p.size for _, p in carried)
     return Link(
@@ -334,34 +343,23 @@ def _link(
         matrices=tuple(places),
         parameters=tuple(range(first, first + count)),
         names=tuple(names),
-        function=_function(before, after, jumps, ca.vertcat(ca.MX(0, 1), *values), ca.vertcat(ca.MX(0, 1), *halves)),
+        function=_function(before, after, jumps, [ca.vertcat(ca.MX(0, 1), *values), ca.vertcat(ca.MX(0, 1), *halves)]),
+        deviations=_function(before, after, jumps, deviations(before, after, jumps, covariance), covariance)
+        if expected
+        else None,
     )
 
 
 def _covariance(before: Declarations, after: Declarations, E: Matrix, jumps: dict[str, Any]) -> Any:
     """J E J' + N: by the tangents of the jumps, with the variances of what appears and the noise of the jumps."""
-    columns: list[State | Unknown] = before.augmented
-    own = {entry.name: entry for entry in columns}
-    rows: list[Any] = []
-    added: list[Any] = []
-    for entry in after.augmented:
-        none = ca.MX(entry.size, entry.size)
-        if entry.name in jumps:
-            value, noise = jumps[entry.name].expression, jumps[entry.name].noise
-        elif entry.name in own:
-            value, noise = own[entry.name].symbol, none
-        else:
-            value, noise = ca.MX.zeros(entry.size, 1), entry.variance
-        rows.append(ca.horzcat(*(ca.jacobian(value, column.symbol) for column in columns)))
-        added.append(noise)
-    J = ca.vertcat(*rows)
-    return J @ E.matrix @ J.T + ca.diagcat(*added)
+    _, J, added = tangent(before, after, jumps)
+    return J @ E.matrix @ J.T + added
 
 
 def _function(
-    before: Declarations, after: Declarations, jumps: dict[str, Any], states: ca.MX, matrices: ca.MX
+    before: Declarations, after: Declarations, jumps: dict[str, Any], values: list[Any], further: Expr = None
 ) -> ca.Function:
-    """(x, e, T, p of the phase before, p of the later one) -> states and half-vectors that are given.
+    """(x, e, T, p of the phase before, p of the later one[, a further symbol]) -> values.
 
     Raises:
         ProblemError: a symbol that is no part of how the phase before ends.
@@ -388,9 +386,11 @@ def _function(
     for group, column in zip(groups, stacked, strict=True):
         offsets = np.cumsum([0, *(symbol.shape[0] for symbol in group)]).tolist()
         arguments += [column[i:j] for i, j in pairwise(offsets)]
-    inner = ca.Function("link", [symbol for group in groups for symbol in group], [states, matrices])
-    outputs = [ca.densify(value) for value in inner.call(arguments, True, False)]
-    return ca.Function("link", stacked, outputs, ["x", "e", "T", "p", "later"], ["states", "matrices"])
+    more = [] if further is None else [further]
+    inner = ca.Function("link", [*(symbol for group in groups for symbol in group), *more], values)
+    outputs = [ca.densify(value) for value in inner.call([*arguments, *more], True, False)]
+    inputs = ["x", "e", "T", "p", "later", *("X" for _ in more)]
+    return ca.Function("link", [*stacked, *more], outputs, inputs, [f"value_{i}" for i in range(len(outputs))])
 
 
 def _check_known(what: str, phase: Declarations, expression: Any, known: set[Any]) -> None:

@@ -30,6 +30,7 @@ from covocp.simulation.step_choice import StepChoice, choose_step, examined, giv
 from covocp.simulation.verdict import LEFT
 from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution.origin import Origin
+from covocp.solution.phases import check_begins
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
 from covocp.statement.names import control_limits
@@ -148,6 +149,7 @@ def _design(solution: Solution) -> System:
                 solution, "instead", "solve or evaluate the problem first: simulate(solve(problem), runs, seed)"
             ),
         )
+    check_begins(solution, "simulate()")
     if solution.origin is Origin.OTHER_TRUTH:
         raise ProblemError(
             "This solution was evaluated under other statistics, which simulate() does not see in it.",

@@ -71,7 +71,8 @@ def interpolated_flight(solution: Solution) -> Flight:
         solution: with a loop and its problem.
     """
     assert solution.loop is not None
-    flown = covariances_along(solution.extremal, _interpolated(solution))
+    start = None if solution.within is None else solution.within.deviations
+    flown = covariances_along(solution.extremal, _interpolated(solution), start)
     return compared(solution, flown, solution.loop.X, solution.t)
 
 

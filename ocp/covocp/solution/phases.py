@@ -47,6 +47,25 @@ def check_whole(solution: Solution, what: str) -> None:
         )
 
 
+def check_begins(solution: Solution, what: str) -> None:
+    """A solution must not be that of a phase into which feedback has brought deviations that were estimated before.
+
+    Args:
+        solution: to be checked.
+        what: is asked of it, a function.
+
+    Raises:
+        ProblemError: it is.
+    """
+    if solution.within is not None and solution.loop is not None and solution.loop.Xhat[0].any():
+        raise ProblemError(
+            f"{what} does not apply to the phase '{solution.name}': it begins with what the feedback before it left.",
+            expected="the first phase, or the solution of a Problem by itself",
+            received=f"the phase '{solution.name}', whose estimate is not zero where it begins",
+            remedy="its covariances, gains and cost are in .loop, .gains and .cost",
+        )
+
+
 @methods_one_at_a_time
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhasesSolution:

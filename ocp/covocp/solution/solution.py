@@ -30,6 +30,7 @@ from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.extremal.phase_loops import PhaseLoop
 from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
@@ -99,18 +100,30 @@ class Solution:
     within: Within | None = None
 
     @staticmethod
-    def of(outcome: Outcome, method: str, within: Within | None = None, *, assess: bool = True) -> Solution:
-        """The solution of an outcome, with the estimate of its mesh error, or nan in its place."""
+    def of(
+        outcome: Outcome,
+        method: str,
+        within: Within | None = None,
+        closed: PhaseLoop | None = None,
+        *,
+        assess: bool = True,
+    ) -> Solution:
+        """The solution of an outcome, with the estimate of its mesh error, or nan in its place.
+
+        `closed` is the loop of one of several phases, which begins where that before it ends.
+        """
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
-        loop = close_loop(extremal) if st.loop is not None and np.isfinite(rates).all() else None
+        loop = None if closed is None else closed.loop
+        if closed is None and st.loop is not None and np.isfinite(rates).all():
+            loop = close_loop(extremal)
         read_only(extremal.trajectory)
         solution = Solution(
             name=st.name,
             method=method,
             converged=outcome.converged,
             message=outcome.message,
-            cost_terms=_split_cost(outcome.cost_terms, loop),
+            cost_terms=_split_cost(outcome.cost_terms, loop, 0.0 if closed is None else closed.handed),
             extremal=extremal,
             rates=rates,
             end_rates=end_rates,
@@ -222,7 +235,7 @@ class Solution:
     @cached
     def mean_effect(self) -> MeanEffect | None:
         """What curved rates and measurements do to the mean of the loop, left out of the cost; None where unknown."""
-        if self.loop is None or self.statement is None:
+        if self.loop is None or self.statement is None or self.within is not None:
             return remembered(self.stats)
         return mean_effect(self.extremal, self.loop)
 
@@ -512,9 +525,9 @@ class Solution:
         return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
 
 
-def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None) -> dict[str, float]:
-    """Cost by term; of an expected cost the nominal's terms and what the deviations add."""
+def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None, handed: float) -> dict[str, float]:
+    """Cost by term; of an expected cost the nominal's terms and what the deviations add, also those handed over."""
     if loop is None:
         return dict(terms)
     nominal = {name: loop.cost[name] for name in ("terminal", "running", COVARIANCES) if name in loop.cost}
-    return nominal | {"deviations": float(sum(terms.values())) - sum(nominal.values())}
+    return nominal | {"deviations": float(sum(terms.values())) + handed - sum(nominal.values())}

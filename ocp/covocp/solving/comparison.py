@@ -19,9 +19,11 @@ from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
 from covocp.extremal.mesh_error import NO_COST
+from covocp.problem.phases import Phases
+from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, method_options
-from covocp.solving.solver import Solver, check_problem
+from covocp.solving.solver import Solver, check_problem, solve
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -41,14 +43,14 @@ class Row:
     Attributes:
         label: of the run, unique.
         method: its name.
-        solution: what came out, converged or not; None where nothing did.
+        solution: what came out, converged or not, of phases a `PhasesSolution`; None where nothing did.
         reason: why there is no converged solution; "" where there is one.
         seconds: building and solving, as a user waits for it.
     """
 
     label: str
     method: str
-    solution: Solution | None = field(repr=False)
+    solution: Solution | Any | None = field(repr=False)
     reason: str
     seconds: float
 
@@ -71,7 +73,7 @@ class Comparison:
     __repr__ = short_repr
 
     @property
-    def solutions(self) -> Mapping[str, Solution]:
+    def solutions(self) -> Mapping[str, Solution | Any]:
         """What came out, by label, converged or not."""
         return {row.label: row.solution for row in self.rows if row.solution is not None}
 
@@ -86,7 +88,7 @@ class Comparison:
         costs = [row.solution.cost for row in self.rows if row.solution is not None and row.solution.converged]
         return min(costs, default=float("nan"))
 
-    def __getitem__(self, key: str | int) -> Solution:
+    def __getitem__(self, key: str | int) -> Solution | Any:
         """The solution of a label or number.
 
         Raises:
@@ -116,7 +118,18 @@ class Comparison:
         return len(self.rows)
 
     def plot(self, *names: Any, path: str | Path | None = None, **options: Any) -> Figure:
-        """Draw all solutions in one figure; see `covocp.plot.figure.plot_solutions`."""
+        """Draw all solutions in one figure; see `covocp.plot.figure.plot_solutions`.
+
+        Raises:
+            ProblemError: they are of phases.
+        """
+        if self._of_phases:
+            raise _wrong(
+                "Solutions of phases are not drawn in one figure.",
+                "solutions of a Problem",
+                f"those of '{self.name}'",
+                "draw each by itself: comparison[label].plot()",
+            )
         figures = later("plot.figure")
         figures.check_plot_options(options)
         labels = list(self.solutions)
@@ -130,13 +143,19 @@ class Comparison:
             **options,
         )
 
+    @property
+    def _of_phases(self) -> bool:
+        """Whether the runs are of phases."""
+        return any(isinstance(solution, PhasesSolution) for solution in self.solutions.values())
+
     def __str__(self) -> str:
         """The table that print shows."""
         return as_text(self._sections())
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the same table, and the figure."""
-        return as_html(self._sections(), later("plot.embedding").embedded(self.plot) if self.solutions else "")
+        drawn = self.solutions and not self._of_phases
+        return as_html(self._sections(), later("plot.embedding").embedded(self.plot) if drawn else "")
 
     def _sections(self) -> list[Section]:
         """The name, the table, why runs failed, and what the columns mean."""
@@ -158,10 +177,10 @@ class Comparison:
 @one_at_a_time
 @checked(methods=either(text, sequence), progress=truth, method_options=optional(mapping))
 def compare(
-    problem: Problem,
+    problem: Problem | Phases,
     methods: Sequence[Any] = DEFAULT,
     *,
-    intervals: int | None = None,
+    intervals: Given = None,
     guess: Given = None,
     progress: bool = True,
     method_options: Mapping[str, Mapping[str, Any]] | None = None,
@@ -170,11 +189,12 @@ def compare(
     """Solve a problem by several methods, or in several formulations, and set the results side by side.
 
     Args:
-        problem: what to solve.
+        problem: what to solve; or phases.
         methods: names of methods, or (label, method, options) for a formulation of its own, such as
             ("states", "ipopt", {"covariances": "states"}).
         intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`.
-        guess: where all runs start; see `Solver.solve`.
+            Of phases as of `solve`.
+        guess: where all runs start; see `Solver.solve`; of phases `solve`.
         progress: whether to show the iterations on a terminal.
         method_options: options by method.
         options: for all runs; every method must know them.
@@ -185,8 +205,11 @@ def compare(
     Raises:
         ProblemError: the statement is wrong, a method or an option is unknown, or two runs have the same label.
     """
-    check_problem(problem)
-    statement = problem.statement()
+    if isinstance(problem, Phases):
+        name = problem.chain().name
+    else:
+        check_problem(problem)
+        name = problem.statement().name
     runs = _runs(methods, {"intervals": intervals, "guess": guess, **options}, dict(method_options or {}))
     rows: list[Row] = []
     for label, method, chosen in runs:
@@ -194,16 +217,20 @@ def compare(
             rows.append(Row(label=label, method=method, solution=None, reason="not run: interrupted", seconds=0.0))
         else:
             rows.append(_run(problem, label, method, chosen, progress))
-    return Comparison(name=statement.name, rows=tuple(rows))
+    return Comparison(name=name, rows=tuple(rows))
 
 
-def _run(problem: Problem, label: str, method: str, options: dict[str, Any], progress: bool) -> Row:
+def _run(problem: Problem | Phases, label: str, method: str, options: dict[str, Any], progress: bool) -> Row:
     """One run, whatever comes of it."""
     begin = time.perf_counter()
     starting = {name: options.pop(name) for name in SOLVE_OPTIONS if name in options}
-    solution, reason = None, ""
+    solution: Solution | Any | None = None
+    reason = ""
     try:
-        solution = Solver(problem, method, **options).solve(progress=progress, allow_failure=True, **starting)
+        if isinstance(problem, Phases):
+            solution = solve(problem, method, progress=progress, allow_failure=True, **options, **starting)
+        else:
+            solution = Solver(problem, method, **options).solve(progress=progress, allow_failure=True, **starting)
         reason = "" if solution.converged else f"did not converge: {solution.message}"
     except Interrupted as error:
         solution, reason = error.solution, f"{INTERRUPTED}: {error}"
@@ -282,21 +309,28 @@ def _entries(row: Row, best: float) -> list[str]:
     if solution is None:
         return ["-", "-", "-", "-", "-", "-", "-", seconds]
     gap = (solution.cost - best) / max(abs(best), NO_COST)
+    phases: tuple[Solution, ...] = tuple(solution) if isinstance(solution, PhasesSolution) else (solution,)
     slope, costates = None, None
     with suppress(CovocpError, RuntimeError, ArithmeticError, ValueError):
-        slope, costates = solution.optimality.stationarity, solution.optimality.costate_difference
+        slope = _largest([phase.optimality.stationarity for phase in phases])
+        costates = _largest([phase.optimality.costate_difference for phase in phases])
     iterations = int(solution.stats.get("iterations", -1))
-    smallest = solution.smallest_eigenvalue
+    smallest = min(phase.smallest_eigenvalue for phase in phases)
     return [
         number(solution.cost, 9),
         "-" if not solution.converged or np.isnan(gap) else "0" if gap == 0 else f"{gap:.1e}",
         _short(slope),
         _short(costates),
-        _short(terminal_miss(solution)),
+        _short(_largest([terminal_miss(phase) for phase in phases])),
         "-" if np.isinf(smallest) else f"{smallest:.2e}",
         str(iterations) if iterations >= 0 else "-",
         seconds,
     ]
+
+
+def _largest(values: list[float | None]) -> float | None:
+    """The largest of those that are known."""
+    return max((value for value in values if value is not None), default=None)
 
 
 def _short(value: float | None) -> str:

@@ -95,6 +95,9 @@ def _of_phases(solution: PhasesSolution, phases: Problem | Phases | None) -> Pha
         if stored.size == later.np:  # where its matrices start: what the jump gives is compared below
             filled = link.filled(later.values, stored[list(link.parameters)])
             statements[i + 1] = replace(later, values=filled)
+        if link.weights and solution[i].parameters.size == statements[i].np:
+            weighed = link.weighed(statements[i].values, solution[i].parameters[list(link.weights)])
+            statements[i] = replace(statements[i], values=weighed)
     pairs = zip(solution.phases, statements, strict=True)
     result = replace(solution, phases=tuple(attached(phase, statement) for phase, statement in pairs))
     for i, link in enumerate(chain.links):
@@ -109,14 +112,23 @@ def _check_link(link: Link, before: Solution, after: Solution) -> None:
         ProblemError: it is not.
     """
     t, later = before.trajectory, after.trajectory
-    given = link.values(t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters)
-    stored = later.x[0, list(link.states)], later.e[0, list(link.matrices)]
-    sizes = np.abs(later.x).max(axis=0)[list(link.states)], np.full(len(link.matrices), np.abs(later.e).max(initial=0))
+    given: tuple[Any, ...] = link.values(t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters)
+    stored: tuple[Any, ...] = (later.x[0, list(link.states)], later.e[0, list(link.matrices)])
+    sizes: tuple[Any, ...] = (
+        np.abs(later.x).max(axis=0)[list(link.states)],
+        np.full(len(link.matrices), np.abs(later.e).max(initial=0)),
+    )
+    names = link.names
+    if link.weights:
+        weights = before.parameters[list(link.weights)], later.e[0, list(link.behind)]
+        given, stored = (*given, weights[0]), (*stored, weights[1])
+        sizes = (*sizes, np.full(weights[0].size, np.abs(weights[0]).max()))
+        names = (*names, *(f"weight {after.extremal.statement.matrix_names[k]} of deviations" for k in link.behind))
     wrong = np.abs(np.concatenate(given) - np.concatenate(stored)) > SAME_LINK * np.concatenate(sizes)
     if before.converged and wrong.any():
         k = int(np.argmax(wrong))
         raise ProblemError(
-            f"The stored solution is of other phases: the {link.names[k]} differs.",
+            f"The stored solution is of other phases: the {names[k]} differs.",
             expected=f"as stored: {np.concatenate(stored)[k]:g}",
             received=f"as given: {np.concatenate(given)[k]:g}",
             remedy="give the phases that were solved, with their jumps, or load without them",

@@ -17,7 +17,9 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome
 from covocp.extremal.links import ChainOutcome, completed, link_residual
+from covocp.extremal.mean_effect import noted
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
+from covocp.extremal.phase_loops import PhaseLoop, phase_loops
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
@@ -28,6 +30,7 @@ from covocp.solving.unused import mention_lengths
 from covocp.solving.warm_start import make_guesses
 from covocp.statement.chain import Chain, started_at
 from covocp.statement.names import name_of, stacked_parameters
+from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.stiffness import resolve_mesh
@@ -73,7 +76,7 @@ def solve_phases(
         asked = f"nominal='{nominal}'" if nominal != "combined" else f"guess={guess!r}"
         raise ProblemError(
             "Phases are not solved that way.",
-            expected="method='ipopt', nominal='combined', and a guess for each phase or none",
+            expected="nominal='combined', and a guess for each phase or none",
             received=f"method='{method}'" if prepare is None else asked,
             remedy="leave the option out",
         )
@@ -251,8 +254,30 @@ class _Run:
         """A guess for each phase, each of which starts where the one before it ends.
 
         Returns:
-            The guesses; the parameters with the matrices that a phase then starts with; the options, graded for them.
+            The guesses; the parameters with the matrices that a phase then starts with, and with the weights that the
+            next one has where it begins; the options, graded for them.
         """
+        found = self._forward(options, values, guesses, attempt)
+        if any(link.weights for link in self._chain.links):
+            found = self._forward(options, self._weighed(*found), guesses, attempt)
+        return found
+
+    def _weighed(self, guesses: tuple[Guess, ...], values: Arrays, options: tuple[Options, ...]) -> Arrays:
+        """The parameters with S of each later phase along its guess, where it begins; from the last to the first."""
+        result = list(values)
+        for i in range(len(values) - 1, 0, -1):
+            st, link, t = self._chain.statements[i], self._chain.links[i - 1], guesses[i].trajectory
+            mesh = resolve_mesh(st, options[i], result[i])
+            along = matrices_function(st, mesh)(t.x.T, t.u.T, t.duration, result[i])
+            start = np.asarray(along[0].full())[list(link.behind), 0]
+            if np.isfinite(start).all():
+                result[i - 1] = link.weighed(result[i - 1], start)
+        return tuple(result)
+
+    def _forward(
+        self, options: tuple[Options, ...], values: Arrays, guesses: list[Any], attempt: int
+    ) -> tuple[tuple[Guess, ...], Arrays, tuple[Options, ...]]:
+        """What `_start` returns, from the first phase to the last, for the weights that are among the parameters."""
         found: list[Guess] = []
         filled: list[Array] = []
         fine: list[Options] = []
@@ -271,6 +296,9 @@ class _Run:
 
 def _solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolution:
     """An outcome as solutions of the phases."""
+    loops: tuple[PhaseLoop | None, ...] = (None,) * len(outcome.extremals)
+    if chain.statements[0].loop is not None:
+        loops = phase_loops(outcome.extremals, chain.links)
     try:
         passed = completed(outcome, chain.links)
     except (RuntimeError, ArithmeticError, ValueError):  # costates of a last iterate that is not finite
@@ -278,19 +306,22 @@ def _solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolutio
             raise
         passed = None
     phases = []
-    for i, (st, terms) in enumerate(zip(chain.statements, outcome.cost_terms, strict=True)):
+    for i, (st, terms, closed) in enumerate(zip(chain.statements, outcome.cost_terms, loops, strict=True)):
         prefix = f"{st.name}: "
         own = {name.removeprefix(prefix): v for name, v in outcome.violations.items() if name.startswith(prefix)}
         entry = None if passed is None else passed[i]
+        within = None if entry is None else entry.within
+        if within is not None and closed is not None:
+            within = replace(within, deviations=closed.start, handed=closed.handed)
         single = Outcome(
             extremal=outcome.extremals[i] if entry is None else entry.extremal,
             cost_terms=terms,
             converged=outcome.converged,
             message=outcome.message,
             violations=own,
-            stats=outcome.stats,
+            stats={**outcome.stats, **noted(None if closed is None else closed.mean)},
         )
-        phases.append(Solution.of(single, method, None if entry is None else entry.within))
+        phases.append(Solution.of(single, method, within, closed))
     residuals = (
         ()
         if passed is None

@@ -468,7 +468,7 @@ def solve(
     """Solve a problem; `Solver` behind it solves again without rebuilding. Or several phases as one problem.
 
     Args:
-        problem: what to solve; `Phases`: by the method "ipopt".
+        problem: what to solve.
         method: a name in `methods()`.
         intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of
             each, or a list of one for each.

@@ -22,6 +22,11 @@ class Link:
     names: of the rows, states first.
     function: (state and half-vectors at the end, duration, parameters, parameters of the later statement) -> states,
         matrices.
+    behind: entries of the later half-vectors at the start that the statement before takes as parameters: S of an
+        expected cost, what deviations cost from there on.
+    weights: where these lie among its parameters.
+    deviations: of an expected cost, (the same, covariance X of the deviations at the end) -> tangent J_x of what the
+        later augmented state is by the one before, variances that are added, half of tr(J_xx X).
     """
 
     states: tuple[int, ...]
@@ -29,6 +34,9 @@ class Link:
     parameters: tuple[int, ...]
     names: tuple[str, ...]
     function: ca.Function
+    behind: tuple[int, ...] = ()
+    weights: tuple[int, ...] = ()
+    deviations: ca.Function | None = None
 
     __repr__ = short_repr
 
@@ -41,6 +49,12 @@ class Link:
         """The parameters of the later statement with the half-vectors at its start."""
         result = later.copy()
         result[list(self.parameters)] = matrices
+        return result
+
+    def weighed(self, earlier: Array, start: Array) -> Array:
+        """The parameters of the earlier statement with what runs backward in the later one, at its start."""
+        result = earlier.copy()
+        result[list(self.weights)] = start
         return result
 
 

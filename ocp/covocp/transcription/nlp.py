@@ -57,7 +57,8 @@ class NLP:
     """A transcribed problem: minimise f(w, p) subject to bounds on w and g(w, p); everything scaled.
 
     `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
-    nodes (columns), the terminal time, running cost, terminal cost and g.
+    nodes (columns), the terminal time, running cost, terminal cost and g. `backward` maps them to the half-vectors at
+    the start of the matrices that run backward; None where none does.
     """
 
     statement: Statement
@@ -70,6 +71,7 @@ class NLP:
     rows: tuple[Rows, ...]
     jacobian: ca.Function | None
     evaluate: ca.Function
+    backward: ca.Function | None = None
 
     __repr__ = short_repr
 
@@ -199,6 +201,15 @@ class NLP:
             inside_path=by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape),
             inside_states=inside_states,
         )
+
+    def bounds_at_ends(self, lam_x: Array) -> tuple[Array, Array]:
+        """Multipliers of the bounds on the states at the first and at the last node, (nx,) each.
+
+        Without those of decisions, which are among the multipliers of states (`unpack_multipliers`).
+        """
+        states = self._split(lam_x)["x"] / self.scales.x
+        states[:, self.statement.decisions] = 0.0
+        return states[0], states[-1]
 
     def _acting(self, controls: Array) -> Array:
         """Multipliers of the control bounds, none where another control acts."""

@@ -27,7 +27,8 @@ class Program:
 
     Minimise f(w, p) subject to bounds on w and g(w, p); everything scaled. `w` and `p` stack those of the parts, then
     the scale of the cost; `g` stacks those of the parts, then the links. Where matrices are eliminated the half-vectors
-    at the start of a part are no variables: expressions of the part before stand for them among its parameters.
+    at the start of a part are no variables: expressions of the part before stand for them among its parameters. What
+    runs backward in a part stands, at its start, among the parameters of the part before.
     """
 
     parts: tuple[NLP, ...]
@@ -86,6 +87,7 @@ class Program:
         costs: list[dict[str, Any]] = []
         rows: list[Array] = []
         used: list[Array] = []
+        parameters = self._weighed(w, parameters)
         for i, (part, span) in enumerate(zip(self.parts, self._spans(), strict=True)):
             used.append(parameters[i])
             if i:
@@ -101,11 +103,25 @@ class Program:
         return tuple(found), {**values, "parts": costs, "g": g}
 
     def filled(self, trajectories: Trajectories, parameters: Arrays) -> Arrays:
-        """The parameters of each part, with the half-vectors at its start that the part before gives."""
+        """The parameters of each part, with the half-vectors that the parts beside it give."""
+        for i, link in enumerate(self.links):
+            if link.weights:
+                start = trajectories[i + 1].e[0, list(link.behind)]
+                parameters = (*parameters[:i], link.weighed(parameters[i], start), *parameters[i + 1 :])
         result = [parameters[0]]
         for i in range(len(self.links)):
             given = self._given(i, trajectories[i], result[-1], parameters[i + 1])
             result.append(self.links[i].filled(parameters[i + 1], given[1]))
+        return tuple(result)
+
+    def _weighed(self, w: Array, parameters: Arrays) -> Arrays:
+        """The parameters of each part, with the half-vectors that run backward from the part after it."""
+        result, spans = list(parameters), self._spans()
+        for i in range(len(self.links) - 1, -1, -1):
+            backward = self.parts[i + 1].backward
+            if self.links[i].weights and backward is not None:
+                start = backward(w[spans[i + 1]], np.append(result[i + 1], 1.0))
+                result[i] = self.links[i].weighed(result[i], np.asarray(start.full()).ravel())
         return tuple(result)
 
     def each(self, trajectories: Trajectories, parameters: Arrays) -> Iterator[tuple[NLP, Trajectory, Array]]:
@@ -161,6 +177,10 @@ class Program:
             result.append(lam_g[offset : offset + size] / part.scales.x[list(link.states)])
             offset += sum(len(entries) for entries in _linked(link, part).values())
         return tuple(result)
+
+    def bounds_at_ends(self, lam_x: Array) -> tuple[tuple[Array, Array], ...]:
+        """Multipliers of the bounds on the states where each part begins and ends (for a cost scale of 1)."""
+        return tuple(part.bounds_at_ends(lam_x[span]) for part, span in zip(self.parts, self._spans(), strict=True))
 
     def units(self, scales: tuple[Scales, ...]) -> Array:
         """Other magnitudes of the variables, in the units of this program, an entry for each variable."""
@@ -224,6 +244,11 @@ def joined(chain: Chain, parts: tuple[NLP, ...]) -> Program:
     p = ca.MX.sym("p", sum(part.statement.np for part in parts) + 1)
     variables = _split(w, [part.w.shape[0] for part in parts])
     *known, cost_scale = _split(p, [*(part.statement.np for part in parts), 1])
+    for i in range(len(parts) - 2, -1, -1):
+        backward = parts[i + 1].backward
+        if chain.links[i].weights and backward is not None:
+            start = backward(variables[i + 1], ca.vertcat(known[i + 1], 1.0))
+            known[i] = _with(known[i], chain.links[i].weights, start)
     cost: Any = 0
     groups: list[tuple[Any, bool]] = []
     link_rows: list[Rows] = []

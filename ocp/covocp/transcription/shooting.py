@@ -180,17 +180,13 @@ def passages(
     passage: Passage = "plain",
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
-    n, m = mesh.intervals, mesh.substeps
+    n = mesh.intervals
     e0 = statement.started(x[:, 0], parameters)[1] if e0 is None else e0
     starts = x[:, :n]
     if mesh.step == "rk4" and not statement.behind:
         ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
-    before = starts
-    if m > 1:
-        inside: Expr = ca.reshape(fine, statement.nx * m, n)
-        before = ca.reshape(ca.vertcat(starts, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
-    columns = (before, fine, *intervals.substeps(m))
+    columns = _substeps(statement, mesh, x, fine, intervals)
     sequence = partial(_sequence, statement, mesh, passage if compiled_steps(mesh) else "plain")
     first = e0[statement.entries(statement.ahead)]
     groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
@@ -204,6 +200,28 @@ def passages(
     if not statement.running_uses_matrices:
         return e, halves, ca.DM.zeros(1, n)
     return e, halves, _matrix_cost(statement, mesh, (starts, begins, fine, halves, *intervals))
+
+
+def _substeps(statement: Statement, mesh: Mesh, x: Expr, fine: Expr, intervals: Interval) -> tuple[Any, ...]:
+    """States before and after each substep, and the substeps, a column each."""
+    n, m = mesh.intervals, mesh.substeps
+    before = x[:, :n]
+    if m > 1:
+        inside: Expr = ca.reshape(fine, statement.nx * m, n)
+        before = ca.reshape(ca.vertcat(before, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
+    return (before, fine, *intervals.substeps(m))
+
+
+def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
+    """Half-vectors at the start of the matrices that run backward, where they are no variables; as `shoot` has them."""
+    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+    advance = nominal_interval(statement, mesh.substeps, mesh.step)
+    ends, fine, _ = _segments(mesh, advance, variables.x, intervals)
+    columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
+    assert statement.matrix_end is not None
+    last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)
+    sequence = partial(_sequence, statement, mesh, "plain")
+    return _backward(statement, mesh, sequence, last, columns, None)[0][:, 0]
 
 
 def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:

@@ -41,7 +41,8 @@ class Multipliers:
     path: of the path inequalities at the nodes, shape (N + 1, rows).
     inside_path, inside_states: of the path inequalities and the bounds on states at the other points of the intervals
         where they are imposed, shapes (N, points - 1, rows), (N, points - 1, nx).
-    states, matrices: of the bounds on states and half-vectors at the nodes, shapes (N + 1, nx), (N + 1, ne).
+    states, matrices: of the bounds on states and half-vectors at the nodes, shapes (N + 1, nx), (N + 1, ne). Where a
+        phase goes before, the first row of those that run backward has the slopes of its cost by them.
     controls: of the bounds on the controls, shape (N + 1 or N, nu).
     gaps: of the continuity at the ends of the shooting segments: the costates there, a row for each segment, shape
         (segments, nx) or, where half-vectors are variables, (segments, nx + ne); no row where nothing was shot.

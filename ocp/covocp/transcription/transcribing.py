@@ -15,7 +15,7 @@ from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import Passage, compiled_steps, interval_columns, shoot
+from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, shoot
 
 # Adjoint sweeps that a Jacobian takes at once.
 LARGEST_DIRECTIONS = 64
@@ -58,7 +58,19 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
         rows=rows,
         jacobian=_jacobian(variables, nodes, rows, g, depending),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
+        backward=_backward(statement, mesh, variables, p),
     )
+
+
+def _backward(statement: Statement, mesh: Mesh, variables: _Variables, p: Expr) -> ca.Function | None:
+    """(w, p) -> half-vectors at the start of the matrices that run backward; None where none does."""
+    if not statement.behind:
+        return None
+    if mesh.eliminated:
+        start = backward_at_start(statement, mesh, variables)
+    else:
+        start = variables.e[statement.entries(statement.behind), 0]
+    return ca.Function("backward", [variables.w, p], [start])
 
 
 class _Variables:

@@ -1,0 +1,79 @@
+"""The closed loops of several phases, one after the other: what each begins with is what the one before ends with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from covocp.base.matrices import Array, unpack
+from covocp.base.short_repr import short_repr
+from covocp.extremal.closed_loop import ClosedLoop, close_loop, design_statistics
+from covocp.extremal.extremal import Extremal
+from covocp.extremal.mean_effect import MeanEffect, mean_effect
+from covocp.statement.chain import Link
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PhaseLoop:
+    """The closed loop of a phase.
+
+    loop: None where it leaves the range of numbers, or one before it does.
+    start: covariance [E Z; Z' Xhat] that it begins with, (2n, 2n).
+    handed: 1/2 tr S Xhat where it begins, less that where the next one begins. The form of the cost that is optimised
+        has it in the phase where the deviations arise, the expected cost in the one where they are paid for.
+    mean: what curved rates, measurements and jumps do to its mean, with what came before; None where unknown.
+    """
+
+    loop: ClosedLoop | None
+    start: Array
+    handed: float
+    mean: MeanEffect | None
+
+    __repr__ = short_repr
+
+
+def phase_loops(extremals: Sequence[Extremal], links: Sequence[Link]) -> tuple[PhaseLoop, ...]:
+    """The loops of all phases along their extremals."""
+    first = design_statistics(extremals[0]).initial
+    start: Array = np.asarray(np.kron(np.diag([1.0, 0.0]), first), dtype=float)
+    means: tuple[Array, Array] | None = (np.zeros(first.shape[0]), np.zeros(first.shape[0]))
+    result: list[PhaseLoop] = []
+    for k, extremal in enumerate(extremals):
+        loop = close_loop(extremal, start=start) if not k or result[-1].loop is not None else None
+        mean = mean_effect(extremal, loop, means) if loop is not None and means is not None else None
+        result.append(PhaseLoop(loop=loop, start=start, handed=0.0, mean=mean))
+        if k < len(links):
+            start, means = _passed(links[k], extremal, extremals[k + 1], result[-1])
+    fed = [_fed(extremal, entry.start) for extremal, entry in zip(extremals, result, strict=True)]
+    after = [*fed[1:], 0.0]
+    return tuple(
+        PhaseLoop(loop=entry.loop, start=entry.start, handed=own - later, mean=entry.mean)
+        for entry, own, later in zip(result, fed, after, strict=True)
+    )
+
+
+def _passed(
+    link: Link, before: Extremal, after: Extremal, ended: PhaseLoop
+) -> tuple[Array, tuple[Array, Array] | None]:
+    """[E Z; Z' Xhat] behind a link, and the means of the deviations and of their estimate."""
+    size, t = len(after.statement.augmented), before.trajectory
+    if ended.loop is None or link.deviations is None:
+        return np.full((2 * size, 2 * size), np.nan), None
+    X = ended.loop.X[-1]
+    given = link.deviations(t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters, X)
+    J, added, bent = (np.asarray(value.full()) for value in given)
+    E, Z, Xhat = ended.loop.E[-1], ended.loop.Z[-1], ended.loop.Xhat[-1]
+    crossed = J @ Z @ J.T
+    start = np.block([[J @ E @ J.T + added, crossed], [crossed.T, J @ Xhat @ J.T]])
+    if ended.mean is None:
+        return start, None
+    return start, (J @ ended.mean.mean[-1] + bent.ravel(), J @ ended.mean.estimate[-1])
+
+
+def _fed(extremal: Extremal, start: Array) -> float:
+    """1/2 tr S Xhat at the start."""
+    st, size = extremal.statement, start.shape[0] // 2
+    S = unpack(extremal.trajectory.e[0, st.matrices[st.behind[0]].span], size)
+    return 0.5 * float(np.sum(S * start[size:, size:]))

@@ -1,0 +1,55 @@
+"""Costates where phases meet and a bound holds a state there, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import covocp as co
+
+
+def _bryson_denham(duration: float, name: str, *, first: bool, limit: float = 1 / 9) -> co.Problem:
+    ocp = co.Problem(duration, name=name)
+    x = ocp.state("x", initial=0.0 if first else None, final=None if first else 0.0, upper=limit)
+    v = ocp.state("v", initial=1.0 if first else None, final=None if first else -1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=0.5 * u**2)
+    return ocp
+
+
+@pytest.mark.parametrize("cut", [0.2, 1 / 3, 0.4, 0.5])
+@pytest.mark.parametrize("intervals", [20, 80])
+def test_a_bound_that_is_active_where_phases_meet_has_a_multiplier_there(cut: float, intervals: int) -> None:
+    """Bryson-Denham, cut before, at the entry of, and inside the arc at the bound, from 1/3 to 2/3."""
+    phases = co.Phases([_bryson_denham(cut, "a", first=True), _bryson_denham(1 - cut, "b", first=False)])
+    solution = co.solve(phases, intervals=intervals, progress=False)
+    assert solution.cost == pytest.approx(4.0, rel=2e-4)  # 4 / (9 limit)
+    assert solution.link_residuals[0] < 1e-9
+    a, b = solution
+    # p_x is 18 before the arc and -18 after it; what is between depends on the places at which the bound is imposed
+    np.testing.assert_allclose(a.costate("x")[0], 18.0, rtol=2e-2)
+    np.testing.assert_allclose(b.costate("x")[-1], -18.0, rtol=2e-2)
+    held = a.costate("x")[-1] - b.costate("x")[0]
+    assert held > -1e-6  # an upper bound pushes one way
+    assert a.multiplier("x") == pytest.approx(held, abs=held + 1e-6)  # what of it the earlier phase has
+
+
+def test_a_decision_at_its_bound_counts_once() -> None:
+    def part(name: str, wanted: float, *, first: bool) -> co.Problem:
+        ocp = co.Problem(1.0, name=name)
+        x = ocp.state("x", initial=0.0 if first else None)
+        d = ocp.decision("d", guess=1.0, upper=2.0)
+        u = ocp.control("u")
+        ocp.dynamics(x, u + d)
+        ocp.minimize(running=u**2 + x**2, terminal=(d - wanted) ** 2)
+        return ocp
+
+    solution = co.solve(
+        co.Phases([part("a", 4.0, first=True), part("b", 9.0, first=False)]), intervals=10, progress=False
+    )
+    assert [float(phase["d"]) for phase in solution] == pytest.approx([2.0, 2.0], rel=1e-6)
+    assert solution.link_residuals[0] < 1e-7
+    for phase in solution:
+        assert phase.optimality.decisions < 1e-6
