@@ -73,8 +73,8 @@ def _refuse_instants(label: str, at: Given) -> None:
     Raises:
         ProblemError: a number, or several.
     """
-    given = at if isinstance(at, (list, tuple, np.ndarray)) else [at]
-    if len(np.shape(given)) == 1 and len(given) and all(is_number(instant) for instant in given):
+    given = at.ravel().tolist() if isinstance(at, np.ndarray) else at if isinstance(at, (list, tuple)) else [at]
+    if len(given) and all(is_number(instant) for instant in given):
         raise ProblemError(
             f"'{label}' is to hold at an instant of the horizon.",
             expected="at='path', 'initial' or 'final'",
