@@ -286,6 +286,20 @@ def test_constraint_at_an_unknown_place():
     ocp.subject_to(x, at="end", name="limit")
 
 
+@pytest.mark.parametrize("at", [4.0, 4, np.float64(4.0), [2.0, 4.0], (2, 4), np.array(4.0), np.array([2.0, 4.0])])
+def test_an_instant_is_where_phases_meet(at):
+    ocp, x, *_ = lag()
+    with pytest.raises(co.ProblemError, match=r"'limit' is to hold at an instant(.|\n)*Phases\(\[before, after\]\)"):
+        ocp.subject_to(x, at=at, name="limit")
+
+
+@pytest.mark.parametrize("at", [True, [], np.nan, [1.0, None], [1.0, [2.0]], "4.0"])
+def test_what_is_no_instant_is_an_unknown_place(at):
+    ocp, x, *_ = lag()
+    with pytest.raises(co.ProblemError, match="unknown place"):
+        ocp.subject_to(x, at=at, name="limit")
+
+
 # --- what is allowed --------------------------------------------------------------------------------------------------
 
 

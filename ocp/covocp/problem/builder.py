@@ -575,13 +575,14 @@ class Problem:
             lower: numbers, shape of the expression; None: no lower bound.
             upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
             at: "path", "initial" or "final"; None: "path", and "final" for integrals and for decisions alone.
+                An instant inside the horizon is the end of a phase (`Phases`).
             name: appears in every diagnostic; "constraint k" by default.
             between: "auto": imposed at more and more points of each interval, until the largest violation between them
                 is below 1e-4 of the limit (with `refine`, its tolerance, where that is smaller, but for 2e-5).
 
         Raises:
-            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an integral
-                elsewhere than at the end.
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an instant in
+                place of one, an integral elsewhere than at the end.
         """
         self._change(with_constraint(self._declarations, expression, lower, upper, at, name, between))
 

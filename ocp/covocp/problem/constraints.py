@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from covocp.base.arguments import is_number
 from covocp.base.checks import caller
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -29,6 +31,7 @@ def with_constraint(
     """The declarations with one more constraint; arguments and errors as of `Problem.subject_to`."""
     label = name if name is not None else f"constraint {len(own.constraints) + 1}"
     if at is not None:
+        _refuse_instants(label, at)
         check_place(label, at)
     value = column_expression(label, "constraint", expression)
     fixed: list[Any] = [*own.parameters, *own.unknowns]
@@ -61,6 +64,23 @@ def check_place(label: str, at: Given) -> None:
             expected="at='path', 'initial' or 'final'",
             received=repr(at),
             remedy="choose one of the three",
+        )
+
+
+def _refuse_instants(label: str, at: Given) -> None:
+    """Instants inside the horizon are ends of phases; whoever gives one is told so.
+
+    Raises:
+        ProblemError: a number, or several.
+    """
+    given = at.ravel().tolist() if isinstance(at, np.ndarray) else at if isinstance(at, (list, tuple)) else [at]
+    if len(given) and all(is_number(instant) for instant in given):
+        raise ProblemError(
+            f"'{label}' is to hold at an instant of the horizon.",
+            expected="at='path', 'initial' or 'final'",
+            received=f"at={at}",
+            remedy="at the start and at the end say 'initial' and 'final'; in between end a phase there, with this "
+            "condition at='final', and go on in the next one: solve(Phases([before, after]))",
         )
 
 
