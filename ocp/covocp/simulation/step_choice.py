@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.simulation.batches import Batch, run_batch
+from covocp.simulation.batches import Batch, Cloud, run_batch
 from covocp.simulation.plan import make_plan
 from covocp.simulation.run_parts import Setting
 from covocp.simulation.schedule import WHOLE, Grid
@@ -86,15 +86,30 @@ def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
     return StepChoice(grid=base.divided(parts), change=np.nan, settled=True, given=True, shortened=shortened)
 
 
-def examined(choice: StepChoice, setting: Setting, *, runs: int, seed: int, stop: Callable[[], bool]) -> StepChoice:
+def examined(
+    choice: StepChoice,
+    setting: Setting,
+    *,
+    runs: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None = None,
+) -> StepChoice:
     """A given step with the change that halving it makes, on a pilot batch; see `choose_step`."""
-    coarse, fine = _pair(setting, choice.grid, choice.grid.divided(2), min(runs, EXAMINED_RUNS), seed, stop)
+    coarse, fine = _pair(setting, choice.grid, choice.grid.divided(2), min(runs, EXAMINED_RUNS), seed, stop, cloud)
     change = _largest_change(coarse, fine, runs)
     return replace(choice, change=change, settled=change <= MATTERS)
 
 
 def choose_step(
-    setting: Setting, base: Grid, rates: Array, *, runs: int, seed: int, stop: Callable[[], bool]
+    setting: Setting,
+    base: Grid,
+    rates: Array,
+    *,
+    runs: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None = None,
 ) -> StepChoice:
     """Halve the step until the second moments at the end do not change any more.
 
@@ -105,6 +120,7 @@ def choose_step(
         runs: number of runs of the simulation, for its sampling error.
         seed: of the simulation; the pilot runs have random numbers of their own.
         stop: asked now and then; true to give up.
+        cloud: where pilot runs start; None: drawn.
 
     Returns:
         The coarser step of the first pair that agrees to `SHARE` of the sampling error; the finest one otherwise.
@@ -119,7 +135,7 @@ def choose_step(
     change = np.inf
     for _ in range(PAIRS):
         grids = base.divided(parts), base.divided(2 * parts)
-        coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop)
+        coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop, cloud)
         change = _largest_change(coarse, fine, runs)
         if unresolved and np.isfinite(fine.left).any():
             change = np.inf  # they may leave it because of the step, in both
@@ -133,14 +149,23 @@ def choose_step(
 
 
 def _pair(
-    setting: Setting, coarse: Grid, fine: Grid, count: int, seed: int, stop: Callable[[], bool]
+    setting: Setting,
+    coarse: Grid,
+    fine: Grid,
+    count: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None,
 ) -> tuple[Batch, Batch]:
     """Pilot runs on a grid, and on one with steps half as long along the same paths."""
     one, two = (
         make_plan(setting, grid, coarse.t[[0, -1]], seed=seed, pilot=True, pairs=grid is coarse)
         for grid in (coarse, fine)
     )
-    return run_batch(one, 0, count, stop), run_batch(two, 0, count, stop)
+    if cloud is None:
+        return run_batch(one, 0, count, stop), run_batch(two, 0, count, stop)
+    same = cloud.first(count), cloud.first(count)
+    return run_batch(one, 0, count, stop, same[0]), run_batch(two, 0, count, stop, same[1])
 
 
 def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:
