@@ -44,7 +44,10 @@ class Passage:
         runs = len(cloud.streams)
         drawn = np.array([stream.standard_normal(self.noises) for stream in cloud.streams]).reshape(runs, self.noises)
         given = (cloud.x, cloud.own, cloud.estimate, cloud.E, drawn.T)
-        x, own, estimate, E = (np.asarray(v.full()) for v in self.function.map(runs)(*given))
+        values = self.function.map(runs)(*given)
+        x, own, estimate, E = (
+            np.asarray(value.full()).reshape(self.function.size1_out(i), runs) for i, value in enumerate(values)
+        )
         return Cloud(x=x, own=own, estimate=estimate, E=E, gone=cloud.gone, streams=cloud.streams)
 
     def predicted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:

@@ -95,9 +95,9 @@ def _panels(sample: PhasesMonteCarlo, names: tuple[Any, ...]) -> list[list[Part]
                 continue
             for component in components:
                 found.setdefault(f"{number} {component[0]}", []).append((moved, component))
-    for number, error in missing.items():
+    for number, unknown in missing.items():
         if not any(key.startswith(f"{number} ") for key in found):
-            raise error
+            raise unknown
     return list(found.values())
 
 

@@ -43,11 +43,11 @@ SINGLE = {"truth": "the design's system", "law": "no feedback", "period": "no fe
 
 
 @overload
-def simulate(solution: Solution, runs: int, seed: int, **options: Any) -> MonteCarlo: ...
+def simulate(solution: Solution, runs: int, seed: int, **options: Any) -> MonteCarlo: ...  # type: ignore[misc]  # named below
 
 
 @overload
-def simulate(solution: PhasesSolution, runs: int, seed: int, **options: Any) -> PhasesMonteCarlo: ...
+def simulate(solution: PhasesSolution, runs: int, seed: int, **options: Any) -> PhasesMonteCarlo: ...  # type: ignore[misc]
 
 
 @one_at_a_time

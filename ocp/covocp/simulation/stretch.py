@@ -147,7 +147,7 @@ def reporting(reporter: Progress) -> Callable[[Batch], None]:
     return report
 
 
-def tell_missing(harvest: Harvest[Batch], runs: int) -> None:
+def tell_missing(harvest: Harvest[Any], runs: int) -> None:
     """Warn of runs that are missing.
 
     Raises:
