@@ -43,14 +43,14 @@ SINGLE = {"truth": "the design's system", "law": "no feedback", "period": "no fe
 
 
 @overload
-def simulate(solution: Solution, runs: int, seed: int, **options: Any) -> MonteCarlo: ...  # type: ignore[misc]  # named below
+def simulate(solution: Solution, runs: int, seed: int, **options: Any) -> MonteCarlo: ...
 
 
 @overload
-def simulate(solution: PhasesSolution, runs: int, seed: int, **options: Any) -> PhasesMonteCarlo: ...  # type: ignore[misc]
+def simulate(solution: PhasesSolution, runs: int, seed: int, **options: Any) -> PhasesMonteCarlo: ...
 
 
-@one_at_a_time
+@one_at_a_time  # type: ignore[misc]  # options by name are those below
 @checked(progress=truth)
 def simulate(
     solution: Solution | PhasesSolution,
