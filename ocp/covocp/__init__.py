@@ -61,6 +61,7 @@ __all__ = [
     "Worth",
     "simulate",
     "MonteCarlo",
+    "PhasesMonteCarlo",
     "table",
     "Table",
     "simulate_law",
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
     from covocp.export import CPackage as CPackage
     from covocp.export import export_c as export_c
     from covocp.simulation import MonteCarlo as MonteCarlo
+    from covocp.simulation import PhasesMonteCarlo as PhasesMonteCarlo
     from covocp.simulation import simulate as simulate
     from covocp.simulation.laws import LawSimulation as LawSimulation
     from covocp.simulation.laws import simulate_law as simulate_law
@@ -117,6 +119,7 @@ else:
         "SampledSimulation": "covocp.simulation.sampled_loop",
         "PhasesSolution": "covocp.solution.phases",
         "MonteCarlo": "covocp.simulation",
+        "PhasesMonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
         "Table": "covocp.blocks.tables",
         "table": "covocp.blocks.tables",
