@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, Cloud, run_stretch
-from covocp.simulation.passage import Passage
+from covocp.simulation.junction import Junction
 from covocp.simulation.plan import Plan
 
 
@@ -16,7 +16,7 @@ class Course:
     """The plan of each stretch, and what carries the runs from one to the next."""
 
     plans: tuple[Plan, ...]
-    passages: tuple[Passage, ...]
+    junctions: tuple[Junction, ...]
 
     __repr__ = short_repr
 
@@ -42,6 +42,6 @@ def run_course(course: Course, first: int, last: int, stop: Callable[[], bool] |
     for k, plan in enumerate(course.plans):
         batch, end = run_stretch(plan, first, last, stop, cloud)
         found.append(batch)
-        if k < len(course.passages):
-            cloud = course.passages[k].carried(end)
+        if k < len(course.junctions):
+            cloud = course.junctions[k].carried(end)
     return Legs(batches=tuple(found))

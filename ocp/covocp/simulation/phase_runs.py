@@ -12,8 +12,8 @@ from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Cloud, StoppedError, run_stretch
 from covocp.simulation.course import Course, Legs
 from covocp.simulation.flown import sample_indices
+from covocp.simulation.junction import Junction, junction
 from covocp.simulation.monte_carlo import MonteCarlo
-from covocp.simulation.passage import Passage, passage
 from covocp.simulation.phase_sample import PhasesMonteCarlo
 from covocp.simulation.plan import Plan, make_plan
 from covocp.simulation.prediction import Prediction, predict
@@ -65,10 +65,10 @@ def simulate_phases(solution: PhasesSolution, request: Request, *, executor: Any
     _check(solution)
     with Progress(f"simulating {solution.name}", progress) as reporter:
         try:
-            legs, passages = _legs(solution, request, reporter)
+            legs, junctions = _legs(solution, request, reporter)
         except StoppedError:
             raise KeyboardInterrupt from None  # nothing is simulated yet
-        course = Course(plans=tuple(leg.plan for leg in legs), passages=tuple(passages))
+        course = Course(plans=tuple(leg.plan for leg in legs), junctions=tuple(junctions))
         tell = reporting(reporter)
         report: Callable[[Legs], None] = lambda done: tell(done.batches[-1])  # noqa: E731
         harvest = simulate_batches(course, request.ranges, executor, lambda: reporter.stop, report)
@@ -100,18 +100,18 @@ def _check(solution: PhasesSolution) -> None:
             )
 
 
-def _legs(solution: PhasesSolution, request: Request, reporter: Progress) -> tuple[list[_Leg], list[Passage]]:
+def _legs(solution: PhasesSolution, request: Request, reporter: Progress) -> tuple[list[_Leg], list[Junction]]:
     """All phases made ready, each from where the predicted and the pilot runs of the one before it end."""
     legs = [_leg(solution[0], request, reporter)]
-    passages: list[Passage] = []
+    junctions: list[Junction] = []
     for k, link in enumerate(solution.links):
         last, after = legs[-1], solution[k + 1]
         systems = last.setting.design, designed(after)
-        passages.append(passage(solution[k], after, *systems, link, request.filter))
-        start = passages[-1].predicted(last.expected.mean[-1], last.expected.covariance[-1])
-        cloud = None if request.step is not None else passages[-1].carried(_pilot_end(last, request, reporter))
+        junctions.append(junction(solution[k], after, *systems, link, request.filter))
+        start = junctions[-1].predicted(last.expected.mean[-1], last.expected.covariance[-1])
+        cloud = None if request.step is not None else junctions[-1].carried(_pilot_end(last, request, reporter))
         legs.append(_leg(after, request, reporter, start, cloud))
-    return legs, passages
+    return legs, junctions
 
 
 def _leg(

@@ -29,6 +29,8 @@ STABLE = 1.0
 # three standard deviations, as the bands have them.
 EXAMINED_RUNS, MATTERS = 256, 3.0
 PAIRS = 5
+# Scatter of a square as a share of its mean below which it is one number.
+SAME = 1e-9
 # Steps of a first grid, at most: a filter that is still faster is not resolved, and the halving says so.
 MOST_STEPS = 100_000
 
@@ -178,7 +180,8 @@ def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:
     if np.count_nonzero(stayed) > 1:
         one, two = (np.hstack([b.deviation, b.estimate])[stayed] ** 2 for b in (coarse, fine))
         error = two.std(axis=0, ddof=1) / np.sqrt(runs)
-        scattered = error > 0
+        # What is the same in all runs but for rounding, such as a state that is known exactly, has no sampling error.
+        scattered = error * np.sqrt(runs) > SAME * two.mean(axis=0)
         changes += (np.abs((one - two).mean(axis=0))[scattered] / error[scattered]).tolist()
     gone = [np.isfinite(b.left).mean() for b in (coarse, fine)]
     error = np.sqrt(max(gone[1] * (1 - gone[1]), 1 / fine.runs) / runs)

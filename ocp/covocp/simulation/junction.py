@@ -25,7 +25,7 @@ from covocp.statement.chain import Link
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Passage:
+class Junction:
     """What carries runs and prediction over; n, n+: rows of the augmented state before and after.
 
     function: (state, unknowns, estimate, half-vector E of the extended filter, normal numbers) -> the first four after.
@@ -103,7 +103,9 @@ class _Ends:
         return [row for row in range(self.later.size) if row not in going]
 
 
-def passage(before: Solution, after: Solution, earlier: System, later: System, link: Link, kind: Estimator) -> Passage:
+def junction(
+    before: Solution, after: Solution, earlier: System, later: System, link: Link, kind: Estimator
+) -> Junction:
     """What carries a simulation from a phase to the next one.
 
     Args:
@@ -136,5 +138,5 @@ def passage(before: Solution, after: Solution, earlier: System, later: System, l
         y, E = ca.MX.sym("y", n), ca.MX.sym("E", 0)
         outputs = [ca.DM(J) @ y, ca.MX(0, 1)]
     outputs = [actual[: later.states], actual[later.states :], *outputs]
-    function = ca.Function("passage", [x, own, y, E, w], [ca.densify(value) for value in outputs])
-    return Passage(function=function, noises=len(noisy), tangent=J, noise=spread)
+    function = ca.Function("junction", [x, own, y, E, w], [ca.densify(value) for value in outputs])
+    return Junction(function=function, noises=len(noisy), tangent=J, noise=spread)
