@@ -227,3 +227,24 @@ def test_files_and_what_is_refused(bounced: Any, tmp_path: Path) -> None:
     solution = co.solve(co.Phases([first, second]), intervals=4, **QUIET)
     with pytest.raises(co.ProblemError, match="Nothing is estimated in the phase 'second'"):
         co.simulate(solution, 10, seed=1)
+
+
+@pytest.mark.parametrize("filter", ["perturbation", "extended"])
+def test_a_single_state_without_unknowns_goes_on(filter: Any) -> None:
+    problems = []
+    for name in ("first", "second"):
+        ocp = co.Problem(1.0, name=name)
+        start: dict[str, Any] = {"initial": None} if problems else {"initial": 1.0, "variance": 0.1}
+        x, u = ocp.state("x", **start), ocp.control("u")
+        ocp.dynamics(x, u, noise=0.1)
+        ocp.measurement("m", x, noise=0.1)
+        ocp.estimation_covariance()
+        ocp.minimize(running=u**2)
+        problems.append(ocp)
+    solution = co.solve(co.Phases(problems), intervals=10, **QUIET)
+    sample = co.simulate(solution, 1000, seed=1, filter=filter, **QUIET)
+    # Without feedback the variance is 0.1 + 0.1 t; E starts at its steady value sqrt(0.1 * 0.1) and stays there.
+    for k, phase in enumerate(sample):
+        np.testing.assert_allclose(phase.predicted[-1], 0.1 + 0.1 * (k + 1), rtol=1e-6)
+        np.testing.assert_allclose(phase.predicted_error[-1], 0.1, rtol=1e-6)
+        assert phase.verdict.holds

@@ -18,7 +18,7 @@ from covocp.base.matrices import Array, half_length, pack_symbolic, unpack_symbo
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.batches import Cloud
-from covocp.simulation.run_parts import factor
+from covocp.simulation.run_parts import factor, part
 from covocp.simulation.schedule import Estimator
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
@@ -132,11 +132,11 @@ def junction(
         y, E = ca.MX.sym("y", n), ca.MX.sym("E", half_length(n))
         e = ca.MX(nothing)
         e[earlier.covariance] = E
-        estimate, covariance = ends.given(y[: earlier.states], y[earlier.states :], e)
+        estimate, covariance = ends.given(part(y, 0, earlier.states), part(y, earlier.states), e)
         outputs = [estimate, pack_symbolic(covariance)]
     else:
         y, E = ca.MX.sym("y", n), ca.MX.sym("E", 0)
         outputs = [ca.DM(J) @ y, ca.MX(0, 1)]
-    outputs = [actual[: later.states], actual[later.states :], *outputs]
+    outputs = [part(actual, 0, later.states), part(actual, later.states), *outputs]
     function = ca.Function("junction", [x, own, y, E, w], [ca.densify(value) for value in outputs])
     return Junction(function=function, noises=len(noisy), tangent=J, noise=spread)
