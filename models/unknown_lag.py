@@ -272,3 +272,33 @@ def figures() -> dict[str, Any]:
             "names": ["u", "x", ("rms", "x"), ("rms", "b"), "C"],
         },
     }
+
+
+def phases(weight: float = 3.0, duration: float = 10.0, steering_duration: float = 2.0) -> co.Phases:
+    """An experiment that ends at rest, then the way to x = 1, steered with what was learnt: [5.2], then [5.3].
+
+    Only what the filter knows of x at the very end costs something, besides the energy of both phases: the experiment
+    is made because the lag moves x while it is steered. There are several local minima: for the weight 3 J = 3.15455973
+    from the guess of this model, 3.13692458 from the solution for the weight 10.
+
+    Args:
+        weight: of the variance of x at the end of the second phase.
+        duration: of the experiment [s].
+        steering_duration: of the second phase [s].
+
+    Returns:
+        The phases "experiment" and "steering", with state "x", unknown "b", control "u" and measurement "position".
+    """
+    problems: list[co.Problem] = []
+    for name, length, final in (("experiment", duration, 0.0), ("steering", steering_duration, 1.0)):
+        ocp = co.Problem(length, name=name)
+        start: dict[str, Any] = {"initial": None} if problems else {"initial": 0.0, "variance": 1.0}
+        x = ocp.state("x", **start, final=final)
+        b = ocp.unknown("b", mean=MEAN, variance=5.0)
+        u = ocp.control("u", guess=0.5)
+        ocp.dynamics(x, -b * x + u, noise=PROCESS_NOISE)
+        ocp.measurement("position", x, noise=MEASUREMENT_NOISE)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=0.5 * u**2, terminal=weight * E[x, x] if problems else 0.0)
+        problems.append(ocp)
+    return co.Phases(problems, name="first-order lag: experiment, then steering")

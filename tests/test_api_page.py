@@ -45,6 +45,7 @@ HELD = (
     "Solution",
     "PhasesSolution",
     "MonteCarlo",
+    "PhasesMonteCarlo",
     "CPackage",
     "Comparison",
     "Certificate",

@@ -302,6 +302,14 @@ def in_phases() -> Iterator[tuple[str, str, Call]]:
         yield "PhasesSolution.plot", name, lambda v, n=name: solution.plot("x", **{n: v})
     yield "PhasesSolution.plot", "names", solution.plot
     yield "PhasesSolution.save", "path", solution.save
+    few_runs = {"runs": 2, "seed": 1, "step": 0.5, "progress": False}
+    for name in ("runs", "seed", "truth", "law", "period", "limits", "filter", "step", "store", "paths", "batch"):
+        yield "simulate phases", name, lambda v, n=name: co.simulate(solution, **{**few_runs, n: v})
+    sample = co.simulate(solution, 2, 1, step=0.5, progress=False)
+    yield "PhasesMonteCarlo", "[]", sample.__getitem__
+    for name in ("units", "title", "path"):
+        yield "PhasesMonteCarlo.plot", name, lambda v, n=name: sample.plot("x", **{n: v})
+    yield "PhasesMonteCarlo.plot", "names", sample.plot
     for name, function in {"evaluate": co.evaluate, "certify": co.certify, "compare": co.compare}.items():
         yield name, "phases", lambda _, f=function: f(co.Phases(parts()))
         yield name, "a solution of phases", lambda _, f=function: f(solution)

@@ -61,6 +61,7 @@ __all__ = [
     "Worth",
     "simulate",
     "MonteCarlo",
+    "PhasesMonteCarlo",
     "table",
     "Table",
     "simulate_law",
@@ -93,6 +94,7 @@ if TYPE_CHECKING:
     from covocp.export import export_c as export_c
     from covocp.passage.library import build_info as build_info
     from covocp.simulation import MonteCarlo as MonteCarlo
+    from covocp.simulation import PhasesMonteCarlo as PhasesMonteCarlo
     from covocp.simulation import simulate as simulate
     from covocp.simulation.laws import LawSimulation as LawSimulation
     from covocp.simulation.laws import simulate_law as simulate_law
@@ -120,6 +122,7 @@ else:
         "SampledSimulation": "covocp.simulation.sampled_loop",
         "PhasesSolution": "covocp.solution.phases",
         "MonteCarlo": "covocp.simulation",
+        "PhasesMonteCarlo": "covocp.simulation",
         "simulate": "covocp.simulation",
         "Table": "covocp.blocks.tables",
         "table": "covocp.blocks.tables",

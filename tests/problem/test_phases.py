@@ -167,8 +167,6 @@ def test_what_takes_one_problem_says_so() -> None:
                 function(given)
     with pytest.raises(co.ProblemError, match="phase"):
         co.compare(solution)
-    with pytest.raises(co.ProblemError, match="phase"):
-        co.simulate(solution, 10, seed=1)
     with pytest.raises(co.ExportError, match="phase"):
         co.export_c(solution, "nowhere")
     with pytest.raises(co.ProblemError, match="one of several phases"):

@@ -161,7 +161,7 @@ def test_linear_gains_do_not_hold_unstable_plants(variance, predicted, beyond):
 
 
 def test_nothing_is_said_where_every_run_leaves(lag, monkeypatch):
-    monkeypatch.setattr("covocp.simulation.runs.LEFT", 1e-6)
+    monkeypatch.setattr("covocp.simulation.stretch.LEFT", 1e-6)
     sample = simulate(lag, 64, 1, step=0.5, store=5, **OPTIONS)
     assert sample.left_share == 1.0
     assert sample.share_beyond("x", 1e9) == 1.0

@@ -7,4 +7,5 @@
 from __future__ import annotations
 
 from covocp.simulation.monte_carlo import MonteCarlo as MonteCarlo
+from covocp.simulation.phase_sample import PhasesMonteCarlo as PhasesMonteCarlo
 from covocp.simulation.runs import simulate as simulate

@@ -6,6 +6,7 @@ so that they too have the same bits however the runs were divided among batches 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,30 @@ from covocp.simulation.vectorised import LANES, padded, vectorise
 
 # Steps whose random numbers are drawn together: they are most of the memory of a batch.
 DRAWN = 64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """Where some runs stand where a stretch begins, in place of draws; a column for each run.
+
+    x: actual state, (entries, runs); own: unknowns. estimate: of the deviation, or, of the extended filter, the
+    augmented state as it has it; E: its half-vectors. gone: who left the domain before, (runs,). streams: of random
+    numbers, one for each run, as far as they were drawn.
+    """
+
+    x: Array
+    own: Array
+    estimate: Array
+    E: Array
+    gone: Any
+    streams: tuple[np.random.Generator, ...]
+
+    __repr__ = short_repr
+
+    def first(self, runs: int) -> Cloud:
+        """The first of the runs, with streams of their own: the same start may be simulated twice."""
+        columns = {name: getattr(self, name)[:, :runs] for name in ("x", "own", "estimate", "E")}
+        return Cloud(**columns, gone=self.gone[:runs], streams=copy.deepcopy(self.streams[:runs]))
 
 
 class StoppedError(Exception):
@@ -72,7 +97,9 @@ class Batch:
         return int(self.cost.size)
 
 
-def run_batch(plan: Plan, first: int, last: int, stop: Callable[[], bool] | None = None) -> Batch:
+def run_batch(
+    plan: Plan, first: int, last: int, stop: Callable[[], bool] | None = None, cloud: Cloud | None = None
+) -> Batch:
     """Simulate the runs first, ..., last - 1.
 
     Args:
@@ -80,6 +107,7 @@ def run_batch(plan: Plan, first: int, last: int, stop: Callable[[], bool] | None
         first: number of the first run, a multiple of `LANES`.
         last: number after the last one.
         stop: asked now and then; true to give up.
+        cloud: where they start; None: drawn.
 
     Returns:
         What is kept of them.
@@ -87,43 +115,39 @@ def run_batch(plan: Plan, first: int, last: int, stop: Callable[[], bool] | None
     Raises:
         StoppedError: when `stop` said so.
     """
+    return run_stretch(plan, first, last, stop, cloud)[0]
+
+
+def run_stretch(
+    plan: Plan, first: int, last: int, stop: Callable[[], bool] | None = None, cloud: Cloud | None = None
+) -> tuple[Batch, Cloud]:
+    """The same, and where the runs end; the streams of the cloud are used up."""
     with np.errstate(all="ignore"):  # runs that leave the domain overflow, and are found
-        return _Simulation(plan, first, last).run(stop or (lambda: False))
+        simulation = _Simulation(plan, first, last, cloud)
+        return simulation.run(stop or (lambda: False)), simulation.end()
 
 
 class _Simulation:
     """The buffers of one batch."""
 
-    def __init__(self, plan: Plan, first: int, last: int) -> None:
-        """Draw the starts of the runs."""
+    def __init__(self, plan: Plan, first: int, last: int, cloud: Cloud | None) -> None:
+        """Place the runs at their starts: drawn, or as a cloud says."""
         self.plan, self.first, self.runs = plan, first, last - first
         width = self.width = padded(self.runs)
         self.step = vectorise(plan.step, width, (3,))
         self.read = None if plan.read is None else vectorise(plan.read, width, (3,))
         self.observe = vectorise(plan.observe, width, (2,))
-        kind = (1,) if plan.pilot else ()
-        self.streams = [
-            np.random.Generator(np.random.PCG64(np.random.SeedSequence(plan.seed, spawn_key=(i, *kind))))
-            for i in range(first, last)
-        ]
-        n, states, entries = plan.size, plan.states, plan.motion.size
-        drawn = np.zeros((n, width))
-        for i, stream in enumerate(self.streams):
-            drawn[:, i] = stream.standard_normal(n)
-        start = np.zeros((n, width))
-        for i in range(n):
-            for j in range(i + 1):  # elementwise: a product of matrices may depend on the number of runs
-                if plan.spread[i, j] != 0:
-                    start[i] += plan.spread[i, j] * drawn[j]
-        z = self.step.inputs[0]
-        z[:] = plan.start[:, None]
-        z[:entries] = plan.motion.moved(z[:entries].T, start[:states].T).T
-        self.own = plan.unknowns[:, None] + start[states:]
+        n = plan.size
+        self.left, self.unanswered = np.full(width, np.inf), np.full(width, np.inf)
+        self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
+        self.step.inputs[0][:] = plan.start[:, None]
+        if cloud is None:
+            self._draw()
+        else:
+            self._continue(cloud)
         self.step.inputs[2][:] = self.own
         self.observe.inputs[1][:] = self.own
         self.laws = [own_copy(plan.flown.law) for _ in range(self.runs)] if plan.flown else []
-        self.left, self.unanswered = np.full(width, np.inf), np.full(width, np.inf)
-        self.last, self.before = np.zeros((2 * n, width)), np.zeros((2 * n, width))
         rows, times, groups = 2 * n + plan.fed_back, plan.stored.size, width // LANES
         self.flags = np.zeros((times, plan.fed_back + len(plan.watched)))
         self.kept = np.zeros((self._flagged.stop - self._flagged.start, width), dtype=bool)
@@ -132,6 +156,45 @@ class _Simulation:
         self.sums = [np.zeros((groups, times, rows)) for _ in range(3)]
         self.products = np.zeros((groups, times, rows, rows))
         self.paths = np.full((min(max(plan.paths - first, 0), self.runs), times, rows), np.nan)
+
+    def _draw(self) -> None:
+        """Draw the starts of the runs about the mean."""
+        plan, kind = self.plan, (1,) if self.plan.pilot else ()
+        self.streams = [
+            np.random.Generator(np.random.PCG64(np.random.SeedSequence(plan.seed, spawn_key=(i, *kind))))
+            for i in range(self.first, self.first + self.runs)
+        ]
+        n, states, entries = plan.size, plan.states, plan.motion.size
+        drawn = np.zeros((n, self.width))
+        for i, stream in enumerate(self.streams):
+            drawn[:, i] = stream.standard_normal(n)
+        start = np.zeros((n, self.width))
+        for i in range(n):
+            for j in range(i + 1):  # elementwise: a product of matrices may depend on the number of runs
+                if plan.spread[i, j] != 0:
+                    start[i] += plan.spread[i, j] * drawn[j]
+        z = self.step.inputs[0]
+        z[:entries] = plan.motion.moved(z[:entries].T, start[:states].T).T
+        self.own = plan.unknowns[:, None] + start[states:]
+
+    def _continue(self, cloud: Cloud) -> None:
+        """Start where a cloud says; who left the domain before stays out of it, its deviation without limit."""
+        plan, z = self.plan, self.step.inputs[0]
+        self.streams = list(cloud.streams)
+        self.own = np.repeat(plan.unknowns[:, None], self.width, axis=1)
+        inside, gone = np.flatnonzero(~cloud.gone), np.flatnonzero(cloud.gone)
+        self.own[:, inside] = cloud.own[:, inside]
+        for name, values in (("x", cloud.x), ("estimate", cloud.estimate), ("E", cloud.E)):
+            z[plan.spans[name], inside] = values[:, inside]
+        self.left[gone] = 0.0
+        self.last[: plan.size, gone] = np.inf
+
+    def end(self) -> Cloud:
+        """Where the runs are after the last step."""
+        z, runs = self.step.inputs[0], self.runs
+        parts = {name: z[self.plan.spans[name], :runs].copy() for name in ("x", "estimate", "E")}
+        gone = np.isfinite(self.left[:runs])
+        return Cloud(**parts, own=self.own[:, :runs], gone=gone, streams=tuple(self.streams))
 
     def run(self, stop: Callable[[], bool]) -> Batch:
         """All steps."""

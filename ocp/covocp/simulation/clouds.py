@@ -88,31 +88,34 @@ def plot_monte_carlo(
     if path is not None:
         check_target(path, SUFFIXES)
     known = {b.name: b.unit for b in sample.blocks} | dict(units or {})
-    components, clouds = _chosen(sample, names)
+    components, clouds = chosen_parts(sample, names)
     count = len(components) + len(clouds)
     rows, columns = _grid(count)
     height = PANEL[1] if not clouds else SQUARE
     with matplotlib.rc_context(STYLE):
         figure = _figure((PANEL[0] * columns, height * rows + HEAD))
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        limits = [
-            _draw_band(place, sample, component, known) for place, component in zip(axes, components, strict=False)
-        ]
+        limits = []
+        for place, component in zip(axes, components, strict=False):
+            draw_band(place, sample, component, known)
+            limits.append(draw_limits(place, limits_over_time(sample, component[2])))
         for place, pair in zip(axes[len(components) :], clouds, strict=False):
-            _draw_cloud(place, sample, pair, known, tuple(sizes.tolist()))
+            draw_cloud(place, sample, pair, known, tuple(sizes.tolist()))
         for place in axes[count:]:
             place.set_visible(False)
         _title(figure, sample, title)
         rows_shown = [row for _, _, row in components]
         errors = sample.estimated and any(row < sample.size for row in rows_shown)
-        _legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()), errors=errors, limits=any(limits))
+        draw_legend(figure, bool(components), bool(clouds), tuple(sizes.tolist()), errors=errors, limits=any(limits))
         if path is not None:
             with written_whole(path, SUFFIXES) as part:
                 figure.savefig(part, dpi=RESOLUTION)
     return figure
 
 
-def _chosen(sample: MonteCarlo, names: tuple[Any, ...]) -> tuple[list[tuple[str, str, int]], list[tuple[int, int]]]:
+def chosen_parts(
+    sample: MonteCarlo, names: tuple[Any, ...]
+) -> tuple[list[tuple[str, str, int]], list[tuple[int, int]]]:
     """Components as (label, name of the symbol, row of y) and pairs of rows at the end."""
     n = sample.size
     every = {}
@@ -154,8 +157,8 @@ def _wrong(name: str, expected: str, received: Given) -> ProblemError:
     )
 
 
-def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], units: Mapping[str, str]) -> bool:
-    """Deviations of one component over time; whether a limit is among what is drawn."""
+def draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], units: Mapping[str, str]) -> None:
+    """Deviations of one component over time."""
     label, name, row = component
     t, n = sample.t, sample.size
     for run in sample.paths[:, :, row]:
@@ -175,17 +178,19 @@ def _draw_band(axes: Axes, sample: MonteCarlo, component: tuple[str, str, int], 
     axes.set_xlabel("time [s]")
     axes.set_ylabel(_folded(_label(label, units.get(name, ""))))
     axes.margins(x=0)
-    return _draw_limits(axes, t, _limits(sample, row))
 
 
-def _draw_limits(axes: Axes, t: Array, limits: list[Array]) -> bool:
-    """Limits that come near what is drawn, if any; the view grows by no more than itself to show them."""
+def draw_limits(axes: Axes, limits: list[tuple[Array, Array]]) -> bool:
+    """Limits over time that come near what is drawn, if any; the view grows by no more than itself to show them."""
     low, high = axes.get_ylim()
     room = (low - (high - low), high + (high - low))
-    near = [limit for limit in limits if limit.min() <= room[1] and limit.max() >= room[0]]
-    for limit in near:
+    near = [(t, limit) for t, limit in limits if limit.min() <= room[1] and limit.max() >= room[0]]
+    for t, limit in near:
         axes.plot(t, limit, zorder=1, **BOUND)
-    least, most = (float(f(limit)) for f, limit in ((np.min, near), (np.max, near))) if near else (low, high)
+    least, most = low, high
+    if near:
+        values = np.concatenate([limit for _, limit in near])
+        least, most = float(values.min()), float(values.max())
     margin = 0.05 * (high - low)
     axes.set_ylim(min(low, max(least - margin, room[0])), max(high, min(most + margin, room[1])))
     return bool(near)
@@ -200,8 +205,8 @@ def _draw_error(axes: Axes, sample: MonteCarlo, row: int) -> None:
         axes.plot(sample.t, sign * own, color=ERROR, linewidth=1.4, linestyle=DOTTED)
 
 
-def _limits(sample: MonteCarlo, row: int) -> list[Array]:
-    """How far a control may deviate from its nominal, where there are limits; a state, to its bounds."""
+def limits_over_time(sample: MonteCarlo, row: int) -> list[tuple[Array, Array]]:
+    """How far a control may deviate from its nominal, where there are limits; a state, to its bounds; over time."""
     n = sample.size
     if row >= 2 * n:
         column = row - 2 * n
@@ -209,14 +214,14 @@ def _limits(sample: MonteCarlo, row: int) -> list[Array]:
     else:
         bounds = [entry for entry in sample.inequalities.rows if entry.bound and entry.name == sample.augmented[row]]
         nominal, limits = sample.nominal[:, row], [v for entry in bounds for v in (entry.lower, entry.upper)]
-    return [limit - nominal for limit in limits if np.isfinite(limit)]
+    return [(sample.t, limit - nominal) for limit in limits if np.isfinite(limit)]
 
 
 def _label(name: str, unit: str) -> str:
     return plain_text(f"deviation of {name}" + (f" [{unit}]" if unit else ""))
 
 
-def _draw_cloud(
+def draw_cloud(
     axes: Axes, sample: MonteCarlo, pair: tuple[int, int], units: Mapping[str, str], sigmas: tuple[float, ...]
 ) -> None:
     """Terminal scatter of two components, with the ellipses of prediction and sample."""
@@ -252,9 +257,10 @@ def _title(figure: Figure, sample: MonteCarlo, title: str | None) -> None:
     place_title(figure, (text, "" if verdict.holds else verdict.headline), warning=not verdict.holds)
 
 
-def _legend(
+def draw_legend(
     figure: Figure, bands: bool, clouds: bool, sigmas: tuple[float, ...], *, errors: bool, limits: bool
 ) -> None:
+    """The legend of what is drawn."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

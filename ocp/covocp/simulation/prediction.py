@@ -93,7 +93,9 @@ class Prediction:
             return np.asarray(chosen @ self.covariance @ chosen.T + mean[:, :, None] * mean[:, None, :])
 
 
-def predict(solution: Solution, design: System, actual: System, grid: Grid) -> Prediction:
+def predict(
+    solution: Solution, design: System, actual: System, grid: Grid, start: tuple[Array, Array] | None = None
+) -> Prediction:
     """Integrate mean and covariance along the nominal by classical Runge-Kutta steps.
 
     Args:
@@ -101,6 +103,8 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
         design: what they assume.
         actual: what is simulated.
         grid: times of the result; the steps of the integration divide its steps.
+        start: mean (2n,) and covariance (2n, 2n) of deviation and estimate; None: those of the actual system, the
+            filter at the mean.
     """
     n = design.size
     joint = _joint(design, actual)
@@ -112,6 +116,8 @@ def predict(solution: Solution, design: System, actual: System, grid: Grid) -> P
     mean = np.concatenate([design.error(actual.start), np.zeros(n)])
     covariance = np.zeros((2 * n, 2 * n))
     covariance[:n, :n] = actual.variance
+    if start is not None:
+        mean, covariance = start
     means, covariances = [mean], [covariance]
     with np.errstate(over="ignore", invalid="ignore"):  # gains that the mesh does not resolve: the verdict says it
         for k, h in enumerate(fine.h.tolist()):

@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.simulation.batches import Batch, run_batch
+from covocp.simulation.batches import Batch, Cloud, run_batch
 from covocp.simulation.plan import make_plan
 from covocp.simulation.run_parts import Setting
 from covocp.simulation.schedule import WHOLE, Grid
@@ -29,6 +29,8 @@ STABLE = 1.0
 # three standard deviations, as the bands have them.
 EXAMINED_RUNS, MATTERS = 256, 3.0
 PAIRS = 5
+# Scatter of a square as a share of its mean below which it is one number.
+SAME = 1e-9
 # Steps of a first grid, at most: a filter that is still faster is not resolved, and the halving says so.
 MOST_STEPS = 100_000
 
@@ -86,15 +88,30 @@ def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
     return StepChoice(grid=base.divided(parts), change=np.nan, settled=True, given=True, shortened=shortened)
 
 
-def examined(choice: StepChoice, setting: Setting, *, runs: int, seed: int, stop: Callable[[], bool]) -> StepChoice:
+def examined(
+    choice: StepChoice,
+    setting: Setting,
+    *,
+    runs: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None = None,
+) -> StepChoice:
     """A given step with the change that halving it makes, on a pilot batch; see `choose_step`."""
-    coarse, fine = _pair(setting, choice.grid, choice.grid.divided(2), min(runs, EXAMINED_RUNS), seed, stop)
+    coarse, fine = _pair(setting, choice.grid, choice.grid.divided(2), min(runs, EXAMINED_RUNS), seed, stop, cloud)
     change = _largest_change(coarse, fine, runs)
     return replace(choice, change=change, settled=change <= MATTERS)
 
 
 def choose_step(
-    setting: Setting, base: Grid, rates: Array, *, runs: int, seed: int, stop: Callable[[], bool]
+    setting: Setting,
+    base: Grid,
+    rates: Array,
+    *,
+    runs: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None = None,
 ) -> StepChoice:
     """Halve the step until the second moments at the end do not change any more.
 
@@ -105,6 +122,7 @@ def choose_step(
         runs: number of runs of the simulation, for its sampling error.
         seed: of the simulation; the pilot runs have random numbers of their own.
         stop: asked now and then; true to give up.
+        cloud: where pilot runs start; None: drawn.
 
     Returns:
         The coarser step of the first pair that agrees to `SHARE` of the sampling error; the finest one otherwise.
@@ -119,7 +137,7 @@ def choose_step(
     change = np.inf
     for _ in range(PAIRS):
         grids = base.divided(parts), base.divided(2 * parts)
-        coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop)
+        coarse, fine = _pair(setting, *grids, min(runs, PILOT_RUNS), seed, stop, cloud)
         change = _largest_change(coarse, fine, runs)
         if unresolved and np.isfinite(fine.left).any():
             change = np.inf  # they may leave it because of the step, in both
@@ -133,14 +151,23 @@ def choose_step(
 
 
 def _pair(
-    setting: Setting, coarse: Grid, fine: Grid, count: int, seed: int, stop: Callable[[], bool]
+    setting: Setting,
+    coarse: Grid,
+    fine: Grid,
+    count: int,
+    seed: int,
+    stop: Callable[[], bool],
+    cloud: Cloud | None,
 ) -> tuple[Batch, Batch]:
     """Pilot runs on a grid, and on one with steps half as long along the same paths."""
     one, two = (
         make_plan(setting, grid, coarse.t[[0, -1]], seed=seed, pilot=True, pairs=grid is coarse)
         for grid in (coarse, fine)
     )
-    return run_batch(one, 0, count, stop), run_batch(two, 0, count, stop)
+    if cloud is None:
+        return run_batch(one, 0, count, stop), run_batch(two, 0, count, stop)
+    same = cloud.first(count), cloud.first(count)
+    return run_batch(one, 0, count, stop, same[0]), run_batch(two, 0, count, stop, same[1])
 
 
 def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:
@@ -153,7 +180,8 @@ def _largest_change(coarse: Batch, fine: Batch, runs: int) -> float:
     if np.count_nonzero(stayed) > 1:
         one, two = (np.hstack([b.deviation, b.estimate])[stayed] ** 2 for b in (coarse, fine))
         error = two.std(axis=0, ddof=1) / np.sqrt(runs)
-        scattered = error > 0
+        # What is the same in all runs but for rounding, such as a state that is known exactly, has no sampling error.
+        scattered = error * np.sqrt(runs) > SAME * two.mean(axis=0)
         changes += (np.abs((one - two).mean(axis=0))[scattered] / error[scattered]).tolist()
     gone = [np.isfinite(b.left).mean() for b in (coarse, fine)]
     error = np.sqrt(max(gone[1] * (1 - gone[1]), 1 / fine.runs) / runs)

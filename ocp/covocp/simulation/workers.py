@@ -5,17 +5,22 @@ from __future__ import annotations
 import concurrent.futures
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar, overload
 
 from covocp.base.errors import ProblemError
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import TURN
 from covocp.simulation.batches import Batch, StoppedError, run_batch
+from covocp.simulation.course import Course, Legs, run_course
 from covocp.simulation.flown import LawFailedError
 from covocp.simulation.plan import Plan
 
 # Seconds between two looks at the interrupt while an executor works.
 PATIENCE = 0.2
+
+
+# What is kept of some runs: a batch, or one for each stretch of a course.
+Kept = TypeVar("Kept", Batch, Legs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,27 +37,47 @@ class Failure:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Harvest:
+class Harvest(Generic[Kept]):
     """What came back: the batches by the number of their first run, failures, whether it was interrupted."""
 
-    batches: tuple[Batch, ...]
+    batches: tuple[Kept, ...]
     failures: tuple[Failure, ...]
     interrupted: bool
 
     __repr__ = short_repr
 
 
+@overload
 def simulate_batches(
     plan: Plan,
     ranges: list[tuple[int, int]],
     executor: Any,
     stop: Callable[[], bool],
     report: Callable[[Batch], None],
-) -> Harvest:
+) -> Harvest[Batch]: ...
+
+
+@overload
+def simulate_batches(
+    plan: Course,
+    ranges: list[tuple[int, int]],
+    executor: Any,
+    stop: Callable[[], bool],
+    report: Callable[[Legs], None],
+) -> Harvest[Legs]: ...
+
+
+def simulate_batches(
+    plan: Plan | Course,
+    ranges: list[tuple[int, int]],
+    executor: Any,
+    stop: Callable[[], bool],
+    report: Callable[[Any], None],
+) -> Harvest[Any]:
     """Simulate some ranges of runs.
 
     Args:
-        plan: what is simulated.
+        plan: what is simulated: one stretch, or several that follow each other.
         ranges: first run of each batch, and the one after its last.
         executor: with the interface of `concurrent.futures`, or None: here, one after the other.
         stop: asked now and then; true to give up.
@@ -64,15 +89,20 @@ def simulate_batches(
         return _elsewhere(plan, ranges, executor, stop, report)
 
 
+def _work(plan: Plan | Course) -> Callable[..., Any]:
+    """What simulates some runs of it."""
+    return run_course if isinstance(plan, Course) else run_batch
+
+
 def _here(
-    plan: Plan, ranges: list[tuple[int, int]], stop: Callable[[], bool], report: Callable[[Batch], None]
-) -> Harvest:
-    done: list[Batch] = []
+    plan: Plan | Course, ranges: list[tuple[int, int]], stop: Callable[[], bool], report: Callable[[Any], None]
+) -> Harvest[Any]:
+    done: list[Any] = []
     failures: list[Failure] = []
     try:
         for first, last in ranges:
             try:
-                done.append(run_batch(plan, first, last, stop))
+                done.append(_work(plan)(plan, first, last, stop))
             except LawFailedError as error:
                 failures.append(Failure(first=first, last=last, reason=_reason(error)))
             else:
@@ -83,14 +113,14 @@ def _here(
 
 
 def _elsewhere(
-    plan: Plan,
+    plan: Plan | Course,
     ranges: list[tuple[int, int]],
     executor: Any,
     stop: Callable[[], bool],
-    report: Callable[[Batch], None],
-) -> Harvest:
+    report: Callable[[Any], None],
+) -> Harvest[Any]:
     """On an executor: a task that fails loses its runs only."""
-    done: dict[int, Batch] = {}
+    done: dict[int, Any] = {}
     failures: list[Failure] = []
     tasks: dict[Any, tuple[int, int]] = {}
     interrupted = False
@@ -127,10 +157,10 @@ def _elsewhere(
     )
 
 
-def _submit(executor: Any, plan: Plan, first: int, last: int) -> Any:
+def _submit(executor: Any, plan: Plan | Course, first: int, last: int) -> Any:
     """A task, as a future of `concurrent.futures`."""
     submit = getattr(executor, "submit", None)
-    future = submit(run_batch, plan, first, last) if callable(submit) else None
+    future = submit(_work(plan), plan, first, last) if callable(submit) else None
     if not isinstance(future, concurrent.futures.Future):
         raise ProblemError(
             "This executor cannot be used.",

@@ -20,6 +20,7 @@ from covocp.base.threads import methods_one_at_a_time
 from covocp.solution.report import sections
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
+from covocp.statement.chain import Link
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -83,6 +84,7 @@ class PhasesSolution:
         link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p.
         violations: of constraints, by name with that of the phase.
         stats: iterations, times, what the method counts.
+        links: what passes from each phase to the next; none where it was read from a file without its phases.
     """
 
     name: str
@@ -93,6 +95,7 @@ class PhasesSolution:
     link_residuals: tuple[float, ...]
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
+    links: tuple[Link, ...] = ()
 
     # What functions say that take one problem or solution.
     instead = "give one of its phases, solution[name]; what concerns all phases together is not available here"

@@ -99,7 +99,8 @@ def _of_phases(solution: PhasesSolution, phases: Problem | Phases | None) -> Pha
             weighed = link.weighed(statements[i].values, solution[i].parameters[list(link.weights)])
             statements[i] = replace(statements[i], values=weighed)
     pairs = zip(solution.phases, statements, strict=True)
-    result = replace(solution, phases=tuple(attached(phase, statement) for phase, statement in pairs))
+    whole = tuple(attached(phase, statement) for phase, statement in pairs)
+    result = replace(solution, phases=whole, links=chain.links)
     for i, link in enumerate(chain.links):
         _check_link(link, result[i], result[i + 1])
     return result

@@ -336,6 +336,7 @@ def _solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolutio
         link_residuals=residuals or (float("nan"),) * len(chain.links),
         violations=dict(outcome.violations),
         stats=dict(outcome.stats),
+        links=chain.links,
     )
 
 
