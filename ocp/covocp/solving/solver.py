@@ -41,7 +41,7 @@ from covocp.solving.attempts import best_of, cost_of, counted, from_starts, inte
 from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import far_away
 from covocp.solving.exact_rows import made_ready
-from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
+from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.methods import METHODS, check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
@@ -214,7 +214,7 @@ class Solver:
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
-            outcome = with_stats(outcome, **gain_counts(self._problem))
+            outcome = with_gain_told(self._problem, outcome, first)
             return self._beside_classical(self._finish(outcome, allow_failure), values)
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
