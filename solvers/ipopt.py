@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 
 from covocp.base.arguments import checked, mapping, one_of, optional, positive, text, truth, whole
-from covocp.base.errors import ProblemError
+from covocp.base.errors import ProblemError, warn_user
 from covocp.base.expressions import Given
 from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
@@ -18,6 +18,7 @@ from covocp.base.residuals import LIMIT
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import Extremal, Guess, Outcome
 from covocp.extremal.links import ChainOutcome
+from covocp.passage.library import build_info
 from covocp.solvers.plugins import merged
 from covocp.solvers.reached import Magnitudes, Round
 from covocp.solvers.runs import MAX_ITERATIONS, Runs
@@ -29,12 +30,15 @@ from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import QUIET
 from covocp.transcription.program import Arrays, Program, Trajectories, alone, joined
 from covocp.transcription.scales import choose_scales, evened
+from covocp.transcription.shooting import Passage
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 
 TOLERANCE = 1e-7
 # What is left at a point is judged by residuals of the first order, larger than tolerances on slopes by this factor.
 LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
+# Rows of a covariance up to which nobody waits for CasADi's own operations.
+LARGEST_UNTOLD = 8
 HISTORY = 20  # of the limited-memory Hessian, measured on the chain of masses
 JIT: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"]}}
 
@@ -148,6 +152,8 @@ def _made_ready(
     eliminated = any(mesh.eliminated and st.matrices for st, mesh in pairs)
     limited = hessian == "limited-memory" or (hessian == "auto" and eliminated)
     limited = limited and plugin == "ipopt"
+    if limited and not compile:
+        _mention_slowness(pairs)
     settings: dict[str, Any] = dict(QUIET)
     if plugin == "ipopt":
         settings["ipopt"] = {
@@ -183,6 +189,17 @@ def _gain_kind(statement: Statement) -> str:
     asked = any(entry.realised is not None for entry in conditions)
     asked = asked or (statement.loop is not None and statement.loop.spread is not None)
     return "asked gain" if asked else "free gain"
+
+
+def _mention_slowness(pairs: list[tuple[Statement, Mesh]]) -> None:
+    """Tell that large covariances pass without compiled code."""
+    info = build_info()
+    sizes = [matrix.size for statement, mesh in pairs if mesh.eliminated for matrix in statement.matrices]
+    if not info["compiled"] and max(sizes, default=0) > LARGEST_UNTOLD:
+        warn_user(
+            f"A covariance of {max(sizes)} rows is solved without the compiled passage, which is several times faster: "
+            f"{info['library']}. Install a C compiler and covocp again; the numbers are the same."
+        )
 
 
 def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plugin: Given) -> None:
@@ -280,6 +297,8 @@ def _builder(
 ) -> Callable[[Magnitudes | None, Trajectories, Arrays], Program]:
     """What makes the program in some magnitudes, or in those of trajectories where there are none."""
 
+    passage: Passage = "compiled" if limited and chain is None else "plain"
+
     def build(scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> Program:
         pairs = list(zip(statements, meshes, strict=True))
         if scales is None:
@@ -287,7 +306,7 @@ def _builder(
             scales = tuple(choose_scales(*pair, trajectory, own) for pair, trajectory, own in along)
         if limited:
             scales = tuple(evened(own, mesh) for own, mesh in zip(scales, meshes, strict=True))
-        parts = tuple(transcribe(*pair, own) for pair, own in zip(pairs, scales, strict=True))
+        parts = tuple(transcribe(*pair, own, passage) for pair, own in zip(pairs, scales, strict=True))
         return alone(parts[0]) if chain is None else joined(chain, parts)
 
     return build

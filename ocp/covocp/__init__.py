@@ -15,8 +15,8 @@ one after the other), `table` (numbers over one to three variables); expressions
 `Solver` (again and again), `compare` (several methods), `evaluate` (a given control), `methods`. To judge a solution:
 `certify` (is it the global minimum?), `worth` (does the combined design pay?), `simulate` (Monte Carlo of the actual
 system), `simulate_law`, `simulate_sampled`. To keep and to fly it: `Solution.save`, `load`, `export_c`. Filters and
-laws by themselves: `blocks`. What is wrong is said by `ProblemError`, `SolveError` and `ExportError`, all of them
-`CovocpError`, and by `CovocpWarning`.
+laws by themselves: `blocks`. What this installation has: `build_info`. What is wrong is said by `ProblemError`,
+`SolveError` and `ExportError`, all of them `CovocpError`, and by `CovocpWarning`.
 
 `help(covocp.solve)` and so on have the details; docs/api.md of the repository lists every name and option on one page.
 """
@@ -71,6 +71,7 @@ __all__ = [
     "CPackage",
     "load",
     "blocks",
+    "build_info",
     "CovocpError",
     "ProblemError",
     "SolveError",
@@ -90,6 +91,7 @@ if TYPE_CHECKING:
     from covocp.blocks.tables import table as table
     from covocp.export import CPackage as CPackage
     from covocp.export import export_c as export_c
+    from covocp.passage.library import build_info as build_info
     from covocp.simulation import MonteCarlo as MonteCarlo
     from covocp.simulation import simulate as simulate
     from covocp.simulation.laws import LawSimulation as LawSimulation
@@ -109,6 +111,7 @@ else:
         "Comparison": "covocp.solving.comparison",
         "compare": "covocp.solving.comparison",
         "load": "covocp.solving.loading",
+        "build_info": "covocp.passage.library",
         "CPackage": "covocp.export",
         "export_c": "covocp.export",
         "LawSimulation": "covocp.simulation.laws",

@@ -196,7 +196,9 @@ def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
         return ca.Function("forward", [start, *common], [ca.horzcat(start, ends), cost])
     ends, fine, cost = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("passage", n)(start[:nx], *common)
     x = ca.horzcat(start[:nx], ends)
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, common, common.parameters[:, 0], start[nx:])
+    e, matrix_cost = matrices_along(
+        statement, mesh, x, fine, common, common.parameters[:, 0], start[nx:], passage="compiled"
+    )
     return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
 
 

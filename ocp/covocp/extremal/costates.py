@@ -100,8 +100,10 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
         fine, slopes, by_duration = discrete_costates(refined(extremal))
         at_nodes = Costates(state=fine.state[::points], matrices=fine.matrices[::points])
         return at_nodes, prolongation(extremal.mesh).T @ slopes, by_duration
-    if st.behind:
-        return _costates_both_ways(extremal)
+    mesh = extremal.mesh
+    along = bool(st.matrices) and mesh.eliminated and not st.coupled and mesh.step != "rk4"
+    if st.behind or along:
+        return _costates_of_passages(extremal)
     last = np.concatenate(terminal_costates(extremal))
     interval = adjoint_interval(st, extremal.mesh.substeps, extremal.mesh.step)
     z = ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
@@ -125,8 +127,8 @@ def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array,
     return np.vstack([values.T, last]), mesh.gathered(slopes), float(by_duration.sum())
 
 
-def _costates_both_ways(extremal: Extremal) -> tuple[Costates, Array, float]:
-    """The same where some matrix runs backward: its costate runs forward, from zero.
+def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """The same where matrices pass along the nominal: the costate of one that runs backward runs forward, from zero.
 
     The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
     both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.
@@ -204,7 +206,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     weights = ca.MX.sym("weights", statement.ne, n + 1)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage="compiled")
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)

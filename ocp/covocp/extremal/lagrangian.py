@@ -18,8 +18,11 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.statement import Columns, Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import interval_columns, matrices_along
+from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, moving_interval, nominal_interval
+
+# Rows that hold states alone.
+OF_STATES = ("final", "states")
 
 
 def node_size(statement: Statement) -> int:
@@ -39,6 +42,13 @@ def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
         *(np.concatenate([z.ravel(), t.u.ravel()]), t.e[0], t.duration, extremal.parameters, costate.T),
         *(m.final, final_matrices, m.start, m.end, m.path.T, m.states.T, m.matrices.T),
     )
+
+
+def _sees_matrices(statement: Statement, held: Entries) -> bool:
+    """Whether some of the rows that are held contain entries of matrices."""
+    conditions = {"path": statement.path, "start": statement.start, "end": statement.end}
+    named = [kind for kind, positions in held if positions]
+    return any(kind not in conditions or conditions[kind].uses_matrices for kind in named if kind not in OF_STATES)
 
 
 @lru_cache(maxsize=4)
@@ -65,16 +75,18 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     x = z[: st.nx, :]
     if st.coupled:
         ends, _, cost = full_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
-        e = z[st.nx :, :]
+        e = seen = z[st.nx :, :]
     else:
         ends, fine, cost = nominal_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
-        e = ca.MX(0, n + 1)
+        e = seen = ca.MX(0, n + 1)
         if st.matrices:
-            e, matrix_cost = matrices_along(st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1])
+            passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1])
+            e, matrix_cost = matrices_along(*passing, passage="compiled")
+            seen = matrices_along(*passing)[0] if compiled_steps(mesh) and _sees_matrices(st, held) else e
             cost += matrix_cost
     value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])
     value += ca.dot(final, x[:, -1]) + ca.dot(final_e, e[:, -1]) + ca.dot(states, x) + ca.dot(matrices, e)
-    rows = {"final": x[:, -1], "final_matrices": e[:, -1], "states": x, "matrices": e}
+    rows = {"final": x[:, -1], "final_matrices": seen[:, -1], "states": x, "matrices": seen}
     at_nodes = u if mesh.control == "linear" else ca.horzcat(u, u[:, -1])
     time = duration * ca.DM(mesh.nodes).T
     for kind, conditions, weights, at in (
@@ -84,8 +96,8 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     ):
         if conditions.size:
             places = Columns(x[:, at], at_nodes[:, at], e[:, at], time[:, at])
-            rows[kind] = conditions.columns(places, duration, p)
-            value += ca.dot(weights, rows[kind])
+            value += ca.dot(weights, conditions.columns(places, duration, p))
+            rows[kind] = conditions.columns(places._replace(matrices=seen[:, at]), duration, p)
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
     inputs = [w, e0, duration, p, costate, final, final_e, start, end, path, states, matrices]
     direction = ca.MX.sym("direction", w.shape[0])

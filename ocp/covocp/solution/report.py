@@ -394,6 +394,8 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     """What a sign means, and what a residual does that is larger than usual."""
     if name == "smallest_eigenvalue":
         return "semidefinite" if solution.semidefinite else "INDEFINITE"
+    if name == "mesh_error" and np.isnan(value) and solution.converged:
+        return "not assessed"
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
     level, words = WORRIES.get(name, (np.inf, ""))

@@ -99,8 +99,8 @@ class Solution:
     within: Within | None = None
 
     @staticmethod
-    def of(outcome: Outcome, method: str, within: Within | None = None) -> Solution:
-        """The solution of an outcome, with the estimate of its mesh error."""
+    def of(outcome: Outcome, method: str, within: Within | None = None, *, assess: bool = True) -> Solution:
+        """The solution of an outcome, with the estimate of its mesh error, or nan in its place."""
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
         loop = close_loop(extremal) if st.loop is not None and np.isfinite(rates).all() else None
@@ -115,7 +115,7 @@ class Solution:
             rates=rates,
             end_rates=end_rates,
             filter_gain=filter_gains(extremal),
-            mesh_error=mesh_error(extremal, outcome.cost_terms["running"], within),
+            mesh_error=mesh_error(extremal, outcome.cost_terms["running"], within) if assess else np.nan,
             violations=dict(outcome.violations),
             stats=dict(outcome.stats),
             blocks=st.blocks,

@@ -158,7 +158,7 @@ class Solver:
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
-    @checked(progress=truth, allow_failure=truth)
+    @checked(progress=truth, allow_failure=truth, assess=truth)
     def solve(
         self,
         parameters: Mapping[str, Any] | None = None,
@@ -168,6 +168,7 @@ class Solver:
         allow_failure: bool = False,
         starts: int = STARTS,
         seed: int = 0,
+        assess: bool = True,
     ) -> Solution:
         """Solve for some values of the parameters.
 
@@ -179,6 +180,9 @@ class Solver:
             allow_failure: return the last iterate of a run that did not converge instead of raising.
             starts: number of random starts of "multistart".
             seed: of the random starts.
+            assess: False in a loop that solves again and again: what is looked at after a run is left out (error of the
+                mesh and steps that are too long, curvature where a run ends as it began, cost of the classical design,
+                warnings). `mesh_error` is then nan; the residuals that a converged run must meet are the same.
 
         Returns:
             The solution.
@@ -207,15 +211,16 @@ class Solver:
                     if first is not None and guess is not first and not outcome.converged and not reporter.stop:
                         guesses = make_guesses(self._solved, self._prepared.mesh, values, first)
                         outcome, start = from_starts(self._prepared, values, guesses, reporter)
-                    outcome = self._leave_saddle(outcome, values, reporter, start)
-                outcome = self._with_finer_steps(outcome, values, reporter)
+                    outcome = self._leave_saddle(outcome, values, reporter, start) if assess else outcome
+                outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
             outcome = with_gain_told(self._problem, outcome, first)
-            return self._beside_classical(self._finish(outcome, allow_failure), values)
+            solution = self._finish(outcome, allow_failure, assess)
+            return self._beside_classical(solution, values) if assess else solution
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
         """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
@@ -397,12 +402,12 @@ class Solver:
         self._keep(found.options, found.prepared)
         return found.outcome
 
-    def _finish(self, outcome: Outcome, allow_failure: bool) -> Solution:
+    def _finish(self, outcome: Outcome, allow_failure: bool, assess: bool) -> Solution:
         """An outcome as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
         if impossible:
             outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(with_stats(outcome, **self._options.grading), self.method)
+        solution = Solution.of(with_stats(outcome, **self._options.grading), self.method, assess=assess)
         if not outcome.converged:
             if allow_failure:
                 return solution
@@ -415,8 +420,9 @@ class Solver:
                 solution=solution,
                 violations=outcome.violations,
             )
-        mention_doubts(solution)
-        mention_limits(solution)
+        if assess:
+            mention_doubts(solution)
+            mention_limits(solution)
         return solution
 
 

@@ -75,26 +75,47 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
 def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
     _check_common(statement, solution)
-    duration = solution.duration if statement.duration.free else statement.duration.guess
-    own, sizes = solution.mesh, mesh.nodes.size
-    same = np.array_equal(own.nodes, mesh.nodes) and own.control == mesh.control
-    sample = solution.at(mesh.nodes * solution.duration)
-    at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
-    ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
-    gain = free_gain_block(statement) if solution.loop is not None else None
+    own = solution.mesh
     t, m = solution.trajectory, solution.multipliers
     blocks = (*statement.states, *statement.controls, *statement.matrices)
     others = {(b.name, b.kind, b.size): b for b in solution.blocks}
     found = [others.get((b.name, b.kind, b.size)) for b in blocks]
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
     matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, found, strict=True))
+    nodes = np.array_equal(own.nodes, mesh.nodes) and np.array_equal(own.instants, mesh.instants)
+    duration = solution.duration if statement.duration.free else statement.duration.guess
+    if matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
+        trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
+    else:
+        trajectory = _resampled(statement, mesh, parameters, solution, matched)
+    constraints = (statement.path.size, statement.start.size, statement.end.size)
+    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+        return Guess(trajectory=trajectory, warm=True)
+    costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    return Guess(
+        trajectory=trajectory,
+        multipliers=_multipliers(m, own, mesh),
+        costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
+        warm=True,
+    )
+
+
+def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, matched: bool) -> Trajectory:
+    """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
+    duration = solution.duration if statement.duration.free else statement.duration.guess
+    sizes, t = mesh.nodes.size, solution.trajectory
+    sample = solution.at(mesh.nodes * solution.duration)
+    at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
+    ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
+    gain = free_gain_block(statement) if solution.loop is not None else None
+    others = {(b.name, b.kind, b.size) for b in solution.blocks}
     if matched:  # nothing of it stays
         x, u, e = (np.zeros((n, v.shape[1])) for n, v in ((sizes, t.x), (mesh.control_nodes, t.u), (sizes, t.e)))
     else:
         plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
         x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
-    for block, other in zip(blocks, found, strict=True):
-        if other is None:
+    for block in (*statement.states, *statement.controls, *statement.matrices):
+        if (block.name, block.kind, block.size) not in others:
             if block == gain:
                 at = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
                 (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, at)
@@ -106,21 +127,9 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         else:
             e[:, block.span] = pack(sample[block.name])
             e[mesh.instants, block.span] = pack(ahead[block.name])
-    if same and matched and solution.trajectory.u.shape == u.shape:
-        u = solution.trajectory.u.copy()
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:
         e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
-    trajectory = Trajectory(x=x, u=u, e=e, duration=duration)
-    constraints = (statement.path.size, statement.start.size, statement.end.size)
-    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
-        return Guess(trajectory=trajectory, warm=True)
-    costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
-    return Guess(
-        trajectory=trajectory,
-        multipliers=_multipliers(m, own, mesh),
-        costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
-        warm=True,
-    )
+    return Trajectory(x=x, u=u, e=e, duration=duration)
 
 
 def _check_common(statement: Statement, solution: Solution) -> None:

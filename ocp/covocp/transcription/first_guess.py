@@ -277,5 +277,5 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, passage="compiled")
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])

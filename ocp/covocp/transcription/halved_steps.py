@@ -59,7 +59,7 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
         duration=ca.DM(trajectory.duration),
         parameters=ca.DM(parameters),
     )
-    values = shoot(statement, divided, start)
+    values = shoot(statement, divided, start, passage="compiled")
     jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
     states, matrices = (np.asarray(ca.DM(values[name][:, ::parts]).full()).T for name in ("x", "e"))
     costs = np.asarray(ca.DM(values["cost"]).full()).reshape(mesh.intervals, parts).sum(axis=1)

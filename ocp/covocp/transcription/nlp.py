@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -273,14 +274,23 @@ def terminal_slopes(
     statement: Statement, trajectory: Trajectory, parameters: Array, end: Array, path: Array
 ) -> tuple[Array, Array]:
     """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
-    x, e = ca.MX.sym("x", statement.nx), ca.MX.sym("e", statement.ne)
-    t, u = trajectory.duration, trajectory.u[-1]
-    value = statement.terminal(x, e, t, parameters)
+    t, function = trajectory, _terminal_slopes(statement)
+    by_x, by_e = function(t.x[-1], t.e[-1], t.u[-1], t.duration, parameters, end, path)
+    return np.asarray(by_x.full()).ravel(), np.asarray(by_e.full()).ravel()
+
+
+@lru_cache(maxsize=4)
+def _terminal_slopes(statement: Statement) -> ca.Function:
+    """(x, e, u at T, T, parameters, multipliers of conditions at the end, of those along the path) -> slopes."""
+    x, e, u = (ca.MX.sym(name, size) for name, size in (("x", statement.nx), ("e", statement.ne), ("u", statement.nu)))
+    t, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
+    end, path = ca.MX.sym("end", statement.end.size), ca.MX.sym("path", statement.path.size)
+    value = statement.terminal(x, e, t, p)
     for conditions, weights in ((statement.end, end), (statement.path, path)):
         if conditions.size:
-            value += ca.dot(ca.DM(weights), conditions.function(x, u, e, t, t, parameters))
-    slopes = ca.Function("slopes", [x, e], [ca.gradient(value, x), ca.gradient(value, e)])
-    return tuple(np.asarray(v.full()).ravel() for v in slopes(trajectory.x[-1], trajectory.e[-1]))  # type: ignore[return-value]
+            value += ca.dot(weights, conditions.function(x, u, e, t, t, p))
+    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, e)]
+    return ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes)
 
 
 def _fix(lower: Array, upper: Array, values: Array) -> None:

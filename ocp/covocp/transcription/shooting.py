@@ -1,19 +1,31 @@
-"""Multiple shooting: states, matrices and costs of all intervals, the matrices along the nominal or with it."""
+"""Multiple shooting: states, matrices and costs of all intervals, the matrices along the nominal or with it.
+
+Matrices along the nominal pass it in sequence: by CasADi's operations, or, where slopes of first order are enough, by
+the compiled passage.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import half_length
+from covocp.passage.library import functions
+from covocp.passage.sweep import depends, passed_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
     full_interval,
     gathering_step,
+    gauss_points,
     in_order,
     joint_interval,
     nominal_interval,
@@ -27,6 +39,13 @@ from covocp.transcription.steps import (
 
 # Steps that a sequence of numbers takes at a time.
 NUMERIC_RUN = 10
+
+# How eliminated matrices pass: by CasADi's operations; where the steps allow it in compiled code, of which CasADi sees
+# no sparsity (slopes along directions, no Jacobians); or something that depends on what they depend on.
+Passage = Literal["plain", "compiled", "dependence"]
+
+# (value, arguments, count) -> what a sequence of steps gives, a column for each step.
+Run = Callable[[Any, list[Any], int], list[Any]]
 
 
 def repeat(column: Expr, count: int) -> Any:
@@ -49,8 +68,11 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
 
 
-def shoot(statement: Statement, mesh: Mesh, variables: Expr) -> dict[str, Any]:
-    """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval."""
+def shoot(statement: Statement, mesh: Mesh, variables: Expr, *, passage: Passage = "plain") -> dict[str, Any]:
+    """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval.
+
+    `passage`: of eliminated matrices.
+    """
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
         start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
@@ -71,10 +93,11 @@ def shoot(statement: Statement, mesh: Mesh, variables: Expr) -> dict[str, Any]:
     if not mesh.eliminated or statement.coupled:
         return result | {"e": nodes[nx:, :]}
     e0 = None if variables.e is None else variables.e[:, 0]
-    passage = passages(statement, mesh, result["x"], fine, intervals, variables.parameters, e0)
+    given = (result["x"], fine, intervals, variables.parameters, e0)
+    at_nodes, halves, matrix_cost = passages(statement, mesh, *given, passage=passage)
     if inside:
-        result["e_inside"] = passage[1][:, inside]
-    return result | {"e": passage[0], "cost": cost + passage[2]}
+        result["e_inside"] = halves[:, inside]
+    return result | {"e": at_nodes, "cost": cost + matrix_cost}
 
 
 def _inside(mesh: Mesh) -> list[int]:
@@ -120,6 +143,8 @@ def matrices_along(
     parameters: Expr,
     e0: Expr = None,
     kicks: Expr = None,
+    *,
+    passage: Passage = "plain",
 ) -> tuple[Any, Any]:
     """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
 
@@ -133,11 +158,12 @@ def matrices_along(
         e0: half-vectors at the start; None: the statement's.
         kicks: added to the half-vectors as they pass the nodes, (ne, N + 1): slopes by them are costates. None:
             nothing; only where some matrix runs backward.
+        passage: how they pass.
 
     Returns:
         Half-vectors at the nodes (ne, N + 1), running cost of each interval (1, N) where it depends on the matrices.
     """
-    e, _, cost = passages(statement, mesh, x, fine, intervals, parameters, e0, kicks)
+    e, _, cost = passages(statement, mesh, x, fine, intervals, parameters, e0, kicks, passage=passage)
     return e, cost
 
 
@@ -150,6 +176,8 @@ def passages(
     parameters: Expr,
     e0: Expr = None,
     kicks: Expr = None,
+    *,
+    passage: Passage = "plain",
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
     n, m = mesh.intervals, mesh.substeps
@@ -163,11 +191,12 @@ def passages(
         inside: Expr = ca.reshape(fine, statement.nx * m, n)
         before = ca.reshape(ca.vertcat(starts, inside[: statement.nx * (m - 1), :]), statement.nx, n * m)
     columns = (before, fine, *intervals.substeps(m))
+    sequence = partial(_sequence, statement, mesh, passage if compiled_steps(mesh) else "plain")
     first = e0[statement.entries(statement.ahead)]
-    groups = [_forward(statement, mesh, first, columns, _of(kicks, statement, statement.ahead))]
+    groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
     if statement.matrix_end is not None:
         last = statement.matrix_end(x[:, -1], intervals.duration[:, -1], parameters)
-        groups.append(_backward(statement, mesh, last, columns, _of(kicks, statement, statement.behind)))
+        groups.append(_backward(statement, mesh, sequence, last, columns, _of(kicks, statement, statement.behind)))
     if statement.summed:
         first = e0[statement.entries(statement.summed)]
         groups.append(_gathered(statement, mesh, first, columns, groups[0], _of(kicks, statement, statement.summed)))
@@ -196,13 +225,20 @@ def _of(kicks: Expr, statement: Statement, positions: tuple[int, ...]) -> Any:
     return None if kicks is None else kicks[statement.entries(positions), :]
 
 
-def _forward(statement: Statement, mesh: Mesh, first: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
+def _forward(
+    statement: Statement,
+    mesh: Mesh,
+    sequence: Callable[..., tuple[Any, Any]],
+    first: Expr,
+    columns: tuple[Any, ...],
+    kicks: Expr,
+) -> tuple[Any, ...]:
     """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
     n, m = mesh.intervals, mesh.substeps
     later = None
     if kicks is not None:
         first, later = first + kicks[:, 0], kicks[:, 1:]
-    arrived, passed = _sequence(statement, mesh, statement.ahead, first, columns, later)
+    arrived, passed = sequence(statement.ahead, first, columns, later)
     nodes = ca.horzcat(first, passed[:, m - 1 :: m])
     return nodes, nodes[:, :n], arrived
 
@@ -234,7 +270,14 @@ def _gathered(
     return nodes, nodes[:, :n], arrived
 
 
-def _backward(statement: Statement, mesh: Mesh, last: Expr, columns: tuple[Any, ...], kicks: Expr) -> tuple[Any, ...]:
+def _backward(
+    statement: Statement,
+    mesh: Mesh,
+    sequence: Callable[..., tuple[Any, Any]],
+    last: Expr,
+    columns: tuple[Any, ...],
+    kicks: Expr,
+) -> tuple[Any, ...]:
     """The same for the matrices that run backward: each step is the forward one of the interval turned round."""
     n, m = mesh.intervals, mesh.substeps
     before, after, *rest = columns
@@ -242,36 +285,75 @@ def _backward(statement: Statement, mesh: Mesh, last: Expr, columns: tuple[Any, 
     turned = tuple(column[:, order] for column in (after, before, *Interval(*rest).turned()))
     if kicks is not None:
         last, kicks = last + kicks[:, n], kicks[:, list(range(n - 1, -1, -1))]
-    arrived, passed = _sequence(statement, mesh, statement.behind, last, turned, kicks)
+    arrived, passed = sequence(statement.behind, last, turned, kicks)
     points = ca.horzcat(passed[:, order], last)
     return points[:, ::m], arrived[:, order][:, ::m], points[:, 1:]
 
 
+def compiled_steps(mesh: Mesh) -> bool:
+    """Whether the compiled passage has the steps of a mesh: those of Gauss, where nothing is written out as C."""
+    return mesh.step in ("gauss", "rodas") and mesh.linear_solver == LINEAR_SOLVER and functions() is not None
+
+
 def _sequence(
-    statement: Statement, mesh: Mesh, positions: tuple[int, ...], first: Expr, columns: tuple[Any, ...], kicks: Expr
+    statement: Statement,
+    mesh: Mesh,
+    passage: Passage,
+    positions: tuple[int, ...],
+    first: Expr,
+    columns: tuple[Any, ...],
+    kicks: Expr,
 ) -> tuple[Any, Any]:
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
     reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
     moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
     chosen = [column[:, moving] for column in columns] if reads else columns
-    if mesh.step == "rk4":
-        step = runge_kutta_step(statement, positions)
-        matrices = [column for k, column in enumerate(columns) if k != 1]
-    else:
-        step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
-        kinds = [step_matrix(statement, i, mesh.step, mesh.linear_solver) for i in positions]
-        matrices = [kind.map(count - len(reads))(*chosen) for kind in kinds]
-    read = read_step(statement, positions) if reads else step
+    matrices, run = _steps(statement, mesh, passage, positions, kicks is not None)(chosen, count - len(reads))
+    read = read_step(statement, positions) if reads else None
     at_reads = [columns[0], *columns[2:]]
     if kicks is None:
-        values = _stretches(step, read, first, (matrices, at_reads), reads, count)[0]
+        values = _stretches(run, read, first, (matrices, at_reads), reads, count)[0]
         return values, values
     at_nodes = ca.MX(first.shape[0], count)
     at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
     given = ([*matrices, at_nodes[:, moving]], [*at_reads, at_nodes])
-    passed, before = _stretches(_kicked(step), _kicked(read), first, given, reads, count)
+    passed, before = _stretches(run, None if read is None else _kicked(read), first, given, reads, count)
     return before, passed
+
+
+def _steps(
+    statement: Statement, mesh: Mesh, passage: Passage, positions: tuple[int, ...], kicked: bool
+) -> Callable[[Any, int], tuple[list[Any], Run]]:
+    """What makes, from the columns of some steps, the arguments of a sequence of them and the sequence."""
+    kinds: list[ca.Function]
+    if passage != "plain":
+        sizes = [statement.matrices[i].size for i in positions]
+        kinds = [gauss_points(statement, i, mesh.step) for i in positions]
+        run = partial(_compiled, passed_by if passage == "compiled" else depends, sizes, kicked)
+        return lambda columns, count: ([h for kind in kinds for h in kind.map(count).call(list(columns))], run)
+    if mesh.step == "rk4":
+        step = runge_kutta_step(statement, positions)
+        step = _kicked(step) if kicked else step
+        return lambda columns, _: ([column for k, column in enumerate(columns) if k != 1], partial(_accumulated, step))
+    step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
+    step = _kicked(step) if kicked else step
+    kinds = [step_matrix(statement, i, mesh.step, mesh.linear_solver) for i in positions]
+    return lambda columns, count: ([kind.map(count)(*columns) for kind in kinds], partial(_accumulated, step))
+
+
+def _compiled(
+    passing: Callable[..., Any], sizes: list[int], kicked: bool, first: Expr, arguments: list[Any], count: int
+) -> list[Any]:
+    """What `_accumulated` gives, by the compiled passage: arguments are h H of each matrix at both Gauss points."""
+    kicks = arguments[-1] if kicked else None
+    ends = np.cumsum([0, *(half_length(size) for size in sizes)]).tolist()
+    parts = []
+    for k, (size, (i, j)) in enumerate(zip(sizes, pairwise(ends), strict=True)):
+        own = None if kicks is None else kicks[i:j, :]
+        parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own))
+    passed = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
+    return [passed] if kicks is None else [passed, passed - kicks]
 
 
 def _reads(mesh: Mesh) -> list[int]:
@@ -288,26 +370,31 @@ def _kicked(step: ca.Function) -> ca.Function:
 
 
 def _stretches(
-    step: ca.Function, read: ca.Function, first: Expr, given: tuple[list[Any], list[Any]], reads: list[int], count: int
+    run: Run,
+    read: ca.Function | None,
+    first: Expr,
+    given: tuple[list[Any], list[Any]],
+    reads: list[int],
+    count: int,
 ) -> list[Any]:
     """What steps give in sequence, and between them what is read, a column each.
 
     Args:
-        step: (value, *columns of `given[0]`) -> value after it, perhaps more.
+        run: (value, columns of `given[0]`, their count) -> values after the steps, perhaps more.
         read: (value, *columns of `given[1]`) -> the same.
         first: value at the start.
         given: arguments of the steps that move, without columns for the others; of those that read, a column for each.
         reads: which of all steps read.
         count: of all steps.
     """
-    if not reads:
-        return _accumulated(step, first, given[0], count)
+    if read is None:
+        return run(first, given[0], count)
     parts: list[list[Any]] = []
     value, moved, k = first, 0, 0
     for stop in [*reads, count]:
         if length := stop - k:
             own = [_columns(argument, moved, length, count - len(reads)) for argument in given[0]]
-            parts.append(_accumulated(step, value, own, length))
+            parts.append(run(value, own, length))
             value, moved = parts[-1][0][:, -1], moved + length
         if stop < count:
             outputs = read(value, *(argument[:, stop] for argument in given[1]))
@@ -352,7 +439,7 @@ def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any,
     x = ca.horzcat(x0, ends)
     if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0)
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0, passage="compiled")
     return x, e, cost + matrix_cost
 
 

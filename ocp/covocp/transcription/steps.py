@@ -168,12 +168,12 @@ def step_matrix(statement: Statement, index: int, step: StepKind, solver: str = 
     if step == "strang":
         value = ca.horzcat(*_strang_parts(statement, index)(xa, xb, *interval))
     else:
-        value = gauss_matrix(_gauss_points(statement, index, step)(xa, xb, *interval), size, solver)
+        value = gauss_matrix(gauss_points(statement, index, step)(xa, xb, *interval), size, solver)
     return ca.Function("step_matrix", [xa, xb, *interval], [value], _slopes(statement, 2))
 
 
 @lru_cache(maxsize=KEPT)
-def _gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Function:
+def gauss_points(statement: Statement, index: int, step: StepKind) -> ca.Function:
     """h H at the two Gauss points, H = [-F' W; Q F], the nominal there by its own polynomial (`between`)."""
     form = _form(statement, index)
     inside = between(statement, GAUSS_NODES) if step == "rodas" else None

@@ -12,30 +12,40 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.statement.statement import Columns, Conditions, Statement
+from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
-from covocp.transcription.shooting import interval_columns, shoot
+from covocp.transcription.shooting import Passage, compiled_steps, interval_columns, shoot
+
+# Adjoint sweeps that a Jacobian takes at once.
+LARGEST_DIRECTIONS = 64
 
 
-def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
+def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = "plain") -> NLP:
     """Build the NLP of a statement on a mesh.
 
     Args:
         statement: the problem.
         mesh: nodes, segments, formulation.
         scales: magnitudes in which the NLP works.
+        passage: of eliminated matrices; compiled, the NLP has slopes of first order only.
 
     Returns:
         The NLP; its functions are not yet differentiated.
     """
     variables = _Variables(statement, mesh, scales)
-    nodes = shoot(statement, mesh, variables)
+    passage = passage if compiled_steps(mesh) else "plain"
+    nodes = shoot(statement, mesh, variables, passage=passage)
     running = ca.sum2(nodes["cost"])
     last_x, last_e = nodes["x"][:, -1], nodes["e"][:, -1]
     terminal = statement.terminal(last_x, last_e, variables.duration, variables.parameters)
     rows = _constraints(statement, mesh, scales, variables, nodes)
     g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
     p = ca.vertcat(variables.p)
+    depending = None
+    if passage == "compiled" and any(entry.dense for entry in rows):
+        seen = shoot(statement, mesh, variables, passage="dependence")
+        depending = _dense(_constraints(statement, mesh, scales, variables, seen))
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
     return NLP(
         statement=statement,
@@ -46,7 +56,7 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
         f=(running + terminal) / variables.cost_scale,
         g=g,
         rows=rows,
-        jacobian=_split_jacobian(variables, rows, g),
+        jacobian=_jacobian(variables, nodes, rows, g, depending),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
     )
 
@@ -55,6 +65,7 @@ class _Variables:
     """The variables of the NLP, and their unscaled values as matrices with a column for each node."""
 
     def __init__(self, statement: Statement, mesh: Mesh, scales: Scales) -> None:
+        self.statement, self.mesh = statement, mesh
         nx, ne, nu, count, nodes = statement.nx, statement.ne, statement.nu, len(mesh.starts), mesh.control_nodes
         lengths = [nx * count, 0 if mesh.eliminated else ne * count, nu * nodes, int(statement.duration.free)]
         ends = np.cumsum([0, *lengths]).tolist()
@@ -216,11 +227,41 @@ def _final_matrices(statement: Statement, scales: Scales, last: Expr) -> list[Ro
     ]
 
 
-def _split_jacobian(variables: _Variables, rows: tuple[Rows, ...], g: Expr) -> ca.Function | None:
-    """Jacobian of g where it has dense rows: those by their own adjoint sweeps, the rest with its sparsity."""
-    dense = [entry.expression for entry in rows if entry.dense]
-    if not dense:
+def _dense(rows: tuple[Rows, ...]) -> Any:
+    """The rows that depend on eliminated matrices."""
+    return ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows if entry.dense))
+
+
+def _jacobian(variables: _Variables, nodes: dict[str, Any], rows: tuple[Rows, ...], g: Expr, depending: Expr) -> Any:
+    """Jacobian of g where CasADi's own takes longer: continuity by intervals, dense rows by their own adjoint sweeps.
+
+    Args:
+        variables: of the NLP.
+        nodes: values at them.
+        rows: of g; continuity of the states first, dense ones last.
+        g: stacked.
+        depending: what depends on the variables as the dense rows do, where the sparsity of these cannot be seen.
+
+    Returns:
+        (w, p) -> g, Jacobian; None where CasADi's own will do.
+    """
+    dense, w, mesh = _dense(rows), variables.w, variables.mesh
+    chained = chains(variables.statement, mesh)
+    if not dense.shape[0] and not chained:
         return None
-    sparse = ca.vertcat(*(entry.expression for entry in rows if not entry.dense))
-    blocks = [ca.jacobian(sparse, variables.w), ca.jacobian(ca.vertcat(*dense), variables.w)]
-    return ca.Function("nlp_jac_g", [variables.w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])
+    blocks, others = [], [entry.expression for entry in rows if not entry.dense]
+    if chained:
+        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+        slopes = segment_slopes(variables.statement, mesh, nodes["x"], intervals, w, variables.x[:, :-1])
+        unscaled = slopes - ca.jacobian(ca.vec(variables.x[:, 1:]), w)
+        blocks.append(ca.mtimes(ca.diag(ca.DM(1 / rows[0].scale)), unscaled))
+        others = others[1:]
+    blocks.append(ca.jacobian(ca.vertcat(ca.MX(0, 1), *others), w))
+    if depending is not None:
+        pattern = ca.jacobian_sparsity(depending, w)
+        unit = ca.horzsplit(ca.DM.eye(dense.shape[0]), LARGEST_DIRECTIONS)
+        by_w = ca.horzcat(*(ca.jtimes(dense, w, ca.densify(seeds), True) for seeds in unit))
+        blocks.append(ca.project(by_w.T, pattern))
+    elif dense.shape[0]:
+        blocks.append(ca.jacobian(dense, w))
+    return ca.Function("nlp_jac_g", [w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])

@@ -1,0 +1,54 @@
+"""The compiled library of the passage: where it is, whether it can be used, and its functions by their C names."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import platform
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+MODULE = "covocp.passage._passage"
+
+_WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
+_SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE)),
+    "passage_free": (None, (_ADDRESS,)),
+    "passage_forward": (None, (_ADDRESS,) * 6),
+    "passage_reverse": (None, (_ADDRESS,) * 10),
+    "passage_tangent": (_WHOLE, (_ADDRESS,) * 16),
+}
+
+
+@lru_cache(maxsize=1)
+def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
+    """The functions of the library, None without it, and where it lies or why it cannot be used."""
+    found = importlib.util.find_spec(MODULE)
+    if found is None or found.origin is None:
+        return None, "it was not built: the installation found no C compiler"
+    try:
+        library = ctypes.CDLL(found.origin)
+        functions = {name: getattr(library, name) for name in _SIGNATURES}
+    except (OSError, AttributeError) as error:
+        return None, f"it cannot be loaded: {error}"
+    for name, (result, arguments) in _SIGNATURES.items():
+        functions[name].restype, functions[name].argtypes = result, arguments
+    return functions, found.origin
+
+
+def functions() -> dict[str, Callable[..., Any]] | None:
+    """The functions of the library by their C names; None where the plain expressions have to do."""
+    return _loaded()[0]
+
+
+def build_info() -> dict[str, str | bool]:
+    """Tell whether the compiled passage of covariances is used here, and why not.
+
+    Without it the same numbers come from CasADi's own operations, more slowly.
+
+    Returns:
+        "compiled": whether it is used; "library": its file, or why there is none; "machine": the processor's kind.
+    """
+    there, text = _loaded()
+    return {"compiled": there is not None, "library": text, "machine": platform.machine()}

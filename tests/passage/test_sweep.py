@@ -1,0 +1,297 @@
+"""The compiled passage against longer arithmetic, finite differences, CasADi's own operations and scipy."""
+
+from __future__ import annotations
+
+import threading
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import covocp as co
+from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
+from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpack_symbolic
+from covocp.base.quadrature import gauss_matrix, riccati_step
+from covocp.models import mars_entry, mass_chain
+from covocp.passage import library
+from covocp.passage.sweep import passed_by
+from covocp.transcription import shooting
+
+pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
+
+SIZES = (1, 2, 3, 4, 5, 7, 8, 12, 20, 40)
+STEPS = 6
+
+
+def systems(
+    n: int, seed: int, *, h: float = 0.05, prior: float = 1.0, information: float = 1.0
+) -> tuple[np.ndarray, ...]:
+    """A covariance, and h H at both points of some steps side by side."""
+    rng = np.random.default_rng(seed)
+
+    def one() -> np.ndarray:
+        F, B, C = rng.normal(size=(n, n)), rng.normal(size=(n, 2)), rng.normal(size=(2, n))
+        return h * np.block([[-F.T, information * C.T @ C], [B @ B.T, F]])
+
+    A = rng.normal(size=(n, n))
+    return prior * (A @ A.T + np.eye(n)), *(np.hstack([one() for _ in range(STEPS)]) for _ in range(2))
+
+
+def node(n: int, *, kicked: bool = False) -> tuple[list[ca.MX], ca.MX]:
+    """Arguments and result of the compiled passage."""
+    arguments = [
+        ca.MX.sym("e", half_length(n)),
+        ca.MX.sym("h1", 2 * n, 2 * n * STEPS),
+        ca.MX.sym("h2", 2 * n, 2 * n * STEPS),
+    ]
+    if kicked:
+        arguments.append(ca.MX.sym("kicks", half_length(n), STEPS))
+    return arguments, passed_by(arguments[0], arguments[1:3], n, *arguments[3:])
+
+
+def by_casadi(n: int, arguments: list[ca.MX]) -> ca.MX:
+    """The same by CasADi's operations."""
+    e, h1, h2 = ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", 2 * n, 2 * n), ca.MX.sym("h2", 2 * n, 2 * n)
+    D = gauss_matrix((h1, h2), n, LINEAR_SOLVER)
+    after = pack_symbolic(riccati_step(D, unpack_symbolic(e, n), lambda a, b: linear_solve(a, b, LINEAR_SOLVER)))
+    inputs = [e, h1, h2]
+    if len(arguments) > 3:
+        inputs.append(ca.MX.sym("kick", half_length(n)))
+        after = after + inputs[-1]
+    return ca.Function("step", inputs, [after]).mapaccum("steps", STEPS)(*arguments)
+
+
+def solved(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """A^-1 B in long double arithmetic."""
+    A, B = A.copy(), B.copy()
+    for k in range(len(A)):
+        p = k + int(np.argmax(np.abs(A[k:, k])))
+        A[[k, p]], B[[k, p]] = A[[p, k]], B[[p, k]]
+        for i in range(len(A)):
+            if i != k:
+                share = A[i, k] / A[k, k]
+                A[i], B[i] = A[i] - share * A[k], B[i] - share * B[k]
+    return B / np.diag(A)[:, None]
+
+
+def in_long_double(E: np.ndarray, h1: np.ndarray, h2: np.ndarray) -> np.ndarray:
+    """The last covariance by the stages themselves: Y_i = Z0 + sum_j a_ij h H_j Y_j."""
+    n = len(E)
+    root = np.sqrt(np.longdouble(3.0))
+    a = np.array([[0.25, 0.25 - root / 6], [0.25 + root / 6, 0.25]], dtype=np.longdouble)
+    E = E.astype(np.longdouble)
+    for k in range(STEPS):
+        span = slice(2 * n * k, 2 * n * (k + 1))
+        H = [h1[:, span].astype(np.longdouble), h2[:, span].astype(np.longdouble)]
+        Z = np.vstack([np.eye(n, dtype=np.longdouble), E])
+        system = np.block([[(i == j) * np.eye(2 * n) - a[i, j] * H[j] for j in range(2)] for i in range(2)])
+        Y = solved(system, np.vstack([Z, Z]))
+        Z = Z + (H[0] @ Y[: 2 * n] + H[1] @ Y[2 * n :]) / 2
+        E = solved(Z[:n].T, Z[n:].T)
+        E = (E + E.T) / 2
+    return E
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
+@pytest.mark.parametrize(
+    ("changes", "allowed"),
+    [
+        ({}, 1e-13),
+        ({"prior": 1e6}, 1e-9),
+        ({"information": 1e8}, 1e-8),
+        ({"h": 1.0}, 1e-11),
+        ({"information": 0.0}, 1e-13),
+    ],
+)
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+def test_last_covariance_in_longer_arithmetic(n, changes, allowed):
+    E, h1, h2 = systems(n, n, **changes)
+    arguments, passed = node(n)
+    found = unpack(np.asarray(ca.Function("f", arguments, [passed])(pack(E), h1, h2).full()).T, n)
+    exact = in_long_double(E, h1, h2)
+    deviation = np.sqrt(np.diag(exact))
+    assert np.abs((found[-1] - exact) / np.outer(deviation, deviation)).max() < allowed
+    assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_a_long_passage_is_the_differential_equation():
+    """Order 4 against scipy."""
+    rng = np.random.default_rng(3)
+    F, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 1)), rng.normal(size=(1, 3))
+    E0, Q, W = np.eye(3), B @ B.T, C.T @ C
+
+    def rate(_: float, e: np.ndarray) -> np.ndarray:
+        E = e.reshape(3, 3)
+        return (F @ E + E @ F.T + Q - E @ W @ E).ravel()
+
+    exact = solve_ivp(rate, (0.0, 1.0), E0.ravel(), rtol=1e-12, atol=1e-14, method="DOP853").y[:, -1].reshape(3, 3)
+    errors = []
+    for count in (20, 40):
+        H = np.tile(np.block([[-F.T, W], [Q, F]]) / count, count)
+        passed = passed_by(ca.DM(pack(E0)), [ca.DM(H), ca.DM(H)], 3)
+        errors.append(np.abs(unpack(np.asarray(passed.full()).T, 3)[-1] - exact).max())
+    assert errors[1] < 1e-6
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize("asked", ["last entry", "all"])
+@pytest.mark.parametrize("n", SIZES)
+def test_values_and_slopes_are_those_of_casadi(n, asked):
+    """One entry at the end has slopes of low rank; with kicks and seeds everywhere they are full."""
+    rng = np.random.default_rng(n)
+    E, h1, h2 = systems(n, n)
+    arguments, passed = node(n, kicked=True)
+    weights = np.zeros((half_length(n), STEPS))
+    weights[-1, -1] = 1.0
+    if asked == "all":
+        weights = rng.normal(size=weights.shape)
+    given = (pack(E), h1, h2, 1e-3 * rng.normal(size=weights.shape))
+    found, known = (
+        ca.Function("f", arguments, [result, *(ca.gradient(ca.dot(weights, result), v) for v in arguments)])(*given)
+        for result in (passed, by_casadi(n, arguments))
+    )
+    for own, other in zip(found, known, strict=True):
+        assert np.abs(np.asarray(own - other)).max() <= 1e-11 * np.abs(np.asarray(other)).max()
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 12])
+def test_slopes_against_finite_differences(n):
+    """Duality: the slope by E(0) and by h H of any direction."""
+    rng = np.random.default_rng(n)
+    E, h1, h2 = systems(n, n)
+    arguments, passed = node(n)
+    weights = rng.normal(size=(half_length(n), STEPS))
+    value = ca.dot(weights, passed)
+    f = ca.Function("f", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
+    given = [pack(E), h1, h2]
+    slopes = f(*given)[1:]
+    for place in range(3):
+        direction = rng.normal(size=given[place].shape)
+        step = 1e-5
+        ends = []
+        for sign in (1, -1, 2, -2):
+            moved = list(given)
+            moved[place] = given[place] + sign * step * direction
+            ends.append(float(f(*moved)[0]))
+        difference = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * step)
+        slope = float(np.sum(np.asarray(slopes[place].full()).reshape(direction.shape) * direction))
+        assert slope == pytest.approx(difference, rel=1e-7, abs=1e-7 * abs(float(f(*given)[0])))
+
+
+@pytest.mark.parametrize("kicked", [False, True])
+@pytest.mark.parametrize("n", [1, 2, 5, 12])
+def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked):
+    """Along directions of the form of H, Q and W symmetric."""
+    rng = np.random.default_rng(n)
+    E, h1, h2 = systems(n, n)
+    shape = (half_length(n), STEPS)
+    weights, moved = rng.normal(size=shape), systems(n, n + 100)[1:]
+    directions = [rng.normal(size=shape[0]), *moved, rng.normal(size=shape)][: 4 if kicked else 3]
+    given = [pack(E), h1, h2, 1e-3 * rng.normal(size=shape)][: len(directions)]
+    arguments, passed = node(n, kicked=kicked)
+    found = []
+    for result in (passed, by_casadi(n, arguments)):
+        value = ca.dot(weights, result) + ca.sumsqr(result) / 2
+        slopes = ca.Function("slopes", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
+        t = ca.MX.sym("t")
+        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
+        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
+        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+    for own, other in zip(*found, strict=True):
+        assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
+
+
+def test_tangents_of_several_entries_at_once():
+    """Jacobian times directions, several of both: every entry of the last covariance by E(0)."""
+    n = 3
+    E, h1, h2 = systems(n, 1)
+    arguments, passed = node(n)
+    unit = ca.DM.eye(half_length(n))
+    forward = ca.jtimes(passed[:, -1], arguments[0], unit)
+    backward = ca.jtimes(passed[:, -1], arguments[0], unit, True).T
+    function = ca.Function("f", arguments, [forward, backward])
+    one, other = (np.asarray(v.full()) for v in function(pack(E), h1, h2))
+    np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14)
+
+
+def test_several_directions_at_once():
+    n = 3
+    E, h1, h2 = systems(n, 0)
+    arguments, passed = node(n)
+    asked = passed[:, -1]
+    jacobian = ca.jtimes(asked, arguments[0], ca.DM.eye(half_length(n)), True).T
+    found = np.asarray(ca.Function("f", arguments, [jacobian])(pack(E), h1, h2).full())
+    known = np.asarray(
+        ca.Function("f", arguments, [ca.jacobian(by_casadi(n, arguments)[:, -1], arguments[0])])(pack(E), h1, h2).full()
+    )
+    np.testing.assert_allclose(found, known, rtol=1e-11, atol=1e-13)
+
+
+def test_a_step_that_cannot_be_taken_gives_no_numbers():
+    """X is singular: E + 1 = 0 with W = 1; CasADi's operations fail there, numbers must not look right."""
+    H = ca.DM([[0.0, 1.0], [0.0, 0.0]])
+    passed = passed_by(ca.DM([-1.0]), [ca.repmat(H, 1, STEPS)] * 2, 1)
+    assert not np.isfinite(np.asarray(passed.full())).any()
+
+
+def test_threads_do_not_meet():
+    """Four threads on the same node, each with its own numbers."""
+    n = 4
+    arguments, passed = node(n)
+    value = ca.sumsqr(passed)
+    given = [(pack(E), h1, h2) for E, h1, h2 in (systems(n, seed) for seed in range(4))]
+    functions = [ca.Function("f", arguments, [value, ca.gradient(value, arguments[1])]) for _ in given]
+    known = [[np.asarray(v.full()) for v in f(*own)] for f, own in zip(functions, given, strict=True)]
+    wrong = []
+
+    def run(k: int) -> None:
+        for _ in range(50):
+            found = [np.asarray(v.full()) for v in functions[k](*given[k])]
+            if any(not np.array_equal(a, b) for a, b in zip(found, known[k], strict=True)):
+                wrong.append(k)
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def solved_with(monkeypatch: pytest.MonkeyPatch, there: bool, problem: co.Problem, **options: object) -> co.Solution:
+    """A solution with the library or without it."""
+    with monkeypatch.context() as patch:
+        if not there:
+            patch.setattr(shooting, "functions", lambda: None)
+            patch.setattr(library, "_loaded", lambda: (None, "it was not built"))
+        return co.solve(problem, progress=False, **options)
+
+
+@pytest.mark.filterwarnings("ignore:A covariance of 10 rows")
+@pytest.mark.parametrize(
+    ("problem", "options"),
+    [
+        (lambda: mass_chain.problem(masses=2), {}),
+        (lambda: mass_chain.problem(masses=4), {"control": "constant"}),
+        (lambda: mars_entry.problem(), {}),
+    ],
+    ids=["chain", "chain of constant control", "Mars entry"],
+)
+def test_a_problem_without_the_library_has_the_same_solution(monkeypatch, problem, options):
+    fast, plain = (solved_with(monkeypatch, there, problem(), **options) for there in (True, False))
+    assert fast.cost == pytest.approx(plain.cost, rel=1e-9)
+    for name in ("state", "matrices"):
+        own, other = (getattr(solution.costates, name) for solution in (fast, plain))
+        assert np.abs(own - other).max() <= 1e-5 * np.abs(other).max()
+
+
+def test_a_large_covariance_without_the_library_is_told(monkeypatch):
+    with pytest.warns(co.CovocpWarning, match=r"10 rows .* without the compiled passage"):
+        solved_with(monkeypatch, False, mass_chain.problem(masses=4), allow_failure=True, max_iterations=0)
+
+
+def test_what_is_built_is_told():
+    info = co.build_info()
+    assert info["compiled"] is True
+    assert str(info["library"]).endswith((".so", ".pyd"))
