@@ -75,7 +75,7 @@ class ClosedLoopCovariance:
     order, by their Jacobians): X[x, x] = E + Xhat, X[u, u] = C Xhat C', X[x, u] = -Xhat C'.
     """
 
-    stands_for = SPREAD  # as a key of solutions
+    _stands_for = SPREAD  # as a key of solutions
 
     def __init__(self, entries: tuple[State | Unknown | Control, ...], spread: Spread) -> None:
         """Keep the entries of states, unknowns and controls and the declared symbol."""

@@ -51,7 +51,7 @@ def name_of(
                 return name
             if name in names and _is_matrix_of(key, symbol):
                 return name
-    if (covariance := getattr(key, "stands_for", "")) in names:
+    if (covariance := getattr(key, "_stands_for", "")) in names:
         return str(covariance)
     vectors = {name: size for name, size in (sizes or {}).items() if name in names}
     if found := _entry_name(key, symbols, vectors):
@@ -212,7 +212,7 @@ def _of_closed_loop(key: Given) -> bool:
     """Whether a key is the covariance of the closed loop, or an expression of it."""
     if isinstance(key, ca.MX):
         return any(symbol.name() == CLOSED_LOOP for symbol in ca.symvar(key))
-    return getattr(key, "stands_for", "") == CLOSED_LOOP
+    return getattr(key, "_stands_for", "") == CLOSED_LOOP
 
 
 def control_limits(statement: Statement, count: int, given: Given) -> Limits:
