@@ -75,6 +75,8 @@ class ClosedLoopCovariance:
     order, by their Jacobians): X[x, x] = E + Xhat, X[u, u] = C Xhat C', X[x, u] = -Xhat C'.
     """
 
+    _stands_for = SPREAD  # as a key of solutions
+
     def __init__(self, entries: tuple[State | Unknown | Control, ...], spread: Spread) -> None:
         """Keep the entries of states, unknowns and controls and the declared symbol."""
         self._entries, self._spread = entries, spread

@@ -52,6 +52,8 @@ class EstimationCovariance:
     order, by their Jacobians); `E.matrix` is the whole symmetric matrix.
     """
 
+    _stands_for = "E"  # as a key of solutions
+
     def __init__(self, entries: Sequence[AugmentedEntry], declaration: Matrix) -> None:
         """Keep the entries of the augmented state and the declared matrix."""
         self._entries = tuple(entries)

@@ -31,6 +31,7 @@ from covocp.problem.expected_cost import GAIN, statement_of
 from covocp.solution.origin import METHOD
 from covocp.solution.report import ASKED
 from covocp.solution.solution import Solution
+from covocp.solving.attempts import with_stats
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
@@ -49,10 +50,35 @@ def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
     return tuple(Problem.of(declarations) for declarations in chosen if declarations is not None)
 
 
-def gain_counts(problem: Problem) -> dict[str, Any]:
-    """What a solution says of its gain: why it is free."""
+def with_gain_told(problem: Problem, outcome: Outcome, best: Solution | None) -> Outcome:
+    """An outcome that says why its gain is free and, where it failed, which limits of X no gain may keep.
+
+    Args:
+        problem: that was solved.
+        outcome: of the run.
+        best: solution with the best gain, where the run started.
+    """
     asked = reasons(problem.declarations)
-    return {ASKED: ", ".join(asked)} if asked else {}
+    if not asked:
+        return outcome
+    outcome = with_stats(outcome, **{ASKED: ", ".join(asked)})
+    if outcome.converged or best is None or best.loop is None:
+        return outcome
+    least, t, p = _spread_halves(best.loop, fed=False), best.t, best.parameters
+    told = []
+    for row in _rows(problem.declarations):
+        at = slice(None) if row.place == "path" else slice(-1, None)
+        floor = row.over(t[at], p, least[at])[0]
+        k = int(np.argmax(floor))
+        if floor[k] > row.limit:
+            told.append(
+                f"'{row.name}' is {floor[k]:.4g} at {t[at][k]:.4g} s with E for X, above its limit {row.limit:.4g}"
+            )
+    if not told:
+        return outcome
+    listed = "; ".join(told)
+    text = f"{outcome.message.rstrip('.')}; no feedback takes X below E: along the nominal of the best gain {listed}"
+    return replace(outcome, message=text)
 
 
 def free_gain_block(statement: Statement) -> Block | None:
@@ -80,11 +106,12 @@ def gain_entries(statement: Statement, block: Block, solution: Solution, at: Arr
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Row:
-    """A condition on X alone, g(X) <= limit.
+    """A condition on X alone, g(X) <= limit, and its name.
 
     function: (time, parameters, half-vector of X) -> g, its slope by X.
     """
 
+    name: str
     place: Place
     limit: float
     function: ca.Function
@@ -137,7 +164,8 @@ def _rows(own: Declarations) -> list[_Row]:
             parts = ca.vertsplit(stacked, np.cumsum([0, *(s.shape[0] for s in known)]).tolist()) if known else []
             arguments = [own.time, stacked, half]
             function = ca.Function("row", arguments, inner.call([own.time, *parts, half]))
-            rows.append(_Row(place=c.at, limit=float(c.upper[i]), function=function))
+            name = c.name if c.lower.size == 1 else f"{c.name}[{i}]"
+            rows.append(_Row(name=name, place=c.at, limit=float(c.upper[i]), function=function))
     return rows
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -41,7 +40,8 @@ from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import far_away
-from covocp.solving.gain_start import gain_counts, meeting_conditions, with_best_gain_problems
+from covocp.solving.exact_rows import made_ready
+from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.methods import METHODS, check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
@@ -116,7 +116,7 @@ class Solver:
         """Build the statement and make the method ready."""
         check_method(method)
         check_problem(problem)
-        self._prepare = importlib.import_module(METHODS[method]).prepare
+        self._prepare = partial(made_ready, method)
         known, own = {field.name for field in fields(Options)}, method_options(method)
         for name in options:
             if name not in known and name not in own:
@@ -153,7 +153,7 @@ class Solver:
         self._own = {k: v for k, v in options.items() if k in own}
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
-        self._prepared = cast(Prepared, self._prepare(solved, self._options, **self._own))
+        self._prepared = self._prepare(solved, self._options, **self._own)
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
@@ -218,7 +218,7 @@ class Solver:
                 outcome = self._closed(outcome)
             if reporter.stop:
                 raise interrupted(Solution.of(outcome, self.method))
-            outcome = with_stats(outcome, **gain_counts(self._problem))
+            outcome = with_gain_told(self._problem, outcome, first)
             solution = self._finish(outcome, allow_failure, assess)
             return self._beside_classical(solution, values) if assess else solution
 
@@ -365,7 +365,7 @@ class Solver:
         alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
         if self._own_steps and alike and times > 1 and not rest:
             options = with_substeps(self._options, own, mesh.substeps)
-            self._keep(options, cast(Prepared, self._prepare(self._solved, options, **self._own)))
+            self._keep(options, self._prepare(self._solved, options, **self._own))
 
     def _keep(self, options: Options, prepared: Prepared) -> None:
         """Other steps from now on; what the classical design costs is then another number."""
@@ -378,7 +378,7 @@ class Solver:
             if finer is None:
                 break
             try:
-                prepared = cast(Prepared, self._prepare(self._solved, finer, **self._own))
+                prepared = self._prepare(self._solved, finer, **self._own)
                 start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
                 again = prepared.solve(values, start, reporter)
             except CovocpError:  # what the steps are off is told with the solution that there is

@@ -17,6 +17,8 @@ from covocp.base.matrices import Array, half_length, unpack_indices
 from covocp.statement.statement import Block, Statement
 
 Limits = tuple[Array, Array]
+# Name of the covariance of the closed loop, a symbol that is no matrix of the statement.
+CLOSED_LOOP = "X"
 ENTRY = re.compile(r"(?P<vector>.+)\[(?P<entry>\d+)\]")
 
 
@@ -49,9 +51,8 @@ def name_of(
                 return name
             if name in names and _is_matrix_of(key, symbol):
                 return name
-    label = getattr(key, "labels", None)
-    if label is not None and "E" in names:
-        return "E"
+    if (covariance := getattr(key, "_stands_for", "")) in names:
+        return str(covariance)
     vectors = {name: size for name, size in (sizes or {}).items() if name in names}
     if found := _entry_name(key, symbols, vectors):
         return found
@@ -191,12 +192,27 @@ def _is_matrix_of(key: Given, half: Given) -> bool:
 
 def unknown_name(key: Given, names: tuple[str, ...]) -> ProblemError:
     """The error for something that is not in the solution."""
+    if _of_closed_loop(key) and CLOSED_LOOP not in names:
+        return ProblemError(
+            f"The covariance {CLOSED_LOOP} of the closed loop is no value at this place.",
+            expected="a symbol or name of " + ", ".join(names),
+            received=str(key)[:100],
+            remedy="use solution.loop, which has X = E + Xhat of states and unknowns at the nodes, Xhat and the gain C "
+            "(that of the controls is C Xhat C'); covariance(x) and deviation(x) are entries of loop.X",
+        )
     return ProblemError(
         f"'{key}' is not in this solution.",
         expected="a symbol or name of " + ", ".join(names),
         received=str(key),
         remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
     )
+
+
+def _of_closed_loop(key: Given) -> bool:
+    """Whether a key is the covariance of the closed loop, or an expression of it."""
+    if isinstance(key, ca.MX):
+        return any(symbol.name() == CLOSED_LOOP for symbol in ca.symvar(key))
+    return getattr(key, "_stands_for", "") == CLOSED_LOOP
 
 
 def control_limits(statement: Statement, count: int, given: Given) -> Limits:
