@@ -41,6 +41,41 @@ def test_a_cut_changes_no_run(filter: Any, at: list[float] | None) -> None:
     np.testing.assert_allclose(got[1].predicted_error[0], got[0].predicted_error[-1], atol=1e-12)
 
 
+def fed_back(duration: float, name: str, *, first: bool = True, last: bool = True) -> co.Problem:
+    """An oscillator with an expected cost."""
+    ocp = co.Problem(duration, name=name)
+    x = ocp.state("x", initial=1.0 if first else None, variance=0.3 if first else None)
+    v = ocp.state("v", initial=0.0 if first else None, variance=0.1 if first else None)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.5 * x, noise=0.2)
+    ocp.measurement("position", x, noise=0.05)
+    ocp.minimize_expected(running=0.5 * u**2 + x**2, terminal=2 * x**2 if last else 0.0)
+    return ocp
+
+
+def test_a_cut_changes_no_run_with_feedback() -> None:
+    one = co.solve(fed_back(2.0, "whole"), intervals=40, **QUIET)
+    parts = [fed_back(1.0, "first", last=False), fed_back(1.0, "second", first=False)]
+    two = co.solve(co.Phases(parts), intervals=20, **QUIET)
+    asked: dict[str, Any] = {"runs": 150, "seed": 3, "step": 0.025, **QUIET}
+    expected, got = co.simulate(one, **asked), co.simulate(two, **asked)
+    np.testing.assert_allclose(got["second"].deviations, expected.deviations, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(got["first"].costs + got["second"].costs, expected.costs, rtol=2e-3, atol=2e-3)
+    assert "and feedback" in str(got).splitlines()[0]
+
+
+def test_feedback_through_a_jump_scatters_as_predicted() -> None:
+    parts = [fed_back(1.0, "first", last=False), fed_back(1.0, "second", first=False)]
+    (x, v), (_, w) = ([state.symbol for state in part.states] for part in parts)
+    phases = co.Phases(parts)
+    phases.jump(w, -0.8 * v + 0.1 * x, noise=0.1)
+    sample = co.simulate(co.solve(phases, intervals=20, **QUIET), 5000, seed=2, step=0.025, **QUIET)
+    assert sample.holds
+    for phase in sample:
+        assert abs(phase.cost - phase.predicted_cost) < 3 * phase.cost_error
+
+
 def linear_phases() -> co.Phases:
     """A body whose speed is turned and whose position is shifted by what is not known exactly; a wind appears."""
     first = co.Problem(duration=1.0, name="first")

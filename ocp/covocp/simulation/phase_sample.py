@@ -102,8 +102,10 @@ class PhasesMonteCarlo:
     def sections(self) -> list[Section]:
         """The whole, and each phase, in sentences and tables."""
         first, failing = self.phases[0], self.failing
-        what = f"{self.runs} runs through {len(self)} phases, seed {first.seed}, {first.filter} filter, no feedback"
-        verdict = "The linear prediction of the errors of the filter "
+        fed_back = any(phase.fed_back for phase in self.phases)
+        flown = f"{first.filter} filter" + (" and feedback" if fed_back else ", no feedback")
+        what = f"{self.runs} runs through {len(self)} phases, seed {first.seed}, {flown}"
+        verdict = f"The linear prediction of the {'spread' if fed_back else 'errors of the filter'} "
         verdict += f"FAILS at the end of {', '.join(failing)}." if failing else "holds at the end of every phase."
         head: Section = [Sentence(f"{self.name or 'phases'}: {what}")]
         end: Section = [Sentence(verdict, warning=bool(failing))]

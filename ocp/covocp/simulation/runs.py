@@ -38,8 +38,13 @@ from covocp.solution.solution import Solution
 LARGEST_BATCH, LARGEST_TASK = 2048, 512
 
 
-# What phases do not take: nothing is fed back in them, and the design's system is what flies.
-SINGLE = {"truth": "the design's system", "law": "no feedback", "period": "no feedback", "limits": "no feedback"}
+# What phases do not take: the design's system, filter and feedback are what flies in them, without limits.
+SINGLE = {
+    "truth": "the design's system",
+    "law": "the design's filter and feedback",
+    "period": "the design's filter and feedback",
+    "limits": "no limit of the actual control",
+}
 
 
 @overload
