@@ -33,6 +33,12 @@ class TimeData:
 
     __repr__ = short_repr
 
+    def at(self, times: Array) -> Array:
+        """Values at some times, (K,) of a scalar, (K, m) of a vector."""
+        (time,) = ca.symvar(self.expression)
+        values = np.asarray(ca.Function("course", [time], [self.expression]).map(times.size)(times[None, :]).full().T)
+        return values[:, 0] if values.shape[1] == 1 else values
+
     @property
     def kinks(self) -> Array:
         """Times at which the slope jumps; a cubic spline has none.
