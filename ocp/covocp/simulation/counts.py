@@ -44,7 +44,7 @@ class Count:
 
     @property
     def as_promised(self) -> bool:
-        """Whether the promised probability at the end, where there is one, is inside the confidence band of the runs'."""
+        """Whether what is promised at the end is inside the confidence band of the runs; where nothing is, true."""
         if np.isnan(self.promised_end):
             return True
         return self.low <= self.promised_end and (self.joint or self.promised_end <= self.high)

@@ -69,8 +69,8 @@ class Run:
     """Symbols of one run, and where the parts of its state lie.
 
     z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "measured" (what a law has
-    measured since its last step, an integral), "sums" (integrals that were declared), "cost", "asked" and "violated" (flags), "held" (control of a law),
-    "read" (what a law has read since its last step, UNREAD where nothing).
+    measured since its last step, an integral), "sums" (integrals that were declared), "cost", "asked" and "violated"
+    (flags), "held" (control of a law), "read" (what a law has read since its last step, UNREAD where nothing).
     noisy: states with process noise; watched: number of inequalities along the path; sums: where the integrals lie in
     the state of the problem.
     """
