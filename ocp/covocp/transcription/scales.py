@@ -36,7 +36,9 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Sc
     x = np.max(candidates, axis=0)
     bounded = np.isfinite(span) & (span > 0)
     x = np.where(bounded, np.clip(x, 1e-3 * span, np.where(x > 0, span, np.inf)), x)
-    x = np.where(x > 0, x, np.where(bounded, span, 1.0))
+    limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
+    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)  # a bound far away says nothing of the state
+    x = np.where(x > 0, x, np.where(bounded, span, alone))
     for block in statement.states:
         if block.name in statement.scales:
             x[block.span] = statement.scales[block.name]
