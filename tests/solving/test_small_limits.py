@@ -61,3 +61,17 @@ def test_a_small_variance_that_is_asked_for():
     ocp.subject_to(E[x, x], upper=0.25e-18, at="final")
     ocp.minimize(running=w**2)
     assert solve(ocp, intervals=10).cost == pytest.approx(9.0, rel=1e-6)
+
+
+def test_the_gradient_method_meets_a_small_limit_or_says_that_it_does_not():
+    def effort(unit):
+        ocp = co.Problem(4.0)
+        x, u = ocp.state("x", initial=0.0), ocp.control("u")
+        ocp.dynamics(x, u)
+        ocp.subject_to(ocp.integral(u**2), upper=0.01 * unit**2)
+        ocp.minimize(running=(u / unit) ** 2, terminal=10 * (x / unit - 1) ** 2)
+        return ocp
+
+    assert solve(effort(1e-4), method="gradient", intervals=10).cost == pytest.approx(6.41, rel=1e-5)
+    with pytest.raises(co.SolveError, match="do not remove the violations"):
+        solve(effort(1e-6), method="gradient", intervals=10)

@@ -14,10 +14,8 @@ from covocp.base.matrices import Array
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
+from covocp.transcription.scales import limit_units
 from covocp.transcription.shooting import interval_columns, shoot
-
-# Limits below this are the units of their rows.
-SMALL = 1e-3
 
 
 def transcribe(statement: Statement, mesh: Mesh, scales: Scales) -> NLP:
@@ -114,9 +112,7 @@ def _condition_rows(kind: str, conditions: Conditions, value: Expr, count: int, 
 
     Solvers meet rows to an absolute tolerance: without that a limit of 1e-12 (the square of micrometres) is none.
     """
-    limits = np.abs(np.stack([conditions.lower, conditions.upper]))
-    largest = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
-    scale = np.where((largest > 0) & (largest < SMALL), largest, 1.0)
+    scale = limit_units(conditions.lower, conditions.upper)
     return Rows(
         kind=kind,
         expression=ca.vec(value if (scale == 1.0).all() else value / ca.repmat(ca.DM(scale), 1, count)),
