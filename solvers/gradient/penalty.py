@@ -27,6 +27,7 @@ from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
+from covocp.transcription.scales import limit_units
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import at_nodes
 
@@ -45,13 +46,14 @@ class Group:
 
     function: (z, u, s, T, p, weights, shifts) -> penalty, its slopes by z, u and T, multipliers, violations,
     second slopes by u (Gauss and Newton's part), distances from the bound that has a multiplier, sizes of the slopes by
-    z and u in the given scales.
+    z and u in the given scales. units: of the rows, where their limits are small.
     """
 
     kind: str
     names: tuple[str, ...]
     nodes: Indices
     shares: Array
+    units: Array
     function: ca.Function
 
     __repr__ = short_repr
@@ -205,7 +207,8 @@ def _group(
         ca.fabs(by_control),
     ]
     function = ca.Function("penalty", [z, u, s, duration, p, weights, shifts], [ca.densify(v) for v in outputs])
-    return Group(kind=kind, names=names, nodes=nodes, shares=shares, function=function.map(nodes.size))
+    units = limit_units(lower, upper)
+    return Group(kind=kind, names=names, nodes=nodes, shares=shares, units=units, function=function.map(nodes.size))
 
 
 def first_weights(
@@ -221,7 +224,7 @@ def first_weights(
         by_z, by_u = (v.reshape(rows, count, -1) for v in outputs[-2:])
         magnitude = (by_z @ z_scale + by_u @ scales.u).max(axis=1, initial=0.0)
         magnitude = np.where(magnitude > 0, magnitude, 1.0)
-        magnitudes.append(magnitude)
+        magnitudes.append(np.where(group.units < 1.0, np.minimum(magnitude, group.units), magnitude))
         weights.append(FIRST_WEIGHT * size * group.shares[:, None] / group.shares.sum() / magnitude**2)
     return Weights(weights=tuple(weights), shifts=tuple(np.zeros_like(w) for w in weights), scales=tuple(magnitudes))
 

@@ -22,9 +22,9 @@ def test_slopes_are_those_of_the_cost(closed, step):
     options = {"grid": np.linspace(0.0, 1.0, 21), "substeps": 2, "covariance_step": step}
 
     def cost(values):
-        return co.evaluate(everywhere(values, closed), nominal=nominal, **options).cost
+        return co.evaluate(everywhere(values, closed), nominal={**nominal, "d": values}, **options).cost
 
-    extremal = co.evaluate(everywhere(at, closed), nominal=nominal, **options).extremal
+    extremal = co.evaluate(everywhere(at, closed), nominal={**nominal, "d": at}, **options).extremal
     extremal = with_tied_multipliers(extremal)  # of x(0) = d[2]
     slopes = decision_slopes(extremal, discrete_costates(extremal)[0])
     for k in range(3):
@@ -46,7 +46,7 @@ def test_the_condition_is_among_the_residuals():
     assert solution.optimality.decisions < 1e-8
     assert "condition of the decisions" in str(solution)
     given = co.evaluate(ocp, nominal=solution).extremal
-    moved = co.evaluate(ocp, nominal={"u": 0.0}).extremal  # d as guessed
+    moved = co.evaluate(ocp, nominal={"u": 0.0, "d": 0.1}).extremal
     costates = [discrete_costates(extremal)[0] for extremal in (given, moved)]
     assert decision_slopes(given, costates[0]).relative < 1e-6
     assert decision_slopes(moved, costates[1]).relative > 0.1

@@ -2,6 +2,8 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pytest
+from refusals import refused
 
 import covocp as co
 
@@ -23,3 +25,21 @@ def test_data_are_drawn_by_name_with_their_unit():
         t, values = lines[label].T
         np.testing.assert_allclose(values, exact(t), atol=1e-6)
     plt.close(figure)
+
+
+def test_data_have_values_and_panels_by_name():
+    times = np.linspace(0.0, 3.0, 7)
+    ocp = co.Problem(duration=3.0)
+    wind = ocp.data("wind", times, np.stack([np.sin(times), times**2], axis=1), unit="m/s")
+    x, u = ocp.state("x", initial=0.0, unit="m"), ocp.control("u")
+    ocp.dynamics(x, u + wind[0])
+    ocp.minimize(running=u**2 + x**2)
+    solution = co.solve(ocp, intervals=12, progress=False)
+    np.testing.assert_allclose(solution["wind"][:, 1], np.interp(solution.t, times, times**2), atol=1e-12)
+    np.testing.assert_allclose(solution["wind[0]"], np.interp(solution.t, times, np.sin(times)), atol=1e-12)
+    assert solution.at(1.3)["wind[1]"] == pytest.approx(np.interp(1.3, times, times**2), abs=1e-12)
+    figure = solution.plot("wind[1]", ["wind[0]", "x"])
+    assert figure.axes[0].get_ylabel() == "wind[1] [m/s]"
+    plt.close(figure)
+    refused(lambda: solution["wind[2]"], "'wind' has no entry 2")
+    refused(lambda: solution.plot("gale"), "'gale' is not in this solution")

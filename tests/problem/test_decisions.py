@@ -318,9 +318,43 @@ def test_a_covariance_must_be_one_up_to_the_bounds():
     refused(lambda: co.solve(ocp, intervals=5, progress=False), "'d'", "no covariance", "lower bound")
 
 
-def test_a_filter_of_a_problem_with_decisions_is_refused():
-    """It would need numbers."""
+def test_a_filter_has_the_numbers_of_decisions():
+    """The same as that of the problem with numbers in their place; no guess is taken for one."""
+
+    def observed(number=None):
+        ocp = co.Problem(1.0)
+        d = (
+            ocp.decision("d", 2, guess=[1.0, 2.0], lower=0.1, upper=9.0)
+            if number is None
+            else ocp.parameter("d", number)
+        )
+        x, u = ocp.state("x", initial=d[0], variance=d[1]), ocp.control("u")
+        ocp.dynamics(x, u - d[0] * x, noise=d[1])
+        ocp.measurement("m", x, noise=d[0])
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=u**2, terminal=E[x, x] + ca.sumsqr(d))
+        return ocp
+
+    number, point = np.array([0.7, 3.0]), (0.3, 0.9, -0.4, 0.2, 0.5)
+    chosen = filters.extended_filter(observed(), decisions={"d": number})
+    for one, two in zip(chosen(*point), filters.extended_filter(observed(number))(*point), strict=True):
+        assert float(one) == pytest.approx(float(two), rel=1e-14)
+    starts = filters.initial_estimate(observed(), decisions={"d": number})
+    np.testing.assert_allclose(np.ravel(starts[0]), 0.7)
+    np.testing.assert_allclose(starts[1], [[3.0]])
     refused(lambda: filters.extended_filter(sensor()), "'r' is a decision", "solution['r']")
+    refused(lambda: filters.extended_filter(sensor(), decisions={"q": 1.0}), "'q'")
+
+
+def test_worth_holds_the_decisions_of_its_nominal():
+    """As of the problem with numbers in their place."""
+    nominal = co.solve(loop(0.4), intervals=20, nominal="deterministic", progress=False)
+    given = {"u": nominal["u"], "r": 0.4}
+    found = co.worth(loop(), nominal=given, intervals=20, grid=nominal.mesh.nodes)
+    known = co.worth(loop(0.4), nominal={"u": nominal["u"]}, intervals=20, grid=nominal.mesh.nodes)
+    assert found.classical.cost == pytest.approx(known.classical.cost, rel=1e-12)
+    assert found.gain == pytest.approx(known.gain, rel=1e-6, abs=1e-12)
+    assert "decisions were held" in found.verdict
 
 
 def test_what_knows_controls_only_says_so():

@@ -64,11 +64,13 @@ class Worth:
     @property
     def verdict(self) -> str:
         """What the numbers mean, a sentence."""
+        if self.gain >= MUCH:
+            return f"worth solving: at least {100 * self.gain:.1f} % of the expected cost can be saved"
+        if any(block.role == "decision" for block in self.classical.blocks):
+            return "little to gain by the controls; decisions were held, and what others gain is not known"
         if self.gain < NOTHING and self.first_order < NOTHING:
             return "nothing to gain: nominal and statistics separate here; the classical design will do"
-        if self.gain < MUCH:
-            return "little to gain: the classical design is nearly as good"
-        return f"worth solving: at least {100 * self.gain:.1f} % of the expected cost can be saved"
+        return "little to gain: the classical design is nearly as good"
 
     def __str__(self) -> str:
         """The summary that print shows."""
@@ -94,6 +96,8 @@ class Worth:
 def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **options: Any) -> Worth:
     """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
 
+    Decisions keep the values of `nominal`, which must be given where there are any: what others gain comes on top.
+
     Args:
         problem: with an expected cost.
         nominal: the classical nominal, as in `evaluate`; None: from the deterministic cost.
@@ -104,7 +108,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
         The estimate; it costs one deterministic solution and a few evaluations.
 
     Raises:
-        ProblemError: no expected cost, constrained gains, decisions, or no deterministic cost and no `nominal`.
+        ProblemError: no expected cost, constrained gains; decisions, or no deterministic cost, and no `nominal`.
         SolveError: the deterministic problem was not solved.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
@@ -117,12 +121,12 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
             remedy="compare solutions by their costs instead",
         )
     chosen = [state.name for state in problem.states if state.role == "decision"]
-    if chosen:
+    if chosen and nominal is None:
         raise ProblemError(
-            f"worth() looks along the controls only, and '{chosen[0]}' is a decision.",
-            expected="a problem in which controls are chosen",
+            f"worth() looks along the controls, and '{chosen[0]}' is a decision: which value is meant?",
+            expected="nominal=, which gives the decisions too",
             received="decisions: " + ", ".join(chosen),
-            remedy="compare the costs of solve(problem) and solve(problem, nominal='deterministic')",
+            remedy="give nominal=solve(problem, nominal='deterministic'), or a dict of controls and decisions",
         )
     if nominal is None:
         classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)

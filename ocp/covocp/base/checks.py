@@ -30,6 +30,22 @@ def is_symbolic(value: Given) -> bool:
     return isinstance(value, ca.MX)
 
 
+def gathered(value: Given) -> Any:
+    """A list of numbers and scalar expressions as a column, rows of them as a matrix; anything else as it is."""
+    if not isinstance(value, (list, tuple)) or not value:
+        return value
+    rows = [entry if isinstance(entry, (list, tuple)) else [entry] for entry in value]
+    nested = {isinstance(entry, (list, tuple)) for entry in value}
+    entries = [entry for row in rows for entry in row]
+    numbers = [entry for entry in entries if not is_symbolic(entry)]
+    plain = all(isinstance(n, (int, float, np.number)) and not isinstance(n, bool) and np.isfinite(n) for n in numbers)
+    scalar = all(entry.shape == (1, 1) for entry in entries if is_symbolic(entry))
+    even = len({len(row) for row in rows}) == 1 and len(nested) == 1
+    if len(numbers) == len(entries) or not (plain and scalar and even):
+        return value
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows))
+
+
 def is_scalar(value: Given) -> bool:
     """Whether a number, an array or an expression has one entry."""
     return bool(value.numel() == 1 if isinstance(value, (ca.MX, ca.DM)) else np.size(value) == 1)
@@ -108,7 +124,8 @@ def bound_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Arr
 
 
 def data_column(name: str, what: str, value: Given, size: int, *, nan: bool = False) -> Any:
-    """Like `column`, but an expression in the parameters of the problem is accepted too."""
+    """Like `column`, but an expression in the parameters of the problem, or a list with some, is accepted too."""
+    value = gathered(value)
     if is_symbolic(value):
         if value.shape == (size, 1):
             return value
@@ -119,10 +136,14 @@ def data_column(name: str, what: str, value: Given, size: int, *, nan: bool = Fa
 
 
 def density_matrix(name: str, what: str, value: Given, size: int) -> Any:
-    """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix.
+    """A size x size matrix from a scalar (times identity), a vector (the diagonal) or a matrix, or lists of entries.
 
     Constant data are checked here: finite, symmetric, positive semidefinite.
     """
+    known = [entry for entry in value if isinstance(entry, (int, float))] if isinstance(value, (list, tuple)) else []
+    value = gathered(value)
+    if is_symbolic(value) and known:
+        check_density(name, what, np.diag(known), definite=False)
     expected = f"a number, {size} numbers (the diagonal) or a {size} x {size} matrix" if size > 1 else "a number"
     if is_symbolic(value):
         if value.shape == (size, size):
@@ -146,6 +167,7 @@ def density_matrix(name: str, what: str, value: Given, size: int) -> Any:
 
 def symmetric_data(name: str, what: str, value: Given, size: int, *, semidefinite: bool) -> Any:
     """Half-vector of a symmetric matrix given as numbers (NaN: free) or as an expression in the parameters."""
+    value = gathered(value)
     matrix: Any = value if is_symbolic(value) else as_number(name, what, value)
     if not is_symbolic(value):
         if matrix.ndim > 2:

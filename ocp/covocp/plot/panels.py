@@ -18,7 +18,7 @@ from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, prod
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
 from covocp.solution.solution import Solution
-from covocp.statement.names import block_of, chosen_entry, name_of, sizes_of
+from covocp.statement.names import block_of, chosen_entry, name_of, sizes_of, split_entry
 from covocp.statement.statement import Block, Statement, entry_names
 from covocp.statement.time_data import in_words
 
@@ -230,6 +230,8 @@ def _resolved(solutions: list[Solution], key: Given) -> Any:
     if isinstance(key, list):
         return Together(keys=tuple(_resolved(solutions, part) for part in key))
     error: ProblemError | None = None
+    if isinstance(key, str) and (course := _course(solutions, key)) is not None:
+        return course
     if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
         if any(knows(solution, key) for solution in solutions):
             return Quantity(word=key)
@@ -243,6 +245,17 @@ def _resolved(solutions: list[Solution], key: Given) -> Any:
     if error is None or isinstance(key, ca.MX):
         return key
     raise error
+
+
+def _course(solutions: list[Solution], name: str) -> Any:
+    """The expression of data over time, or of an entry of them, by name; None where it is no such name."""
+    vector, k = split_entry(name) or (name, -1)
+    for entry in (entry for solution in solutions if solution.statement for entry in solution.statement.data):
+        if entry.name == name:
+            return entry.expression
+        if entry.name == vector and k < entry.values.shape[1]:
+            return entry.expression[k]
+    return None
 
 
 def _uncertain(solutions: list[Solution], word: str, key: Given) -> Any:

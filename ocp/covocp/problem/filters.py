@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, overload
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import check_kind
+from covocp.base.checks import check_kind, column
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, unpack
 from covocp.blocks.bucy import time_step
@@ -16,11 +17,17 @@ from covocp.blocks.updates import Form, Missing
 from covocp.problem.builder import Problem
 from covocp.problem.decisions import decisions_of
 from covocp.problem.rates import process_noise
+from covocp.statement.names import name_of
 from covocp.statement.statement import Statement
+
+# Values of decisions by symbol or name.
+Decided = Mapping[Any, Any] | None
 
 
 @overload
-def extended_filter(problem: Problem, *, step: None = None, duration: float | None = None) -> ca.Function: ...
+def extended_filter(
+    problem: Problem, *, step: None = None, duration: float | None = None, decisions: Decided = None
+) -> ca.Function: ...
 @overload
 def extended_filter(
     problem: Problem,
@@ -30,6 +37,7 @@ def extended_filter(
     form: Form = "joseph",
     missing: Missing = "raise",
     duration: float | None = None,
+    decisions: Decided = None,
 ) -> tuple[ca.Function, ca.Function]: ...
 def extended_filter(
     problem: Problem,
@@ -39,6 +47,7 @@ def extended_filter(
     form: Form = "joseph",
     missing: Missing = "raise",
     duration: float | None = None,
+    decisions: Decided = None,
 ) -> ca.Function | tuple[ca.Function, ca.Function]:
     """Extended Kalman filter of the actual system of a problem; its rows are those of the estimation covariance.
 
@@ -56,16 +65,17 @@ def extended_filter(
         form: of the update, see `kalman.update`.
         missing: "raise": readings are trusted, "skip": a row that is NaN is no measurement.
         duration: T [s], where it is free and the system depends on it; None: its guess.
+        decisions: their values by symbol or name; needed where there are any.
 
     Returns:
         Continuous: (x, P, u, y, t) -> dx/dt, dP/dt. Discrete: predict (x, P, u, t) -> x, P a step later, with t at the
         start of it, and update (x, P, y, u, t) -> x, P after the reading.
 
     Raises:
-        ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive;
-            measurements at instants without a step, or where missing ones are not skipped.
+        ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive,
+            a decision without a value; measurements at instants without a step, or where missing ones are not skipped.
     """
-    system = _System(problem, duration)
+    system = _System(problem, duration, decisions)
     _check_instants(problem, step, missing)
     x, P, u, t = system.symbols
     none = (type(x)(0, 1), type(x)(0, 0))
@@ -100,36 +110,41 @@ def _check_instants(problem: Problem, step: float | None, missing: Missing) -> N
         )
 
 
-def initial_estimate(problem: Problem) -> tuple[Array, Array]:
+def initial_estimate(problem: Problem, *, decisions: Decided = None) -> tuple[Array, Array]:
     """Where the filter of a problem starts: initial states and means of the unknowns, and their covariance.
 
     Args:
         problem: with the variances as declared, or with an initial estimation covariance.
+        decisions: as in `extended_filter`.
 
     Returns:
         Estimate, (n,) where all states are vectors, NaN where an initial state is free, and covariance (n, n).
 
     Raises:
-        ProblemError: no `Problem` or an incomplete one.
+        ProblemError: no `Problem` or an incomplete one, a decision without a value.
     """
     statement = _statement(problem)
     means = _parameters(statement)[1]
     starts = statement.boundary_values(statement.values)
-    estimate = np.concatenate([starts[0][: statement.augmented_geometry.size - means.size], means])
+    first, matrices = statement.started(_decided(statement, decisions, starts[0]), statement.values, starts[2])
+    estimate = np.concatenate([first[: statement.augmented_geometry.size - means.size], means])
     for block in statement.matrices:
         if block.estimation:
-            return estimate, unpack(starts[2][block.span], block.size)
+            return estimate, unpack(matrices[block.span], block.size)
     own = problem.declarations
     variances = ca.diagcat(*(entry.variance for entry in own.augmented))
-    covariance = ca.Function("variances", [entry.symbol for entry in own.parameters], [variances])
-    values = covariance.call([ca.DM(entry.value) for entry in own.parameters])
+    names = [state.name for state in decisions_of(own)]
+    given: list[Any] = [*own.parameters, *decisions_of(own)]
+    chosen = [first[block.span] for name in names for block in statement.states if block.name == name]
+    covariance = ca.Function("variances", [entry.symbol for entry in given], [variances])
+    values = covariance.call([ca.DM(value) for value in (*(entry.value for entry in own.parameters), *chosen)])
     return estimate, np.asarray(values[0].full())
 
 
 class _System:
     """Rates, process noise and measurement of the augmented state, functions of (x, t, u)."""
 
-    def __init__(self, problem: Problem, duration: float | None) -> None:
+    def __init__(self, problem: Problem, duration: float | None, decisions: Decided) -> None:
         statement = _statement(problem)
         if statement.coupled:
             raise ProblemError(
@@ -146,10 +161,12 @@ class _System:
         x, t, u = kind.sym("x", self.geometry.size), kind.sym("t"), kind.sym("u", controls)
         self.symbols = x, kind.sym("P", size, size), u, t
         # what a derived problem adds to states and controls (gains, for instance) moves nothing in the actual system
-        state = ca.vertcat(x[:estimated], kind.zeros(statement.nx - estimated))
+        behind = np.nan_to_num(_decided(statement, decisions, np.zeros(statement.nx))[estimated:])
+        moving, own = ca.vertsplit(x, [0, estimated, self.geometry.size])  # slices of one number are never empty
+        state = ca.vertcat(moving, ca.DM(behind))
         control = ca.vertcat(u, kind.zeros(statement.nu - controls))
         length = statement.duration.guess if duration is None else duration
-        at = (state, control, t, length, ca.vertcat(known, x[estimated:]))
+        at = (state, control, t, length, ca.vertcat(known, own))
         nominal: Any = statement.nominal
         rate = ca.vertcat(nominal(*at)[0][:estimated], kind.zeros(means.size))
         self.rate = ca.Function("rate", [x, t, u], [ca.densify(rate)])
@@ -168,14 +185,28 @@ class _System:
 
 def _statement(problem: Problem) -> Statement:
     check_kind(problem, Problem, "give the problem itself, not its solution")
-    if chosen := decisions_of(problem.declarations):
-        raise ProblemError(
-            f"The filter of a problem needs numbers, and '{chosen[0].name}' is a decision.",
-            expected="a problem whose constants are numbers or parameters",
-            received="decisions: " + ", ".join(entry.name for entry in chosen),
-            remedy=f"build the problem with the chosen numbers in their place: solution['{chosen[0].name}']",
-        )
     return problem.statement()
+
+
+def _decided(statement: Statement, decisions: Decided, state: Array) -> Array:
+    """The whole state with the values of the decisions.
+
+    Raises:
+        ProblemError: one has no value, or what is given is none of them.
+    """
+    own = {block.name: block for block in statement.states if block.role == "decision"}
+    result: Array = state.copy()
+    given = {name_of(key, statement.symbols, tuple(own)): value for key, value in (decisions or {}).items()}
+    for name, block in own.items():
+        if name not in given:
+            raise ProblemError(
+                f"The filter of a problem needs numbers, and '{name}' is a decision.",
+                expected="a value of every decision",
+                received=", ".join(given) or "none",
+                remedy=f"give decisions={{'{name}': solution['{name}']}}, or another value",
+            )
+        result[block.span] = column(name, "value", given[name], block.size)
+    return result
 
 
 def _parameters(statement: Statement) -> tuple[Array, Array]:

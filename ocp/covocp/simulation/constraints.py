@@ -2,6 +2,7 @@
 
 A run is looked at with its own state, unknowns and control, and the matrices that the solution has; the covariance X of
 the closed loop is zero in it, whose deviations have happened: x + 3 sqrt(X[x, x]) <= 2 counts runs with x > 2. An
+integral is that of the run: of what it did, not of the nominal; what covariances promise of it is not computed. An
 equality is met by no noisy run exactly, and what no run changes (a covariance, an open-loop control) is the same in
 all: neither is counted.
 """
@@ -39,7 +40,7 @@ class Row:
 
     bound: whether it is the bound of a state or of a control, whose name it has.
     chance: whether it is of a condition on a probability. parts: of rows that hold together the positions of these;
-        it is kept where all of them are.
+        it is kept where all of them are. integral: whether integrals are in it, of which covariances promise nothing.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Row:
     bound: bool
     chance: bool = False
     parts: tuple[int, ...] = ()
+    integral: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,12 +59,14 @@ class Rows:
 
     function: (state, control, matrices, time, duration, parameters) -> their values.
     left_out: names of the constraints that are not counted, and why. chances: conditions on probabilities in `rows`.
+    sums: entries of the state that are integrals and are gathered in each run.
     """
 
     rows: tuple[Row, ...]
     function: ca.Function
     left_out: Mapping[str, str]
     chances: tuple[ChanceLimits, ...] = ()
+    sums: tuple[int, ...] = ()
 
     __repr__ = short_repr
 
@@ -83,9 +87,12 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
     a = [symbolic.sym(f"a{i}", k) for i, k in enumerate(sizes)]
     unknowns = [k for b in st.of_kind("unknown") for k in range(b.span.start, b.span.stop)]
     gathered = [k for b in st.states if b.role == "integral" for k in range(b.span.start, b.span.stop)]
-    sums = ca.vertcat(a[0][gathered, :], a[2][st.entries(st.summed), :])
     own = ca.vertcat(a[0][:states], a[1][:fed_back], a[5][unknowns])
-    rows, values, left_out = [], [], {}
+    # An integral of what is the same in all runs is left to the solution, whose quadrature is another one.
+    moved = [] if st.nominal is None else st.nominal(a[0], a[1], *a[3:])[0]
+    sums = [k for k in gathered if ca.depends_on(moved[k], own)]
+    varying, summed = a[0][sums, :], a[2][st.entries(st.summed), :]
+    rows, values, left_out, needed = [], [], {}, False
     for name, value, low, high in _bounds(st, a, (states, fed_back)):
         rows.append(Row(name=name, place="path", lower=low, upper=high, bound=True))
         values.append(value)
@@ -99,17 +106,20 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
             low, high = float(conditions.lower[i]), float(conditions.upper[i])
             if low == high:
                 left_out[name] = "an equality, which no noisy run meets exactly"
-            elif ca.depends_on(column[i], sums):
-                left_out[name] = "an integral along the nominal"
-            elif not ca.depends_on(column[i], own):
+            elif ca.depends_on(column[i], summed):
+                left_out[name] = "an integral of covariances along the nominal"
+            elif not ca.depends_on(column[i], ca.vertcat(own, varying)):
                 left_out[name] = "the same in all runs"
             else:
-                rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False))
+                whole = bool(ca.depends_on(column[i], varying))
+                rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False, integral=whole))
                 values.append(column[i])
+                needed |= whole
     for limits in st.chances:
         _add_chance(limits, limits.function(*a)[0], rows, values)
     function = ca.Function("conditions", a, [ca.densify(ca.vertcat(symbolic(0, 1), *values))])
-    return Rows(rows=tuple(rows), function=function, left_out=left_out, chances=st.chances)
+    own_sums = tuple(sums) if needed else ()
+    return Rows(rows=tuple(rows), function=function, left_out=left_out, chances=st.chances, sums=own_sums)
 
 
 def _add_chance(limits: ChanceLimits, column: Any, rows: list[Row], values: list[Any]) -> None:
@@ -161,7 +171,10 @@ def violations(run: Run, z: Given, fed: Given, c: dict[str, Any]) -> Any:
     chosen = counted_rows(design)
     if not chosen.rows:
         return run.symbolic(0, 1)
-    state = ca.vertcat(z[run.spans["x"]], part(c["x"], design.entries))
+    rest = ca.vertsplit(part(c["x"], design.entries))
+    for i, k in enumerate(run.sums):
+        rest[k - design.entries] = z[run.spans["sums"]][i]
+    state = ca.vertcat(z[run.spans["x"]], *rest)
     u = ca.vertcat(fed, part(c["u"], design.fed_back))
     known = ca.DM(solution.parameters[: solution.parameters.size - design.unknowns])
     matrices = c["e"] if c["e"].shape[0] else run.symbolic.zeros(design.statement.ne)  # no constraint uses them
@@ -208,6 +221,8 @@ def promised(solution: Solution, design: System, nominal: Nominal, prediction: P
                 share[known] = over[known] > MARGIN * max(1.0, abs(limit))
                 result[:, i] += share
     for i, row in enumerate(chosen.rows):
+        if row.integral:
+            result[:, i] = np.nan
         if row.parts:  # Boole's bound
             result[:, i] = np.minimum(result[:, list(row.parts)].sum(axis=1), 1.0)
     return result

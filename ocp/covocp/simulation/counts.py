@@ -18,7 +18,7 @@ class Count:
 
     name: of the constraint, or of the state or control whose bound it is. place: "path", "initial" or "final". bound:
     whether it is a bound. chance: whether it is of a condition on a probability. joint: of several rows that hold
-    together; what is promised is then an upper bound.
+    together; what is promised is then an upper bound. What contains an integral is promised nothing (NaN).
     runs: that violate it, at any instant of the path; share: of all runs.
     at_end: runs that violate it at the end, those that left the domain among them, and end_share; promised_end: what
     the covariances promise for normal deviations, (low, high): the confidence band of the probability that the runs
@@ -44,7 +44,9 @@ class Count:
 
     @property
     def as_promised(self) -> bool:
-        """Whether the promised probability at the end is inside the confidence band of the runs'."""
+        """Whether what is promised at the end is inside the confidence band of the runs; where nothing is, true."""
+        if np.isnan(self.promised_end):
+            return True
         return self.low <= self.promised_end and (self.joint or self.promised_end <= self.high)
 
 

@@ -107,7 +107,7 @@ def make_plan(
     varying = np.flatnonzero(((before != before[0]) | (after != before[0])).any(axis=0))
     watched, at = counted_rows(design), indices(grid, stored)
     lengths = np.hstack([grid.h[:, None], readings_of(setting.solution, grid).T])
-    run = run_symbols(setting, chosen, len(watched.at("path")))
+    run = run_symbols(setting, chosen, len(watched.at("path")), watched.sums)
     return Plan(
         step=step_function(run, before[0], varying),
         read=read_function(run, before[0], varying),

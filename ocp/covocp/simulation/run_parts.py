@@ -69,9 +69,10 @@ class Run:
     """Symbols of one run, and where the parts of its state lie.
 
     z: the state; own: its unknowns. spans: "x", "estimate", "E" (of the extended filter), "measured" (what a law has
-    measured since its last step, an integral), "cost", "asked" and "violated" (flags), "held" (control of a law),
-    "read" (what a law has read since its last step, UNREAD where nothing).
-    noisy: states with process noise; watched: number of inequalities along the path.
+    measured since its last step, an integral), "sums" (integrals that were declared), "cost", "asked" and "violated"
+    (flags), "held" (control of a law), "read" (what a law has read since its last step, UNREAD where nothing).
+    noisy: states with process noise; watched: number of inequalities along the path; sums: where the integrals lie in
+    the state of the problem.
     """
 
     setting: Setting
@@ -82,6 +83,7 @@ class Run:
     spans: Mapping[str, slice]
     noisy: list[int]
     watched: int
+    sums: tuple[int, ...] = ()
 
     __repr__ = short_repr
 
@@ -120,8 +122,8 @@ class Run:
         return Geometry.stacked(design.motion, estimate, rest)
 
 
-def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) -> Run:
-    """Symbols of a run; watched: number of inequalities along its path."""
+def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0, sums: tuple[int, ...] = ()) -> Run:
+    """Symbols of a run; watched: number of inequalities along its path; sums: entries of its integrals."""
     design, actual = setting.design, setting.actual
     scalar = design.statement.symbolic is ca.SX and actual.statement.symbolic is ca.SX
     symbolic: Any = ca.SX if scalar else ca.MX
@@ -131,6 +133,7 @@ def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) 
         "estimate": design.start.size if setting.filter == "extended" else design.size,
         "E": half_length(design.size) if setting.filter == "extended" else 0,
         "measured": design.measured if setting.flown else 0,
+        "sums": len(sums),
         "cost": int(setting.costs),
         "asked": design.fed_back,
         "violated": watched,
@@ -147,6 +150,7 @@ def run_symbols(setting: Setting, coefficients: Coefficients, watched: int = 0) 
         spans={name: slice(i, j) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)},
         noisy=[i for i in range(design.states) if noise.has_nz(i, i)],
         watched=watched,
+        sums=sums,
     )
 
 

@@ -172,9 +172,13 @@ def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
     else:
         expected = system_at(run, design, estimate_of(run, z), u, c).rate
         parts += [expected, run.symbolic.zeros(half_length(design.size))]
+    known = ca.DM(setting.solution.parameters[: setting.solution.parameters.size - design.unknowns])
+    state, p = ca.vertcat(x, part(c["x"], design.entries)), ca.vertcat(known, run.own)
+    if run.sums:
+        assert design.statement.nominal is not None
+        gathered = design.statement.nominal(state, u, c["t"], setting.solution.duration, p)[0]
+        parts += [gathered[k] for k in run.sums]
     if design.statement.loop is not None:
-        known = ca.DM(setting.solution.parameters[: setting.solution.parameters.size - design.unknowns])
-        state, p = ca.vertcat(x, part(c["x"], design.entries)), ca.vertcat(known, run.own)
         cost = design.statement.loop.running(state, u, c["t"], setting.solution.duration, p)
         parts.append(cost + ca.dot(moved, c["extra"] @ moved) / 2)
     return ca.vertcat(*parts), u

@@ -37,6 +37,7 @@ from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
+from covocp.statement.time_data import TimeData
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -202,6 +203,11 @@ class Solution:
         return gains if self.loop is None else {**gains, "C": self.loop.gain}
 
     @property
+    def _data(self) -> tuple[TimeData, ...]:
+        """What is given over time and used; () for a solution read from a file."""
+        return self.statement.data if self.statement is not None else ()
+
+    @property
     def symbols(self) -> Mapping[str, Any]:
         """The user's symbols by name; empty for a solution read from a file."""
         return self.statement.symbols if self.statement is not None else {}
@@ -264,6 +270,8 @@ class Solution:
         """Name of a symbol, a name or an entry among some blocks; None: among all values."""
         names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
         sizes = sizes_of(self.blocks if blocks is None else blocks)
+        if blocks is None:
+            sizes |= {entry.name: entry.values.shape[1] for entry in self._data}
         return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes)
 
     @cached
@@ -288,7 +296,7 @@ class Solution:
             if b.tangent:  # of unit length, which interpolation keeps up to its error
                 values = values / np.linalg.norm(values, axis=1, keepdims=True)
             result[b.name] = values[:, 0] if b.size == 1 else values
-        return result
+        return result | {entry.name: entry.at(t) for entry in self._data}
 
     def __getitem__(self, key: Given) -> Array:
         """Values at the nodes of a symbol, a name, an entry of one, or an expression; decisions, integrals: numbers.

@@ -1,4 +1,4 @@
-"""What a run that failed says of its decisions: one without a bound that went far away."""
+"""What a run that failed says of its decisions and data: what went far away without a bound, what bends where."""
 
 from __future__ import annotations
 
@@ -28,3 +28,17 @@ def far_away(solution: Solution) -> str:
                 found.append(f"the decision '{name}' went to {value:.3g} and has no {side} bound")
     listed = "; ".join(found)
     return f"\n  {listed}: the cost may fall with it without end, give its bounds." if found else ""
+
+
+def bent_data(solution: Solution) -> str:
+    """A line on data with kinks under a free duration, whose slope by it jumps; "" where there are none."""
+    statement = solution.statement
+    if statement is None or not statement.duration.free:
+        return ""
+    bent = ", ".join(f"'{entry.name}'" for entry in statement.data if entry.kinks.size)
+    if not bent:
+        return ""
+    return (
+        f"\n  The data {bent} have kinks: where T is free its slope jumps whenever one of them passes a node. "
+        "kind='cubic' is smooth; or solve for some fixed durations and compare."
+    )

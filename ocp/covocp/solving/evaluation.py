@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.checks import as_number, check_density, check_kind
+from covocp.base.checks import as_number, check_density, check_kind, column
 from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, stacked, unpack
@@ -55,8 +55,10 @@ def evaluate(
 
     Args:
         problem: the problem; or a solution, whose nominal and gains are kept.
-        nominal: the control: a solution (of any problem with controls of these names), or a dict of control to number,
-            array over the nodes, or function of s = t/T; None: the guesses of the controls. The states follow.
+        nominal: the control: a solution (of any problem with controls and decisions of these names), or a dict of
+            control to number, array over the nodes, or function of s = t/T, and of decision to value; None: the
+            guesses of controls and decisions. The states follow; what else is free (initial states, the duration, a
+            constant gain) is taken from the solution, or as guessed.
         truth: what the statistics really are, for a solution with an expected cost: a problem of the same symbols
             (its variances and noise densities count), or a dict of parameter name to value.
         intervals: number of control intervals, where the nominal is not a solution.
@@ -67,7 +69,7 @@ def evaluate(
         A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`.
 
     Raises:
-        ProblemError: a control is not given, a name is unknown, `truth` has other symbols.
+        ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
     """
     if isinstance(problem, Solution):
         if nominal is not None or options or parameters is not None:
@@ -103,8 +105,7 @@ def _along(
     mesh = evaluation_mesh(st, given, values)
     u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
     x0, e0 = starts(st, mesh, values)
-    if isinstance(nominal, Solution):
-        x0, e0 = st.started(_started_like(st, nominal, x0, values), values, e0)
+    x0, e0 = st.started(_started_like(st, nominal, x0, values), values, e0)
     check_model(st, x0, u[:1].ravel(), e0, duration, values)
     outcome = evaluate_controls(st, mesh, u, duration, values, x0)
     own_steps = given.substeps == "auto"
@@ -132,15 +133,40 @@ def _with_passed(solution: Solution) -> dict[str, float]:
     return result
 
 
-def _started_like(statement: Statement, nominal: Solution, x0: Array, parameters: Array) -> Array:
-    """The initial state, with what is free there as in a solution that has it: decisions are such states."""
+def _started_like(statement: Statement, nominal: Given, x0: Array, parameters: Array) -> Array:
+    """The initial state, with the decisions of the nominal and, of a solution, what else is free there.
+
+    Raises:
+        ProblemError: the nominal does not give a decision: a guess is no choice.
+    """
     result, known = x0.copy(), statement.boundary_values(parameters)[0]
-    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
-    for block in statement.states:
-        if block.name in own and own[block.name].size == block.size:
-            first = nominal.trajectory.x[0, own[block.name].span]
-            result[block.span] = np.where(np.isnan(known[block.span]), first, x0[block.span])
+    gain = free_gain_block(statement)
+    if isinstance(nominal, Solution):
+        own = {block.name: block for block in nominal.blocks if block.kind == "state"}
+        for block in statement.states:
+            if block.name in own and own[block.name].size == block.size:
+                first = nominal.trajectory.x[0, own[block.name].span]
+                result[block.span] = np.where(np.isnan(known[block.span]), first, x0[block.span])
+            elif block == gain and nominal.loop is not None:
+                result[block.span] = gain_entries(statement, block, nominal, nominal.t / nominal.duration)[0]
+            elif block.role == "decision":
+                raise _not_given("decision", block.name, f"a solution of '{nominal.name}' without it")
+        return result
+    given = _by_name(statement, nominal) if nominal is not None else {}
+    for block in statement.states if nominal is not None else ():
+        if block.role != "decision" or (block == gain and block.name not in given):  # Gain(guess=) says what it is
+            continue
+        if block.name not in given:
+            raise _not_given("decision", block.name, ", ".join(given) or "nothing")
+        result[block.span] = column(block.name, "value", given[block.name], block.size)
     return result
+
+
+def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]:
+    """What a dict gives of controls and decisions, by name."""
+    blocks = (*statement.controls, *(block for block in statement.states if block.role == "decision"))
+    names = tuple(block.name for block in blocks)
+    return {name_of(key, statement.symbols, names): value for key, value in nominal.items()}
 
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
@@ -172,7 +198,7 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> t
                 if block == free_gain_block(statement) and nominal.loop is not None:
                     columns.append(gain_entries(statement, block, nominal, at))
                     continue
-                raise _not_given(block.name, f"a solution of '{nominal.name}' without it")
+                raise _not_given("control", block.name, f"a solution of '{nominal.name}' without it")
             own = nominal.block(block.name)
             columns.append(nominal.trajectory.u[:, own.span] if same else sample[block.name].reshape(-1, block.size))
         return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
@@ -183,12 +209,11 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> t
             received=repr(nominal)[:100],
             remedy="correct nominal=",
         )
-    names = tuple(block.name for block in statement.controls)
-    given = {name_of(key, statement.symbols, names): value for key, value in nominal.items()}
+    given = _by_name(statement, nominal)
     columns = []
     for block in statement.controls:
         if block.name not in given:
-            raise _not_given(block.name, ", ".join(given) or "nothing")
+            raise _not_given("control", block.name, ", ".join(given) or "nothing")
         value = given[block.name]
         value = value if callable(value) else as_number(block.name, "guess", value)
         if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
@@ -197,12 +222,12 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> t
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
 
 
-def _not_given(name: str, received: str) -> ProblemError:
+def _not_given(kind: str, name: str, received: str) -> ProblemError:
     return ProblemError(
-        f"The nominal does not give the control '{name}'.",
-        expected="a history of every control",
+        f"The nominal does not give the {kind} '{name}'.",
+        expected="a history of every control" if kind == "control" else "a value of every decision",
         received=received,
-        remedy=f"add '{name}' to nominal=",
+        remedy=f"add '{name}' to nominal=" if "solution" not in received else f"give a dict with '{name}' as nominal=",
     )
 
 

@@ -39,7 +39,7 @@ from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.between_nodes import check_between, watched
-from covocp.solving.decisions import far_away
+from covocp.solving.decisions import bent_data, far_away
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.methods import METHODS, check_method, method_options
@@ -415,7 +415,7 @@ class Solver:
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
             raise SolveError(
                 f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
-                f"{violated}{far_away(solution)}"
+                f"{violated}{far_away(solution)}{bent_data(solution)}"
                 "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
                 solution=solution,
                 violations=outcome.violations,

@@ -33,6 +33,17 @@ class TimeData:
 
     __repr__ = short_repr
 
+    def at(self, times: Array) -> Array:
+        """Values at some times, (K,) of a scalar, (K, m) of a vector."""
+        (time,) = ca.symvar(self.expression)
+        course = ca.Function("course", [time], [self.expression])
+        values = (
+            np.asarray(course.map(times.size)(times[None, :]).full().T)
+            if times.size
+            else np.zeros((0, course.nnz_out()))
+        )
+        return values[:, 0] if values.shape[1] == 1 else values
+
     @property
     def kinks(self) -> Array:
         """Times at which the slope jumps; a cubic spline has none.

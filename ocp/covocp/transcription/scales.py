@@ -18,6 +18,15 @@ RESPONSE_STEP = 1e-3
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
 STRETCH = 10.0
+# Limits below this are the units of their rows.
+SMALL = 1e-3
+
+
+def limit_units(lower: Array, upper: Array) -> Array:
+    """Units of rows between limits: the larger one where it is small, else 1."""
+    limits = np.abs(np.stack([lower, upper]))
+    largest = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
+    return np.where((largest > 0) & (largest < SMALL), largest, 1.0)
 
 
 def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:
@@ -36,7 +45,9 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Sc
     x = np.max(candidates, axis=0)
     bounded = np.isfinite(span) & (span > 0)
     x = np.where(bounded, np.clip(x, 1e-3 * span, np.where(x > 0, span, np.inf)), x)
-    x = np.where(x > 0, x, np.where(bounded, span, 1.0))
+    limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
+    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)  # a bound far away says nothing of the state
+    x = np.where(x > 0, x, np.where(bounded, span, alone))
     for block in statement.states:
         if block.name in statement.scales:
             x[block.span] = statement.scales[block.name]

@@ -15,6 +15,7 @@ from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales
+from covocp.transcription.scales import limit_units
 from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, shoot
 
 # Adjoint sweeps that a Jacobian takes at once.
@@ -121,22 +122,29 @@ def _constraints(
             k = len(columns)
             x, u, e, t = (v[:, columns] for v in arguments)
             value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
-            rows.append(
-                Rows(
-                    kind=kind,
-                    expression=ca.vec(value),
-                    lower=np.tile(conditions.lower, k),
-                    upper=np.tile(conditions.upper, k),
-                    names=conditions.names,
-                    scale=np.ones(k * conditions.size),
-                    dense=conditions.uses_matrices and mesh.eliminated,
-                )
-            )
+            rows.append(_condition_rows(kind, conditions, value, k, mesh))
     if mesh.points > 1:
         rows += _inside_rows(statement, mesh, scales, variables, nodes)
     if mesh.eliminated and statement.matrices:
         rows += _final_matrices(statement, scales, nodes["e"][:, -1])
     return tuple(sorted(rows, key=lambda entry: entry.dense))
+
+
+def _condition_rows(kind: str, conditions: Conditions, value: Expr, count: int, mesh: Mesh) -> Rows:
+    """Inequalities at some points, in units of their limits where these are small.
+
+    Solvers meet rows to an absolute tolerance: without that a limit of 1e-12 (the square of micrometres) is none.
+    """
+    scale = limit_units(conditions.lower, conditions.upper)
+    return Rows(
+        kind=kind,
+        expression=ca.vec(value if (scale == 1.0).all() else value / ca.repmat(ca.DM(scale), 1, count)),
+        lower=np.tile(conditions.lower / scale, count),
+        upper=np.tile(conditions.upper / scale, count),
+        names=conditions.names,
+        scale=np.tile(scale, count),
+        dense=conditions.uses_matrices and mesh.eliminated,
+    )
 
 
 def _backward_ends(statement: Statement, scales: Scales, variables: _Variables, nodes: dict[str, Any]) -> Rows:
@@ -206,17 +214,8 @@ def _inside_rows(
         points = intervals.substeps(mesh.points).columns(at)
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
         places = Columns(nodes["x_inside"], points.start, e, variables.duration * points.s)
-        rows.append(
-            Rows(
-                kind="path_inside",
-                expression=ca.vec(path.columns(places, variables.duration, variables.parameters)),
-                lower=np.tile(path.lower, n * inner),
-                upper=np.tile(path.upper, n * inner),
-                names=path.names,
-                scale=np.ones(n * inner * path.size),
-                dense=path.uses_matrices and mesh.eliminated,
-            )
-        )
+        value = path.columns(places, variables.duration, variables.parameters)
+        rows.append(_condition_rows("path_inside", path, value, n * inner, mesh))
     return rows
 
 
