@@ -69,12 +69,14 @@ class Runs:
         """
         self._build_program = build
         self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
+        # Ipopt tells its functions and its iterations, and takes multipliers to start from
+        self._open = plugin == "ipopt"
         self._strictness = 1.0
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: Monitor | None = None
         self._nlp: Program | None = None
-        self._cold: ca.Function | None = None
-        self._warm: ca.Function | None = None
+        self._cold: Any = None
+        self._warm: Any = None
 
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
         """Run from these guesses, one for each part; the last iterate is returned whatever happens.
@@ -127,7 +129,7 @@ class Runs:
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
             at_once = 0 <= done[-1].point.iterations <= AT_ONCE
-            if self._plugin == "ipopt" and done[-1] is best and at_once:  # new scales alone do not move it
+            if self._open and done[-1] is best and at_once:  # new scales alone do not move it
                 self._tighten()
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
             solver = self._warm_solver() if start.lam_x is not None else self._cold
@@ -150,7 +152,7 @@ class Runs:
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
         assert self._cold is not None
-        first = FirstOrder(nlp, self._cold, self._plugin)
+        first = FirstOrder(nlp, self._cold if self._open else None)
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
@@ -168,7 +170,7 @@ class Runs:
     def _run(
         self,
         nlp: Program,
-        solver: ca.Function,
+        solver: Any,
         start: Start,
         parameters: Arrays,
         progress: Progress,
@@ -230,13 +232,13 @@ class Runs:
 
     def _build(
         self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool
-    ) -> tuple[Program, ca.Function]:
+    ) -> tuple[Program, Any]:
         """The program and its solver, made at the first call; a second solver shares the functions for warm starts.
 
         Other plugins than Ipopt print their iterations where somebody watches that call.
         """
         if self._nlp is None or self._cold is None:
-            if self._plugin != "ipopt" and not watched:
+            if not self._open and not watched:
                 self._settings = silent(self._plugin, self._settings)
             self._transcribe(None, trajectories, parameters)
         assert self._nlp is not None
@@ -246,14 +248,14 @@ class Runs:
     def _transcribe(self, scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> None:
         """The program in these scales, and its solver."""
         self._nlp = self._build_program(scales, trajectories, parameters)
-        if self._plugin == "ipopt":
+        if self._open:
             self._monitor = Monitor(self._nlp)
         self._cold, self._warm = self._make({}), None
 
-    def _warm_solver(self) -> ca.Function:
+    def _warm_solver(self) -> Any:
         """The solver for starts with multipliers; other plugins than Ipopt have one for all."""
         assert self._cold is not None
-        if self._plugin != "ipopt":
+        if not self._open:
             return self._cold
         if self._warm is None:
             shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
@@ -264,7 +266,7 @@ class Runs:
             )
         return self._warm
 
-    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> ca.Function:
+    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> Any:
         nlp = self._nlp
         assert nlp is not None
         settings = {**self._settings, **functions}
@@ -292,12 +294,12 @@ class Runs:
                 remedy="correct plugin_options=, or leave compile= out",
             ) from error
 
-    def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Arrays) -> float:
+    def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
         """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
 
         Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
         """
-        if self._plugin != "ipopt":  # each plugin has functions of its own, and a scaling of its own
+        if not self._open:  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
             return self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)
