@@ -13,6 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import ENDED, STOPPED, Guess
+from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
 from covocp.solvers.reached import (
@@ -148,7 +149,7 @@ class Runs:
     def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
         where = point.where
-        status = status_of(point.status)
+        status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
         assert self._cold is not None
@@ -212,16 +213,20 @@ class Runs:
             evaluable=evaluable,
         )
 
+    def _ending(self, name: str) -> Ending | None:
+        """The ending of that name; None for those that only a plugin knows."""
+        return status_of(name)
+
     def _lost_way(self, status: str) -> dict[str, Any]:
         """Whether the run lost its way, as a count."""
         if self._monitor is not None and self._monitor.wandered:
             return {"wandered": STOPPED}
-        known = status_of(status)
+        known = self._ending(status)
         return {"wandered": ENDED} if known is not None and known.lost else {}
 
     def message(self, last: Round) -> str:
         """How the run ended, a sentence."""
-        status, known = last.point.status, status_of(last.point.status)
+        status, known = last.point.status, self._ending(last.point.status)
         if last.converged:
             return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
         if last.residuals is not None and last.point.success:
@@ -230,9 +235,7 @@ class Runs:
             return status
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
-    def _build(
-        self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool
-    ) -> tuple[Program, Any]:
+    def _build(self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool) -> tuple[Program, Any]:
         """The program and its solver, made at the first call; a second solver shares the functions for warm starts.
 
         Other plugins than Ipopt print their iterations where somebody watches that call.

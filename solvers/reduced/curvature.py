@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
 from covocp.statement.interval import model_symbols
@@ -25,12 +27,12 @@ KEPT_SHARE = 0.1
 
 def first_curvature(
     nlp: NLP,
-    chosen: Array,
+    chosen: NDArray[np.intp],
     w: Array,
     trajectory: Trajectory,
     parameters: Array,
     slope_at: Callable[[Array], Array],
-) -> Array:
+) -> Curvature:
     """A first Hessian in the chosen variables: of the running cost by the controls, elsewhere from differences.
 
     Args:
@@ -42,11 +44,10 @@ def first_curvature(
         slope_at: the slope of the cost by all variables at a point.
 
     Returns:
-        (nz, nz), positive definite, of the cost itself.
+        Positive definite, of the cost itself.
     """
     st, nodes, nu = nlp.statement, nlp.mesh.control_nodes, nlp.statement.nu
     size = w.size
-    whole = np.zeros(size)
     first = size - nodes * nu - int(st.duration.free)
     blocks, weights = _running(nlp, trajectory, parameters)
     slope = slope_at(w)
@@ -70,8 +71,7 @@ def first_curvature(
             change = (slope_at(moved) - slope)[i] / step
             floor = abs(float(slope[i])) / max(1.0, abs(float(w[i])))
             diagonal[i] = max(abs(change) if np.isfinite(change) else 0.0, floor, diagonal[own].max() * 1e-6, 1e-12)
-    del whole
-    return result[np.ix_(chosen, chosen)]
+    return Curvature.of(result[np.ix_(chosen, chosen)])
 
 
 def _running(nlp: NLP, trajectory: Trajectory, parameters: Array) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ def _running(nlp: NLP, trajectory: Trajectory, parameters: Array) -> tuple[Array
 def _curvature_of_running(statement: Statement) -> ca.Function:
     """(x, u, e, t, T, p) -> Hessian of the running cost by u."""
     x, u, e, t, duration, p = model_symbols(statement)
-    if statement.coupled or statement.running_uses_matrices:
+    if statement.nominal is None or statement.running_uses_matrices:
         running = statement.rates(x, u, e, t, duration, p)[2]
     else:
         running = statement.nominal(x, u, t, duration, p)[1]
@@ -117,18 +117,36 @@ def _along_slope(slope_at: Callable[[Array], Array], slope: Array, w: Array, met
     return curvature if np.isfinite(curvature) and curvature > 0.0 else 1.0
 
 
-def learnt(curvature: Array, change: Array, difference: Array) -> Array:
+class Curvature(NamedTuple):
+    """B and its inverse, (nz, nz) each, learnt side by side."""
+
+    matrix: Array
+    inverse: Array
+
+    @staticmethod
+    def of(matrix: Array) -> Curvature:
+        """With the inverse of a matrix."""
+        return Curvature(matrix, np.asarray(np.linalg.inv(matrix), dtype=float))
+
+
+def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature:
     """The damped update of Broyden, Fletcher, Goldfarb and Shanno: B stays positive definite.
 
     Args:
-        curvature: B, (nz, nz).
+        curvature: B and its inverse.
         change: s, of the variables.
         difference: y, of the slope of the Lagrangian.
     """
-    Bs = curvature @ change
+    B, H = curvature
+    Bs = B @ change
     sBs, sy = float(change @ Bs), float(change @ difference)
     if not sBs > 0.0 or not np.isfinite(sy):
         return curvature
     theta = 1.0 if sy >= KEPT_SHARE * sBs else (1.0 - KEPT_SHARE) * sBs / (sBs - sy)
     r = theta * difference + (1.0 - theta) * Bs
-    return np.asarray(curvature + np.outer(r, r / (change @ r)) - np.outer(Bs, Bs / sBs))
+    sr = float(change @ r)
+    Hr = H @ r
+    scaled = change / sr
+    B = B + np.outer(r, r / sr) - np.outer(Bs, Bs / sBs)
+    H = H + np.outer((1.0 + float(r @ Hr) / sr) * scaled, change) - np.outer(Hr, scaled) - np.outer(scaled, Hr)
+    return Curvature(B, H)

@@ -12,9 +12,9 @@ from covocp.base.buffered import Buffered
 from covocp.base.matrices import Array
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.reduced.condensed import Bounds, Layout, layout_of
-from covocp.solvers.reduced.curvature import first_curvature
+from covocp.solvers.reduced.curvature import Curvature, first_curvature
 from covocp.solvers.reduced.sequence import Functions, Memory, Place, Sequence
-from covocp.solvers.statuses import Status
+from covocp.solvers.reduced.statuses import Status
 from covocp.transcription.program import Program
 
 
@@ -52,7 +52,7 @@ class Engine:
         start = self._at(layout, p)(x0)
         if start is None:
             self._program.check_finite(x0, (p[:-1],))
-            self._stats = {"success": False, "return_status": Status.NO_NUMBER.name_of_ipopt, "iter_count": 0}
+            self._stats = {"success": False, "return_status": str(Status.NO_NUMBER), "iter_count": 0}
             return {"x": ca.DM(x0), "lam_x": ca.DM.zeros(x0.size), "lam_g": ca.DM.zeros(bounds.lbg.size)}
         sequence = Sequence(
             Functions(full=self._at(layout, p), value=self._values(p)),
@@ -64,13 +64,13 @@ class Engine:
             watch=self._monitor.seen,
         )
         memory = self._memory if lam_g0 is not None else None  # what was learnt at a plan helps near it
-        if memory is not None and memory.curvature.shape[0] != layout.chosen.size:
+        if memory is not None and memory.curvature.matrix.shape[0] != layout.chosen.size:
             memory = None
         ended = sequence.run(start, memory)
         self._memory = ended.memory if ended.status is Status.SOLVED else None
         self._stats = {
             "success": ended.status is Status.SOLVED,
-            "return_status": ended.status.name_of_ipopt,
+            "return_status": str(ended.status),
             "iter_count": ended.iterations,
         }
         return {"x": ca.DM(ended.place.w), "lam_x": ca.DM(ended.lam_x), "lam_g": ca.DM(ended.lam_g)}
@@ -128,10 +128,10 @@ class Engine:
         outputs = self._outputs(w, p)
         return np.full(w.size, np.nan) if outputs is None else outputs[1]
 
-    def _first(self, layout: Layout, p: Array) -> Callable[[Place], Array]:
+    def _first(self, layout: Layout, p: Array) -> Callable[[Place], Curvature]:
         (part,) = self._program.parts
 
-        def first(place: Place) -> Array:
+        def first(place: Place) -> Curvature:
             trajectory, _ = part.unpack(place.w, p[:-1])
             return first_curvature(
                 part,

@@ -20,10 +20,12 @@ from covocp.solvers.reduced.condensed import (
     reduced,
     weighed,
 )
-from covocp.solvers.reduced.curvature import learnt
+from covocp.solvers.reduced.curvature import Curvature, learnt
+from covocp.solvers.reduced.statuses import Status
 from covocp.solvers.reduced.subproblem import Quadratic, Step, eased, solved
-from covocp.solvers.statuses import Status
 
+# States at the end, in their units, that grow by more than this with a control or a gap have lost their digits.
+LARGEST_GROWTH = 1e8
 # Decrease that a step must bring, as a share of what its slope promises.
 SUFFICIENT = 1e-4
 # Share of the length below which a step is given up.
@@ -64,7 +66,7 @@ class Place:
 class Memory:
     """What a run leaves to the next: the Hessian, and what was active."""
 
-    curvature: Array
+    curvature: Curvature
     active_rows: Array
     active_bounds: Array
 
@@ -104,7 +106,7 @@ class Sequence:
         layout: Layout,
         bounds: Bounds,
         *,
-        first: Callable[[Place], Array],
+        first: Callable[[Place], Curvature],
         tolerance: float,
         most: int,
         watch: Callable[[float, Array], bool],
@@ -126,9 +128,11 @@ class Sequence:
     def run(self, start: Place, kept: Memory | None) -> Ended:
         """From a start, with what a run before left."""
         place, iterations = start, 0
+        rows = self._condensed(place)
+        if not float(np.abs(rows.follows).max(initial=0.0)) < LARGEST_GROWTH:
+            return self._ended(place, rows, None, Status.GROWS, 0, None)
         curvature = self._first(place) if kept is None else kept.curvature
         fresh = kept is None
-        rows = self._condensed(place)
         active = (np.zeros(rows.places.size), np.zeros(rows.slope.size))
         if kept is not None and kept.active_rows.size == rows.places.size:
             active = (kept.active_rows, kept.active_bounds)
@@ -172,11 +176,12 @@ class Sequence:
         return condensed(self._layout, self._bounds, place.w, place.slope, place.g, place.jacobian)
 
     def _step(
-        self, rows: Subproblem, curvature: Array, active: tuple[Array, Array], weights: Array
+        self, rows: Subproblem, curvature: Curvature, active: tuple[Array, Array], weights: Array
     ) -> tuple[Step, float] | None:
         """The step of a subproblem, and which share of the violations it leaves."""
         problem = Quadratic(
-            curvature=curvature,
+            curvature=curvature.matrix,
+            inverse=curvature.inverse,
             slope=rows.slope,
             rows=rows.rows,
             lower=rows.lower,
@@ -196,7 +201,7 @@ class Sequence:
     def _violations(self, g: Array) -> Array:
         return np.asarray(np.maximum(np.maximum(self._bounds.lbg - g, g - self._bounds.ubg), 0.0))
 
-    def _met(self, place: Place, step: Step, curvature: Array, left: float) -> Status | None:
+    def _met(self, place: Place, step: Step, curvature: Curvature, left: float) -> Status | None:
         """How the run ends here, if it does."""
         violation = float(self._violations(place.g).max(initial=0.0))
         if left > STUCK and violation > FEASIBLE:
@@ -205,14 +210,14 @@ class Sequence:
             return Status.SOLVED
         return None
 
-    def _gain(self, place: Place, step: Step, curvature: Array) -> float:
-        """What the subproblem promises, relative to the cost or to what the controls spend of it, where that is more."""
+    def _gain(self, place: Place, step: Step, curvature: Curvature) -> float:
+        """What the subproblem promises, relative to the cost or to what controls spend of it."""
         z = place.w[self._layout.chosen]
-        size = max(abs(place.cost), SPENT * float(z @ curvature @ z), float(np.finfo(float).tiny))
-        return float(step.change @ curvature @ step.change) / size
+        size = max(abs(place.cost), SPENT * float(z @ curvature.matrix @ z), float(np.finfo(float).tiny))
+        return float(step.change @ curvature.matrix @ step.change) / size
 
     def _searched(
-        self, place: Place, rows: Subproblem, step: Step, curvature: Array, weights: Array, left: float
+        self, place: Place, rows: Subproblem, step: Step, curvature: Curvature, weights: Array, left: float
     ) -> Place | None:
         """The next point: the longest share of the step that lowers cost and weighed violations enough."""
         change = moved(self._layout, rows, step.change, place.w.size)
@@ -220,7 +225,7 @@ class Sequence:
         share = min(1.0, LONGEST / longest) if longest > 0 else 1.0
         missed = float(weights @ self._violations(place.g))
         merit, slope = place.cost + missed, float(place.slope @ change) - (1.0 - left) * missed
-        slope = min(slope, -0.5 * float(step.change @ curvature @ step.change))
+        slope = min(slope, -0.5 * float(step.change @ curvature.matrix @ step.change))
         room = ROUNDOFF * (abs(place.cost) + missed)
         corrected = False
         shortest = SHORTEST if self._gain(place, step, curvature) > AT_ROUNDOFF else NEARLY_WHOLE
@@ -249,7 +254,7 @@ class Sequence:
         return None
 
     def _corrected(
-        self, place: Place, rows: Subproblem, step: Step, change: Array, g: Array, curvature: Array
+        self, place: Place, rows: Subproblem, step: Step, change: Array, g: Array, curvature: Curvature
     ) -> Array | None:
         """The whole step with what the rows bend corrected (second order)."""
         whole = replace(place, g=g - self._rows_along(place, change))

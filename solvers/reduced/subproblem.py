@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,16 +16,21 @@ from covocp.base.short_repr import short_repr
 TRIED = 12
 # Violations and wrong signs below this, in the units of the problem, are roundoff.
 ROUNDOFF = 1e-10
+# Relative residual of the equations of a set, how often they are solved for what is left of them to reach it, and what
+# is left where they depend on each other.
+REFINED, MOST_REFINED = 1e-14, 4
+DEPENDENT = 1e-8
 # Share of the curvature that keeps the system of dependent rows solvable.
 REGULAR = 1e-14
-SETTINGS = {"error_on_fail": False, "daqp": {"primal_tol": 1e-9, "iter_limit": 10000}}
+SETTINGS: dict[str, Any] = {"error_on_fail": False, "daqp": {"primal_tol": 1e-9, "iter_limit": 10000}}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quadratic:
-    """Minimise q'd + d'B d/2 where lower <= rows d <= upper and low <= d <= high; B positive definite."""
+    """Minimise q'd + d'B d/2 where lower <= rows d <= upper and low <= d <= high; B, and its inverse."""
 
     curvature: Array
+    inverse: Array
     slope: Array
     rows: Array
     lower: Array
@@ -98,25 +104,18 @@ def _with_active(problem: Quadratic, active_rows: Array, active_bounds: Array) -
     change[free] = 0.0
     target = np.where(active_rows > 0, problem.upper, problem.lower)[held]
     B, A = problem.curvature, problem.rows[held]
-    q = (problem.slope + B @ change)[free]
     b = target - A @ change
-    inner, rows = B[np.ix_(free, free)], A[:, free]
     if held.sum() > free.sum():
         return None
-    try:
-        solution = np.linalg.solve(inner, np.column_stack([q, rows.T]))
-        y, W = solution[:, 0], solution[:, 1:]
-        S = rows @ W
-        if S.size:
-            S = S + REGULAR * np.diag(np.diag(S))
-        multipliers = np.linalg.solve(S, -b - rows @ y) if S.size else np.zeros(0)
-    except np.linalg.LinAlgError:
+    if free.all():
+        found = _with_equations(B, problem.inverse, A, problem.slope, b)
+    else:
+        q = (problem.slope + B @ change)[free]
+        inner = B[np.ix_(free, free)]
+        found = _with_equations(inner, _inverse_of(problem.inverse, free), A[:, free], q, b)
+    if found is None:
         return None
-    change[free] = -(y + W @ multipliers)
-    if not (np.isfinite(change).all() and np.isfinite(multipliers).all()):
-        return None
-    if np.abs(rows @ change[free] - b).max(initial=0.0) > 1e-8 * (1.0 + np.abs(b).max(initial=0.0)):
-        return None  # dependent rows
+    change[free], multipliers = found
     of_rows = np.zeros(active_rows.size)
     of_rows[held] = multipliers
     of_bounds = np.where(free, 0.0, -(problem.slope + B @ change + problem.rows.T @ of_rows))
@@ -127,6 +126,46 @@ def _with_active(problem: Quadratic, active_rows: Array, active_bounds: Array) -
         active_rows=active_rows,
         active_bounds=active_bounds,
     )
+
+
+def _inverse_of(inverse: Array, free: Array) -> Array:
+    """The inverse of the free part of B from that of the whole."""
+    held = np.logical_not(free)
+    across = inverse[np.ix_(free, held)]
+    return np.asarray(inverse[np.ix_(free, free)] - across @ np.linalg.solve(inverse[np.ix_(held, held)], across.T))
+
+
+def _with_equations(B: Array, H: Array, A: Array, q: Array, b: Array) -> tuple[Array, Array] | None:
+    """The minimiser of q'd + d'B d/2 with A d = b, and its multipliers; None where the equations depend on each other.
+
+    By the inverse H of B that was learnt beside it, and for what that leaves once more.
+    """
+    W = H @ A.T
+    S = A @ W
+    S += REGULAR * np.diag(np.diag(S))
+    change, multipliers = np.zeros(q.size), np.zeros(b.size)
+    for _ in range(MOST_REFINED):
+        left, missed = q + B @ change + multipliers @ A, A @ change - b
+        if _is_small(left, q) and _is_small(missed, b):
+            break
+        y = H @ left
+        if b.size:
+            try:
+                more = np.linalg.solve(S, missed - A @ y)
+            except np.linalg.LinAlgError:
+                return None
+            y = y + W @ more
+            multipliers = multipliers + more
+        change = change - y
+    if not (np.isfinite(change).all() and np.isfinite(multipliers).all()):
+        return None
+    unmet = np.abs(A @ change - b).max(initial=0.0) > DEPENDENT * (1.0 + np.abs(b).max(initial=0.0))
+    return None if unmet else (change, multipliers)
+
+
+def _is_small(left: Array, whole: Array) -> bool:
+    """Whether what is left of an equation is roundoff."""
+    return bool(np.abs(left).max(initial=0.0) <= REFINED * np.abs(whole).max(initial=0.0))
 
 
 @lru_cache(maxsize=8)
@@ -172,8 +211,12 @@ def eased(problem: Quadratic, active_rows: Array, active_bounds: Array, price: f
     curvature = np.zeros((n + 1, n + 1))
     curvature[:n, :n] = problem.curvature
     curvature[n, n] = price
+    inverse = np.zeros((n + 1, n + 1))
+    inverse[:n, :n] = problem.inverse
+    inverse[n, n] = 1.0 / price
     wide = Quadratic(
         curvature=curvature,
+        inverse=inverse,
         slope=np.append(problem.slope, price),
         rows=np.column_stack([problem.rows, need]),
         lower=problem.lower,

@@ -29,8 +29,12 @@ def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given
     return next(make_guesses(statement, mesh, parameters, guess))
 
 
-def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Iterator[Guess]:
+def make_guesses(
+    statement: Statement, mesh: Mesh, parameters: Array, guess: Given, *, linked: bool = False
+) -> Iterator[Guess]:
     """Guesses on a mesh from what the user gave, the best first; the others are made when they are asked for.
+
+    `linked`: to a phase before, so that costates count where it starts.
 
     Raises:
         ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess, or a solution
@@ -39,7 +43,7 @@ def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Giv
     if isinstance(guess, Trajectory):
         yield Guess(trajectory=guess)
     elif isinstance(guess, Solution):
-        yield _from_solution(statement, mesh, parameters, guess)
+        yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
         for trajectory in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
             yield Guess(trajectory=trajectory)
@@ -72,16 +76,16 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
     return replace(statement, guesses=guesses) if given else statement
 
 
-def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
+def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, linked: bool) -> Guess:
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
     _check_common(statement, solution)
     own = solution.mesh
     t, m = solution.trajectory, solution.multipliers
     blocks = (*statement.states, *statement.controls, *statement.matrices)
     others = {(b.name, b.kind, b.size): b for b in solution.blocks}
-    found = [others.get((b.name, b.kind, b.size)) for b in blocks]
+    there = [others.get((b.name, b.kind, b.size)) for b in blocks]
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
-    matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, found, strict=True))
+    matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, there, strict=True))
     nodes = np.array_equal(own.nodes, mesh.nodes) and np.array_equal(own.instants, mesh.instants)
     duration = solution.duration if statement.duration.free else statement.duration.guess
     if matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
@@ -91,7 +95,13 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     constraints = (statement.path.size, statement.start.size, statement.end.size)
     if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
         return Guess(trajectory=trajectory, warm=True)
-    costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    width = statement.nx + (0 if mesh.eliminated else statement.ne)
+    if nodes and own.segments == mesh.segments and m.gaps.shape == (len(mesh.segments), width) and not linked:
+        costates = np.zeros((mesh.nodes.size, statement.nx + statement.ne))  # read where segments meet and nowhere else
+        costates[list(mesh.starts[1:]), :width] = m.gaps
+    else:
+        found = np.hstack([solution.costates.state, solution.costates.matrices])
+        costates = interpolated(found, own.nodes, mesh.nodes)
     return Guess(
         trajectory=trajectory,
         multipliers=_multipliers(m, own, mesh),
