@@ -1,4 +1,4 @@
-"""Planning again as it is learnt
+"""Planning again while learning
 =============================
 
 A lag whose rate b is unknown is brought from 2 to 0, and b is to be known well. One plan for all 8 s rests on what was
