@@ -37,6 +37,8 @@ class ChainOutcome:
         message: how it ended, a sentence.
         violations: largest violation of each violated constraint by its name.
         stats: iterations, times, what the method counts.
+        given: whether the controls were given, and nothing was chosen: then nothing is prescribed where statements end,
+            and the multipliers contain nothing of what the later ones cost.
     """
 
     extremals: tuple[Extremal, ...]
@@ -47,6 +49,7 @@ class ChainOutcome:
     message: str
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
+    given: bool = False
 
     __repr__ = short_repr
 
@@ -123,13 +126,18 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         if result:
             later = result[-1]
             slopes = link_slopes(links[i], extremal, later)
+            m = extremal.multipliers
             if extremal.mesh.eliminated and st.matrices:
-                m = extremal.multipliers
-                through = replace(m, final_matrices=m.final_matrices + slopes.matrices)
-                extremal = replace(extremal, multipliers=through)
+                m = replace(m, final_matrices=m.final_matrices + slopes.matrices)
+            if outcome.given:
+                m = replace(m, final=m.final + slopes.state)
+            extremal = replace(extremal, multipliers=m)
+        costates = discrete_costates(extremal)[0]
         start = np.zeros(st.nx)
         if i:
-            start[list(links[i - 1].states)] = outcome.link_multipliers[i - 1]
+            states = list(links[i - 1].states)
+            by_x = slopes_at_start(extremal, costates)[0] if outcome.given else start
+            start[states] = -by_x[states] if outcome.given else outcome.link_multipliers[i - 1]
         others = outcome.cost - sum(outcome.cost_terms[i].values())
         within = Within(
             others=others,
@@ -139,7 +147,6 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
             end=slopes.state,
             end_matrices=slopes.matrices,
         )
-        costates = discrete_costates(extremal)[0]
         result.append(Passed(extremal=extremal, costates=costates, within=within, bounds=outcome.bounds_at_ends[i]))
     return tuple(result[::-1])
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
-from covocp.extremal.closed_loop import ClosedLoop, close_loop, design_statistics
+from covocp.extremal.closed_loop import ClosedLoop, Statistics, close_loop, design_statistics
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.mean_effect import MeanEffect, mean_effect
 from covocp.statement.chain import Link
@@ -34,18 +35,44 @@ class PhaseLoop:
     __repr__ = short_repr
 
 
-def phase_loops(extremals: Sequence[Extremal], links: Sequence[Link]) -> tuple[PhaseLoop, ...]:
-    """The loops of all phases along their extremals."""
-    first = design_statistics(extremals[0]).initial
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChainStatistics:
+    """What is truly uncertain in all phases.
+
+    phases: the statistics of each, of which the first initial covariance counts. links: what passes between them.
+    """
+
+    phases: tuple[Statistics, ...]
+    links: tuple[Link, ...]
+
+    __repr__ = short_repr
+
+
+def phase_loops(
+    extremals: Sequence[Extremal], links: Sequence[Link], truth: ChainStatistics | None = None
+) -> tuple[PhaseLoop, ...]:
+    """The loops of all phases along their extremals.
+
+    Args:
+        extremals: of the phases.
+        links: of the chain.
+        truth: the true statistics; None: the design's.
+    """
+    first = (design_statistics(extremals[0]) if truth is None else truth.phases[0]).initial
     start: Array = np.asarray(np.kron(np.diag([1.0, 0.0]), first), dtype=float)
     means: tuple[Array, Array] | None = (np.zeros(first.shape[0]), np.zeros(first.shape[0]))
     result: list[PhaseLoop] = []
     for k, extremal in enumerate(extremals):
-        loop = close_loop(extremal, start=start) if not k or result[-1].loop is not None else None
+        own = None if truth is None else truth.phases[k]
+        loop = close_loop(extremal, own, start) if not k or result[-1].loop is not None else None
         mean = mean_effect(extremal, loop, means) if loop is not None and means is not None else None
         result.append(PhaseLoop(loop=loop, start=start, handed=0.0, mean=mean))
         if k < len(links):
-            start, means = _passed(links[k], extremal, extremals[k + 1], result[-1])
+            after = extremals[k + 1]
+            added = _added(links[k], extremal, extremal.parameters, after.parameters)
+            if truth is not None:
+                added = _added(truth.links[k], extremal, *(own.parameters for own in truth.phases[k : k + 2]))
+            start, means = _passed(links[k], extremal, after, result[-1], added)
     fed = [_fed(extremal, entry.start) for extremal, entry in zip(extremals, result, strict=True)]
     after = [*fed[1:], 0.0]
     return tuple(
@@ -55,21 +82,29 @@ def phase_loops(extremals: Sequence[Extremal], links: Sequence[Link]) -> tuple[P
 
 
 def _passed(
-    link: Link, before: Extremal, after: Extremal, ended: PhaseLoop
+    link: Link, before: Extremal, after: Extremal, ended: PhaseLoop, added: Array
 ) -> tuple[Array, tuple[Array, Array] | None]:
-    """[E Z; Z' Xhat] behind a link, and the means of the deviations and of their estimate."""
+    """[E Z; Z' Xhat] behind a link that adds variances, and the means of the deviations and of their estimate."""
     size, t = len(after.statement.augmented), before.trajectory
     if ended.loop is None or link.deviations is None:
         return np.full((2 * size, 2 * size), np.nan), None
     X = ended.loop.X[-1]
     given = link.deviations(t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters, X)
-    J, added, bent = (np.asarray(value.full()) for value in given)
+    J, _, bent = (np.asarray(value.full()) for value in given)
     E, Z, Xhat = ended.loop.E[-1], ended.loop.Z[-1], ended.loop.Xhat[-1]
     crossed = J @ Z @ J.T
     start = np.block([[J @ E @ J.T + added, crossed], [crossed.T, J @ Xhat @ J.T]])
     if ended.mean is None:
         return start, None
     return start, (J @ ended.mean.mean[-1] + bent.ravel(), J @ ended.mean.estimate[-1])
+
+
+def _added(link: Link, before: Extremal, parameters: Array, later: Array) -> Array:
+    """Variances that a link adds at the end of an extremal, with these parameters of the statements at both sides."""
+    assert link.deviations is not None
+    size, t = link.deviations.size1_in(5), before.trajectory
+    given = link.deviations(t.x[-1], t.e[-1], t.duration, parameters, later, ca.DM.zeros(size, size))
+    return np.asarray(given[1].full())
 
 
 def _fed(extremal: Extremal, start: Array) -> float:

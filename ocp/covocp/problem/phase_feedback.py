@@ -24,7 +24,7 @@ from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain
 from covocp.problem.declarations import Declarations, Parameter
 from covocp.problem.expansion import slope_by
 from covocp.problem.expected_cost import FEEDBACK, check_random, derive
-from covocp.statement.statement import error_size
+from covocp.statement.statement import Statement, error_size
 
 # Name of the parameter of a phase that stands for S where the next one begins.
 WEIGHT = f"{FEEDBACK}(T)"
@@ -62,7 +62,7 @@ def with_feedback(phases: Sequence[Declarations], jumps: Sequence[Jumps]) -> lis
     return result
 
 
-def in_phase(phase: Declarations, error: ProblemError) -> ProblemError:
+def in_phase(phase: Declarations | Statement, error: ProblemError) -> ProblemError:
     """What is wrong with a phase, said with its name."""
     own = {name: getattr(error, name) for name in ("expected", "received", "remedy")}
     return ProblemError(f"In the phase '{phase.name}': {error.problem}", **own)

@@ -81,7 +81,8 @@ class PhasesSolution:
         converged: whether the method's own test was met.
         message: how the method ended.
         phases: their solutions in order.
-        link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p.
+        link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p; nan
+            along controls that were given, where p+ is had from the later phase alone.
         violations: of constraints, by name with that of the phase.
         stats: iterations, times, what the method counts.
         links: what passes from each phase to the next; none where it was read from a file without its phases.
@@ -223,6 +224,7 @@ class PhasesSolution:
         met = [
             [f"{one.name} to {two.name}", number(value, 3) + (" LARGE" if value > LARGE_LINK else "")]
             for one, two, value in pairs
+            if not np.isnan(value)
         ]
         columns = ["costates where phases meet: p against k_x + J' p+ (relative)", ""]
         links: Section = [Table(columns=columns, rows=met)] if met else []

@@ -8,25 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
 from covocp.base.checks import as_number, check_density, check_kind, column
 from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
+from covocp.base.later import later
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance, variances
-from covocp.extremal.extremal import Extremal
+from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.path_limits import NOTED
 from covocp.problem.builder import Problem
+from covocp.problem.phases import Phases
 from covocp.solution.chances import reached
 from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
-from covocp.solution.phases import check_whole
+from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.unused import mention_forgotten
@@ -41,44 +43,55 @@ from covocp.transcription.nlp import check_costs
 SAME = 1e-9
 
 
+@overload
+def evaluate(problem: Problem | Solution, **options: Any) -> Solution: ...
+
+
+@overload
+def evaluate(problem: Phases | PhasesSolution, **options: Any) -> PhasesSolution: ...
+
+
 @one_at_a_time
 def evaluate(
-    problem: Problem | Solution,
+    problem: Problem | Solution | Phases | PhasesSolution,
     *,
     nominal: Given = None,
     truth: Given = None,
-    intervals: int = 100,
+    intervals: Given = 100,
     parameters: Mapping[str, Any] | None = None,
     **options: Any,
-) -> Solution:
+) -> Solution | PhasesSolution:
     """Evaluate costs, covariances and gains along a given nominal, or a solution under other statistics.
 
     Args:
-        problem: the problem; or a solution, whose nominal and gains are kept.
+        problem: the problem, or phases; or a solution of either, whose nominal and gains are kept.
         nominal: the control: a solution (of any problem with controls and decisions of these names), or a dict of
             control to number, array over the nodes, or function of s = t/T, and of decision to value; None: the
             guesses of controls and decisions. The states follow; what else is free (initial states, the duration, a
-            constant gain) is taken from the solution, or as guessed.
+            constant gain) is taken from the solution, or as guessed. Of phases a `PhasesSolution`, or such a nominal
+            for each phase: a list, or a dict by name of the phase.
         truth: what the statistics really are, for a solution with an expected cost: a problem of the same symbols
-            (its variances and noise densities count), or a dict of parameter name to value.
-        intervals: number of control intervals, where the nominal is not a solution.
+            (its variances and noise densities count), or a dict of parameter name to value; of phases `Phases`, the
+            noise of whose jumps counts too, or such a dict.
+        intervals: number of control intervals, where the nominal is not a solution; of phases that of each, or a list
+            of one for each.
         parameters: values of parameters other than the declared ones, by name.
         options: of the mesh, as in `solve`.
 
     Returns:
-        A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`.
+        A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`. Of
+        phases a `PhasesSolution`.
 
     Raises:
         ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
+        SolveError: a phase becomes NaN or inf along the nominal.
     """
+    if isinstance(problem, (Solution, PhasesSolution)):
+        _check_kept(nominal, parameters, options)
+    if isinstance(problem, (Phases, PhasesSolution)):
+        run = {"nominal": nominal, "truth": truth, "intervals": intervals, "parameters": parameters}
+        return cast("PhasesSolution", later("solving.phases_evaluated").evaluate_phases(problem, **run, **options))
     if isinstance(problem, Solution):
-        if nominal is not None or options or parameters is not None:
-            raise ProblemError(
-                "evaluate(solution) keeps its nominal, mesh and parameters.",
-                expected="truth=... only",
-                received="nominal=, parameters= or options of the mesh",
-                remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
-            )
         solution = problem
     else:
         with evaluating(str(getattr(problem, "name", ""))):
@@ -89,6 +102,21 @@ def evaluate(
     return _under(solution, truth)
 
 
+def _check_kept(nominal: Given, parameters: Given, options: dict[str, Any]) -> None:
+    """A solution is evaluated as it is.
+
+    Raises:
+        ProblemError: something else is given for it.
+    """
+    if nominal is not None or options or parameters is not None:
+        raise ProblemError(
+            "evaluate(solution) keeps its nominal, mesh and parameters.",
+            expected="truth=... only",
+            received="nominal=, parameters= or options of the mesh",
+            remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
+        )
+
+
 def _along(
     problem: Problem, nominal: Given, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
 ) -> Solution:
@@ -97,28 +125,52 @@ def _along(
     st = problem.statement()
     mention_forgotten(problem)
     values = stacked_parameters(st, parameters)
-    given = Options(intervals=intervals, **_known(options))
-    if isinstance(nominal, Solution) and not options:
-        own = nominal.mesh
-        given = replace(given, grid=np.unique(own.nodes), control=own.control)  # type: ignore[arg-type]
-    given = graded(st, given, values)
-    mesh = evaluation_mesh(st, given, values)
-    u, duration = _controls(st, mesh, nominal, given.grading.get("intervals_asked", 0))
-    x0, e0 = starts(st, mesh, values)
-    x0, e0 = st.started(_started_like(st, nominal, x0, values), values, e0)
-    check_model(st, x0, u[:1].ravel(), e0, duration, values)
-    outcome = evaluate_controls(st, mesh, u, duration, values, x0)
+    given = graded(st, first_options(nominal, intervals, options), values)
+    outcome = run_along(st, nominal, given, values)
     own_steps = given.substeps == "auto"
     while own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, given)):
-        shorter = evaluate_controls(st, evaluation_mesh(st, finer, values), u, duration, values, x0)
+        shorter = run_along(st, nominal, finer, values)
         if not shorter.converged:
             break
         outcome, given = shorter, finer
     if outcome.converged:
         check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
     solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
-    if not solution.converged:
-        return solution
+    return told(solution) if solution.converged else solution
+
+
+def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> Options:
+    """The mesh that is asked for, or that of a nominal which is a solution."""
+    given = Options(intervals=intervals, **_known(options))
+    if isinstance(nominal, Solution) and not options:
+        own = nominal.mesh
+        given = replace(given, grid=np.unique(own.nodes), control=own.control)  # type: ignore[arg-type]
+    return given
+
+
+def run_along(
+    statement: Statement, nominal: Given, options: Options, parameters: Array, linked: Mapping[int, float] | None = None
+) -> Outcome:
+    """One run along a nominal.
+
+    Args:
+        statement: the problem.
+        nominal: as `evaluate` takes it.
+        options: of the mesh, graded.
+        parameters: of the statement.
+        linked: entries of the initial state that a phase before gives.
+    """
+    mesh = evaluation_mesh(statement, options, parameters)
+    u, duration = _controls(statement, mesh, nominal, options.grading.get("intervals_asked", 0))
+    x0, e0 = starts(statement, mesh, parameters)
+    given = _started_like(statement, nominal, x0, parameters, linked or {})
+    x0, e0 = statement.started(given, parameters, e0)
+    check_model(statement, x0, u[:1].ravel(), e0, duration, parameters)
+    return evaluate_controls(statement, mesh, u, duration, parameters, x0)
+
+
+def told(solution: Solution) -> Solution:
+    """A solution with the limits that it passes between the nodes; what the user must know about it is said."""
     mention_doubts(solution)
     return replace(solution, violations=_with_passed(solution))
 
@@ -133,33 +185,69 @@ def _with_passed(solution: Solution) -> dict[str, float]:
     return result
 
 
-def _started_like(statement: Statement, nominal: Given, x0: Array, parameters: Array) -> Array:
+def _started_like(
+    statement: Statement, nominal: Given, x0: Array, parameters: Array, linked: Mapping[int, float]
+) -> Array:
     """The initial state, with the decisions of the nominal and, of a solution, what else is free there.
 
     Raises:
-        ProblemError: the nominal does not give a decision: a guess is no choice.
+        ProblemError: the nominal does not give a decision: a guess is no choice; or another one than a phase before.
     """
-    result, known = x0.copy(), statement.boundary_values(parameters)[0]
-    gain = free_gain_block(statement)
+    result = x0.copy()
+    decisions = [block for block in statement.states if block.role == "decision"]
     if isinstance(nominal, Solution):
-        own = {block.name: block for block in nominal.blocks if block.kind == "state"}
-        for block in statement.states:
-            if block.name in own and own[block.name].size == block.size:
-                first = nominal.trajectory.x[0, own[block.name].span]
-                result[block.span] = np.where(np.isnan(known[block.span]), first, x0[block.span])
-            elif block == gain and nominal.loop is not None:
-                result[block.span] = gain_entries(statement, block, nominal, nominal.t / nominal.duration)[0]
-            elif block.role == "decision":
-                raise _not_given("decision", block.name, f"a solution of '{nominal.name}' without it")
-        return result
-    given = _by_name(statement, nominal) if nominal is not None else {}
-    for block in statement.states if nominal is not None else ():
-        if block.role != "decision" or (block == gain and block.name not in given):  # Gain(guess=) says what it is
-            continue
-        if block.name not in given:
-            raise _not_given("decision", block.name, ", ".join(given) or "nothing")
-        result[block.span] = column(block.name, "value", given[block.name], block.size)
+        _take_free(statement, nominal, result, parameters, linked)
+        decisions = [block for block in decisions if block.name in {own.name for own in nominal.blocks}]
+    elif nominal is not None:
+        given, gain = _by_name(statement, nominal), free_gain_block(statement)
+        for block in decisions:
+            if block.name in given:
+                result[block.span] = column(block.name, "value", given[block.name], block.size)
+            elif block != gain and block.span.start not in linked:  # Gain(guess=) says what it is
+                raise _not_given("decision", block.name, ", ".join(given) or "nothing")
+        decisions = [block for block in decisions if block.name in given]
+    for block in decisions if nominal is not None else ():
+        _check_goes_on(block.name, result, block.span, linked)
+    result[list(linked)] = list(linked.values())
     return result
+
+
+def _take_free(
+    statement: Statement, nominal: Solution, x: Array, parameters: Array, linked: Mapping[int, float]
+) -> None:
+    """Put what is free in an initial state as a solution has it.
+
+    Raises:
+        ProblemError: the solution has no value of a decision.
+    """
+    known = statement.boundary_values(parameters)[0]
+    gain = free_gain_block(statement)
+    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
+    for block in statement.states:
+        if block.name in own and own[block.name].size == block.size:
+            first = nominal.trajectory.x[0, own[block.name].span]
+            x[block.span] = np.where(np.isnan(known[block.span]), first, x[block.span])
+        elif block == gain and nominal.loop is not None:
+            x[block.span] = gain_entries(statement, block, nominal, nominal.t / nominal.duration)[0]
+        elif block.role == "decision" and block.span.start not in linked:
+            raise _not_given("decision", block.name, f"a solution of '{nominal.name}' without it")
+
+
+def _check_goes_on(name: str, values: Array, span: slice, linked: Mapping[int, float]) -> None:
+    """A decision that a phase before has is the same constant.
+
+    Raises:
+        ProblemError: the nominal has another value of it.
+    """
+    for entry in range(span.start, span.stop):
+        before = linked.get(entry, values[entry])
+        if abs(values[entry] - before) > SAME * abs(before):
+            raise ProblemError(
+                f"The nominal gives the decision '{name}' two values.",
+                expected="one value in all phases that have it",
+                received=f"{before:g} and {values[entry]:g}",
+                remedy=f"give '{name}' in the first phase that has it, and leave it out in the others",
+            )
 
 
 def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]:
@@ -273,7 +361,7 @@ def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
     elif isinstance(truth, Problem):
         other = truth.statement()
         values = other.values
-        _check_same(st, other)
+        check_same(st, other)
     else:
         raise ProblemError(
             "The truth is of an unknown kind.",
@@ -281,6 +369,15 @@ def true_statistics(extremal: Extremal, truth: Given) -> Statistics:
             received=repr(truth)[:100],
             remedy="correct truth=",
         )
+    return statistics_along(extremal, other, values)
+
+
+def statistics_along(extremal: Extremal, other: Statement, values: Array) -> Statistics:
+    """Initial covariance and noise densities of the statement of a truth, with these parameters.
+
+    Raises:
+        ProblemError: it is another system along the extremal, or has no expected cost, or what is no covariance.
+    """
     _check_system(extremal, other, values)
     block = next((b for b in other.matrices if b.estimation), None)
     if block is None or other.loop is None:
@@ -318,7 +415,7 @@ def _check_densities(extremal: Extremal, truth: Statistics) -> None:
             check_density("truth", what, matrices[worst], definite=False)
 
 
-def _check_same(design: Statement, truth: Statement) -> None:
+def check_same(design: Statement, truth: Statement) -> None:
     """The symbols of both must agree; the linear equations know one system only, so must the rates."""
 
     def signature(statement: Statement) -> list[tuple[str, str, int]]:

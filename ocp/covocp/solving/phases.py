@@ -37,6 +37,7 @@ from covocp.transcription.stiffness import resolve_mesh
 
 Arrays = tuple[Array, ...]
 INTERVALS = 100  # of each phase, where none are asked for
+TAKEN_BY = {"guess": "solve", "nominal": "evaluate"}
 
 
 def solve_phases(
@@ -88,16 +89,19 @@ def solve_phases(
         if name not in known and name not in own:
             raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ())
     mesh_options = {name: value for name, value in options.items() if name in known}
-    asked_options = tuple(Options(intervals=n, **mesh_options) for n in _intervals(chain, intervals))
-    guesses = _guess_of_each(chain, guess, asked_options)
-    values = _values(chain, {} if parameters is None else parameters)
+    asked_options = tuple(Options(intervals=n, **mesh_options) for n in intervals_of(chain, intervals))
+    guesses = of_each(chain, guess)
+    for asked, entry in zip(asked_options, guesses, strict=True):
+        if isinstance(entry, Mapping):
+            mention_lengths({str(key): value for key, value in entry.items()}, asked)
+    values = values_of(chain, {} if parameters is None else parameters)
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         run = _Run(chain, prepare, {k: v for k, v in options.items() if k in own}, reporter)
         outcome = run.solve(asked_options, values, guesses)
         if reporter.stop:
             message = "Interrupted. On this error (.solution): the last iterate."
-            raise Interrupted(message, solution=_solution(chain, outcome, method))  # type: ignore[arg-type]
-        solution = _solution(chain, outcome, method)
+            raise Interrupted(message, solution=phases_solution(chain, outcome, method))  # type: ignore[arg-type]
+        solution = phases_solution(chain, outcome, method)
     return _finished(solution, allow_failure)
 
 
@@ -124,7 +128,7 @@ def _method_options(prepare: Any) -> tuple[str, ...]:
     return tuple(n for n, p in inspect.signature(prepare).parameters.items() if p.kind is p.KEYWORD_ONLY)
 
 
-def _intervals(chain: Chain, intervals: Given) -> list[int]:
+def intervals_of(chain: Chain, intervals: Given) -> list[int]:
     """Number of control intervals of each phase; one number is that of each."""
     count = len(chain.statements)
     intervals = INTERVALS if intervals is None else intervals
@@ -139,8 +143,12 @@ def _intervals(chain: Chain, intervals: Given) -> list[int]:
     return [int(n) for n in listed]
 
 
-def _guess_of_each(chain: Chain, guess: Given, options: tuple[Options, ...]) -> list[Any]:
-    """The guess of each phase."""
+def of_each(chain: Chain, guess: Given, what: str = "guess") -> list[Any]:
+    """The guess of each phase, or the nominal; None where there is none.
+
+    Raises:
+        ProblemError: it does not fit the phases.
+    """
     names = [st.name for st in chain.statements]
     if guess is None:
         return [None] * len(names)
@@ -153,19 +161,16 @@ def _guess_of_each(chain: Chain, guess: Given, options: tuple[Options, ...]) -> 
         listed = list(guess) if isinstance(guess, (PhasesSolution, list, tuple)) else []
     if len(listed) != len(names):
         raise ProblemError(
-            "The guess does not fit the phases.",
-            expected=f"None, a PhasesSolution of {len(names)} phases, a list of {len(names)} guesses, or a dict by "
+            f"The {what} does not fit the phases.",
+            expected=f"None, a PhasesSolution of {len(names)} phases, a list of {len(names)} entries, or a dict by "
             "name of the phase: " + ", ".join(names),
             received=repr(guess)[:100],
-            remedy="correct guess=; the guess of a phase is what solve() takes for one problem",
+            remedy=f"correct {what}=; that of a phase is what {TAKEN_BY[what]}() takes for one problem",
         )
-    for own, entry in zip(options, listed, strict=True):
-        if isinstance(entry, Mapping):
-            mention_lengths({str(key): value for key, value in entry.items()}, own)
     return listed
 
 
-def _values(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
+def values_of(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
     """Parameters of each statement; a name counts in all that have it."""
     carried = [{b.name for b in st.matrices} for st in chain.statements]
     own = [
@@ -294,8 +299,8 @@ class _Run:
         return tuple(found), tuple(filled), tuple(fine)
 
 
-def _solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolution:
-    """An outcome as solutions of the phases."""
+def phases_solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolution:
+    """An outcome as solutions of the phases; link residuals are nan where nothing was chosen."""
     loops: tuple[PhaseLoop | None, ...] = (None,) * len(outcome.extremals)
     if chain.statements[0].loop is not None:
         loops = phase_loops(outcome.extremals, chain.links)
@@ -324,7 +329,7 @@ def _solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolutio
         phases.append(Solution.of(single, method, within, closed))
     residuals = (
         ()
-        if passed is None
+        if passed is None or outcome.given
         else tuple(link_residual(passed[i], passed[i + 1], link) for i, link in enumerate(chain.links))
     )
     return PhasesSolution(
