@@ -161,7 +161,7 @@ def test_options_that_mean_nothing_to_phases_are_refused(options: dict[str, Any]
 def test_what_takes_one_problem_says_so() -> None:
     phases = co.Phases([first(), part()])
     solution = co.solve(phases, intervals=2, progress=False)
-    for function in (co.Solver, co.evaluate, co.worth, co.certify):
+    for function in (co.Solver, co.worth, co.certify):
         for given in (phases, solution):
             with pytest.raises(co.ProblemError, match="phase"):
                 function(given)

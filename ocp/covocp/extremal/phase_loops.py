@@ -68,11 +68,11 @@ def phase_loops(
         mean = mean_effect(extremal, loop, means) if loop is not None and means is not None else None
         result.append(PhaseLoop(loop=loop, start=start, handed=0.0, mean=mean))
         if k < len(links):
-            after = extremals[k + 1]
-            added = _added(links[k], extremal, extremal.parameters, after.parameters)
+            behind = extremals[k + 1]
+            added = _added(links[k], extremal, extremal.parameters, behind.parameters)
             if truth is not None:
                 added = _added(truth.links[k], extremal, *(own.parameters for own in truth.phases[k : k + 2]))
-            start, means = _passed(links[k], extremal, after, result[-1], added)
+            start, means = _passed(links[k], extremal, behind, result[-1], added)
     fed = [_fed(extremal, entry.start) for extremal, entry in zip(extremals, result, strict=True)]
     after = [*fed[1:], 0.0]
     return tuple(

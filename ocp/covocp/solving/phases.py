@@ -91,9 +91,9 @@ def solve_phases(
     mesh_options = {name: value for name, value in options.items() if name in known}
     asked_options = tuple(Options(intervals=n, **mesh_options) for n in intervals_of(chain, intervals))
     guesses = of_each(chain, guess)
-    for asked, entry in zip(asked_options, guesses, strict=True):
+    for mesh_of_phase, entry in zip(asked_options, guesses, strict=True):
         if isinstance(entry, Mapping):
-            mention_lengths({str(key): value for key, value in entry.items()}, asked)
+            mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase)
     values = values_of(chain, {} if parameters is None else parameters)
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         run = _Run(chain, prepare, {k: v for k, v in options.items() if k in own}, reporter)
