@@ -168,7 +168,7 @@ def test_what_takes_one_problem_says_so() -> None:
     with pytest.raises(co.ProblemError, match="phase"):
         co.compare(solution)
     with pytest.raises(co.ExportError, match="phase"):
-        co.export_c(solution, "nowhere")
+        co.export_c(phases, "nowhere")
     with pytest.raises(co.ProblemError, match="one of several phases"):
         co.certify(solution["first"])
     with pytest.raises(co.ProblemError, match="There is no phase 'third'"):

@@ -27,6 +27,7 @@ from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
 from covocp.export.laws.limits import warn_outside
+from covocp.export.laws.phases import phase_laws
 from covocp.export.laws.sampled import discretised, sampled_law
 from covocp.export.laws.solver import solver_law
 from covocp.export.laws.spread import LARGEST_SPREAD, check_flight, sampled_flight
@@ -40,7 +41,7 @@ from covocp.export.text.self_test import self_test
 from covocp.export.text.source import source
 from covocp.problem.builder import Problem
 from covocp.solution.flight import interpolated_flight
-from covocp.solution.phases import check_begins
+from covocp.solution.phases import PhasesSolution, check_begins
 from covocp.solution.solution import Solution
 
 PRECISIONS = {"double": "double", "single": "float"}
@@ -88,11 +89,12 @@ def export_c(
     """Write C sources of a solution, of functions or of a solver.
 
     An open-loop solution becomes `sample(time)`; one with feedback also a controller, `init` and
-    `step(measurement, time)` -> control; functions themselves; a problem a solver for re-planning,
+    `step(measurement, time)` -> control; one of phases `sample(time)`, which finds the phase, and `sample_<phase>` of
+    each; functions themselves; a problem a solver for re-planning,
     `solve(initial state, parameters, ...)` -> plan.
 
     Args:
-        what: a `Solution`, a `casadi.Function`, a list of them, or a `Problem`.
+        what: a `Solution`, a `PhasesSolution`, a `casadi.Function`, a list of them, or a `Problem`.
         directory: folder to make; its parent must exist.
         name: of the package, an identifier in C; None: from the directory.
         precision: "double" or "single".
@@ -103,7 +105,8 @@ def export_c(
         limits: of the control that a controller gives out: None (not limited, not even to the bounds of the problem),
             "bounds" (those of the problem), or a dict of control to (lower, upper). A nominal control outside of them
             is a warning.
-        feedback: whether a solution with feedback is exported as a controller; False: its histories only.
+        feedback: whether a solution with feedback is exported as a controller; False: its histories only, which is all
+            that there is of phases.
         largest_spread: of a controller: the largest factor between the standard deviations of the loop as it flies with
             these gains (interpolated between the nodes, or held over a period) and those that the solution predicts;
             where it is more, nothing is exported. float("inf"): whatever it is.
@@ -135,6 +138,9 @@ def export_c(
         if not isinstance(largest_spread, (int, float)) or isinstance(largest_spread, bool) or not largest_spread >= 1:
             raise _wrong_number("largest_spread", "a number >= 1, or inf", largest_spread)
         content = _solution(what, precision, allowed, period, limits, feedback, largest_spread)
+    elif isinstance(what, PhasesSolution):
+        _check_options("a solution of phases", {**given, **options}, ("feedback",))
+        content = _phases(what, precision, allowed, feedback)
     elif isinstance(what, Problem):
         _check_options("a problem", given, ("method",))
         content = _problem(what, precision, method, options, tolerance)
@@ -242,6 +248,21 @@ def _solution(
             remedy="leave them out",
         )
     return Content(laws=tuple(laws), title=f"{solution.name or 'Solution'}: {', '.join(law.name for law in laws)}.")
+
+
+def _phases(solution: PhasesSolution, precision: str, tolerance: float, feedback: bool) -> Content:
+    """The histories of all phases."""
+    if feedback and any(phase.loop is not None for phase in solution):
+        raise ExportError(
+            "A controller that flies through several phases has no C code.",
+            expected="feedback=False: the histories of all phases",
+            received=f"the solution of the phases '{solution.name}', with feedback",
+            remedy="add feedback=False; the controller of the first phase is that of solution[0]",
+        )
+    if not solution.converged:
+        warn_user(f"The solution that is exported did not converge: {solution.message}.")
+    laws = phase_laws(solution, precision, tolerance)
+    return Content(laws=laws, title=f"{solution.name or 'Phases'}: {', '.join(law.name for law in laws)}.")
 
 
 def _problem(

@@ -21,7 +21,6 @@ from covocp.export.laws.law import CODES, STATUSES, Law, Port, span, stacked_siz
 from covocp.export.text.header import struct_name
 
 NAMES = tuple(STATUSES)
-WHOLE = ("status", "index")  # fields of a struct that are int in C
 
 
 class Backend(Protocol):
@@ -151,7 +150,7 @@ class Library:
         """A struct of a law as ctypes has it, and its fields as flat arrays in the same memory."""
 
         def kind(port: Port) -> Any:
-            if port.name in WHOLE:
+            if port.whole:
                 return ctypes.c_int
             if port.scalar:
                 return self._real

@@ -163,7 +163,9 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     for name in fields:
         rows, columns = shapes.get(name, (1, 1))
         unit, listed = units.get(name, ""), entries.get(name, ())
-        ports.append(Port(name=name, rows=rows, columns=columns, unit=unit, about=about[name], entries=listed))
+        whole = name in ("index", "status")
+        port = Port(name=name, rows=rows, columns=columns, unit=unit, about=about[name], entries=listed, whole=whole)
+        ports.append(port)
     return tuple(ports)
 
 

@@ -91,14 +91,7 @@ class History:
 
     def clock(self, time: Expr, fallback: Expr = 0.0) -> Clock:
         """A time made safe; one that is not finite becomes `fallback`."""
-        finite = ca.fabs(time) <= LARGEST
-        known = ca.if_else(finite, time, fallback)
-        inside = ca.fmin(ca.fmax(known, 0.0), self.duration)
-        slack = self.margin * self.duration
-        before, after = known < -slack, known > self.duration + slack
-        within = ca.if_else(ca.logic_or(before, after), 0.0, finite)
-        conditions = [(ca.logic_not(finite), "TIME_NOT_FINITE"), (before, "TIME_BEFORE"), (after, "TIME_AFTER")]
-        return Clock(time=inside, within=within, conditions=conditions)
+        return clock(time, self.duration, self.margin, fallback)
 
     def at(self, time: Expr) -> Nominal:
         """The nominal at a time within [0, T], an MX expression."""
@@ -134,6 +127,25 @@ class History:
         values = ca.Function("nominal", [time], [now.x, now.u, now.e]).map(t.size)(t[None, :])
         x, u, e = (np.asarray(v.full()).T for v in values)
         return x, u, e
+
+
+def clock(time: Expr, duration: float, margin: float, fallback: Expr = 0.0) -> Clock:
+    """A time made safe.
+
+    Args:
+        time: that is asked for [s], an expression.
+        duration: the last time that there is [s].
+        margin: share of it by which a time outside counts as inside.
+        fallback: in the place of a time that is not finite.
+    """
+    finite = ca.fabs(time) <= LARGEST
+    known = ca.if_else(finite, time, fallback)
+    inside = ca.fmin(ca.fmax(known, 0.0), duration)
+    slack = margin * duration
+    before, after = known < -slack, known > duration + slack
+    within = ca.if_else(ca.logic_or(before, after), 0.0, finite)
+    conditions = [(ca.logic_not(finite), "TIME_NOT_FINITE"), (before, "TIME_BEFORE"), (after, "TIME_AFTER")]
+    return Clock(time=inside, within=within, conditions=conditions)
 
 
 def history(solution: Solution, precision: str) -> History:

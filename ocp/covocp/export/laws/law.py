@@ -52,6 +52,7 @@ class Port:
         unit: in words, for the comments.
         about: what it is, a line.
         entries: names of the rows of a vector.
+        whole: whether a number is an int in a struct.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Port:
     unit: str = ""
     about: str = ""
     entries: tuple[str, ...] = ()
+    whole: bool = False
 
     @property
     def size(self) -> int:

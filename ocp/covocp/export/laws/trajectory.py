@@ -9,23 +9,26 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack_symbolic
-from covocp.export.laws.history import History, time_status
+from covocp.export.laws.history import History, Nominal, time_status
 from covocp.export.laws.law import Law, Port, flat
 from covocp.export.text.names import identifier
 from covocp.solution.solution import Solution
 from covocp.statement.statement import Block
 
+# What a sample may return.
+STATUSES = ("OK", "TIME_BEFORE", "TIME_AFTER", "TIME_NOT_FINITE", "FAILED")
 # Share of the duration by which the points of the comparison reach beyond it.
 BEYOND = 0.1
 
 
-def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
+def sample_law(solution: Solution, tables: History, tolerance: float, part: str = "") -> Law:
     """The law (time) -> states, controls, matrices (whole, not as half-vectors), status.
 
     Args:
         solution: where the names come from.
         tables: its nominal.
         tolerance: largest relative deviation.
+        part: of what the solution is a part, its name in C; "": of nothing.
     """
     time = ca.MX.sym("time")
     clock = tables.clock(time)
@@ -35,14 +38,13 @@ def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
         [Port(name="time", unit="s", about="of the values: the one asked for, within the range")],
         [clock.time],
     )
-    for block in solution.blocks:
-        if block.kind in ("state", "control", "matrix"):
-            ports.append(block_port(block, taken))
-            values.append(flat(_value(block, nominal)))
-    ports.append(Port(name="status", about="as returned"))
+    for block, value in named_values(solution, nominal):
+        ports.append(block_port(block, taken))
+        values.append(value)
+    ports.append(Port(name="status", about="as returned", whole=True))
     core = ca.Function("sample", [time], [*values, time_status(clock)])
     return Law(
-        name="sample",
+        name=f"sample_{part}" if part else "sample",
         kind="sample",
         about=(
             "Nominal at a time: states and matrices by cubic Hermite polynomials between the nodes, and between more "
@@ -52,11 +54,17 @@ def sample_law(solution: Solution, tables: History, tolerance: float) -> Law:
         core=core,
         inputs=(Port(name="time", unit="s"),),
         outputs=tuple(ports),
-        constants={"DURATION [s]": tables.duration},
-        statuses=("OK", "TIME_BEFORE", "TIME_AFTER", "TIME_NOT_FINITE", "FAILED"),
+        constants={f"{part}_DURATION [s]" if part else "DURATION [s]": tables.duration},
+        statuses=STATUSES,
         points=lambda random, count: times(tables, random, count)[:, None],
         tolerance=tolerance,
     )
+
+
+def named_values(solution: Solution, nominal: Nominal) -> list[tuple[Block, Any]]:
+    """The symbols of a solution that change, each with its flat column at some time."""
+    known = [block for block in solution.blocks if block.kind in ("state", "control", "matrix")]
+    return [(block, flat(_value(block, nominal))) for block in known]
 
 
 def block_port(block: Block, taken: set[str]) -> Port:

@@ -10,8 +10,9 @@ STRUCTS = {"sample": "point", "controller": "controller", "solver": "workspace"}
 
 
 def struct_name(package: str, law: Law) -> str:
-    """The type that a law fills, keeps or works in."""
-    return f"{package}_{STRUCTS[law.kind]}"
+    """The type that a law fills, keeps or works in; of the sample of a part, `sample_<part>`, that of the part."""
+    part = law.name.removeprefix("sample_") + "_" if law.kind == "sample" and law.name != "sample" else ""
+    return f"{package}_{part}{STRUCTS[law.kind]}"
 
 
 def header(package: str, title: tuple[str, ...], laws: tuple[Law, ...], generated: Generated, real: str) -> str:
@@ -123,7 +124,7 @@ def _fields(package: str, law: Law) -> str:
     """The struct of a sample or a controller."""
     names, lines = size_names(package, law), []
     for port in law.outputs:
-        kind = "int" if port.name in ("status", "index") else f"{package}_real"
+        kind = "int" if port.whole else f"{package}_real"
         dimensions = "".join(f"[{name}]" for name in names.get(port.name, ()))
         about = described(port).replace(", row by row", "")
         lines.append(f"    {kind} {port.name}{dimensions};" + (f" /* {_plain(about)} */" if about else ""))

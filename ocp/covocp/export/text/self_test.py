@@ -233,7 +233,8 @@ def _call(package: str, law: Law) -> str:
                 offset = span(law.inputs, port.name).start
                 kept = law.held[port.name]
                 if port.scalar:
-                    lines.append(f"self.{kept} = {'(int)' if kept == 'index' else ''}in[{offset}];")
+                    whole = any(own.name == kept and own.whole for own in law.outputs)
+                    lines.append(f"self.{kept} = {'(int)' if whole else ''}in[{offset}];")
                 else:
                     lines.append(f"memcpy(self.{kept}, in + {offset}, sizeof(self.{kept}));")
         lines.append(f"status = {function}({', '.join(['&self', *arguments, 'control'])});")

@@ -87,11 +87,17 @@ def _function(package: str, law: Law, sizes: Sizes) -> str:
 def _sample(package: str, law: Law, sizes: Sizes) -> str:
     """A time in, a struct out."""
     lines = [*_work(package, sizes), f"{package}_real status_;"]
+    whole = [port.name for port in law.results if port.whole]
+    lines += [f"{package}_real {name}_whole_;" for name in whole]
     lines += [f"arg_[{i}] = {_address(port)};" for i, port in enumerate(law.inputs)]
-    lines += [f"res_[{i}] = {_address(port, 'point->')};" for i, port in enumerate(law.results)]
+    lines += [
+        f"res_[{i}] = " + (f"&{port.name}_whole_;" if port.whole else f"{_address(port, 'point->')};")
+        for i, port in enumerate(law.results)
+    ]
     lines += [f"res_[{len(law.results)}] = &status_;"]
     failed = code(package, "FAILED")
     lines += [f"if ({_called(package, law)}) {{", f"    point->status = {failed};", f"    return {failed};", "}"]
+    lines += [f"point->{name} = (int){name}_whole_;" for name in whole]
     lines += ["point->status = (int)status_;", "return point->status;"]
     return f"{signature(package, law)}\n{{\n{_body(lines)}\n}}"
 
@@ -99,7 +105,7 @@ def _sample(package: str, law: Law, sizes: Sizes) -> str:
 def _controller(package: str, law: Law, sizes: Sizes) -> str:
     """The struct before a step in, the one after it out."""
     kind = struct_name(package, law)
-    whole = {port.name for port in law.outputs if port.name == "index"}
+    whole = {port.name for port in law.results if port.whole}
     lines = [f"{kind} next_;", *_work(package, sizes), f"{package}_real status_;"]
     lines += [f"{package}_real {name}_before_, {name}_after_;" for name in sorted(whole)]
     lines.append("do {")
@@ -133,7 +139,7 @@ def _initial(law: Law) -> str:
     fields = []
     for port in law.outputs:
         values = law.start[span(law.outputs, port.name)]
-        if port.name in ("status", "index"):
+        if port.whole:
             fields.append(str(int(values[0])))
         elif port.scalar:
             fields.append(row(values)[1:-1])
