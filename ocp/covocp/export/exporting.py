@@ -26,8 +26,9 @@ from covocp.export.laws.design import design_of
 from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
-from covocp.export.laws.limits import warn_outside
-from covocp.export.laws.phases import phase_laws
+from covocp.export.laws.limits import limits_of_each, warn_outside
+from covocp.export.laws.phase_controller import legs_of, phases_controller
+from covocp.export.laws.phases import histories
 from covocp.export.laws.sampled import discretised, sampled_law
 from covocp.export.laws.solver import solver_law
 from covocp.export.laws.spread import LARGEST_SPREAD, check_flight, sampled_flight
@@ -135,12 +136,12 @@ def export_c(
     }
     if isinstance(what, Solution):
         _check_options("a solution", {**given, **options}, ("period", "limits", "feedback", "largest_spread"))
-        if not isinstance(largest_spread, (int, float)) or isinstance(largest_spread, bool) or not largest_spread >= 1:
-            raise _wrong_number("largest_spread", "a number >= 1, or inf", largest_spread)
+        _check_spread(largest_spread)
         content = _solution(what, precision, allowed, period, limits, feedback, largest_spread)
     elif isinstance(what, PhasesSolution):
-        _check_options("a solution of phases", {**given, **options}, ("feedback",))
-        content = _phases(what, precision, allowed, feedback)
+        _check_options("a solution of phases", {**given, **options}, ("limits", "feedback", "largest_spread"))
+        _check_spread(largest_spread)
+        content = _phases(what, precision, allowed, limits, feedback, largest_spread)
     elif isinstance(what, Problem):
         _check_options("a problem", given, ("method",))
         content = _problem(what, precision, method, options, tolerance)
@@ -241,28 +242,51 @@ def _solution(
             check_flight(sampled_flight(solution, samples), largest_spread, period)
             laws.append(sampled_law(design, tables, samples, tolerance))
     elif period is not None or limits is not None:
-        raise ExportError(
-            "period= and limits= are those of a controller.",
-            expected="a solution of a problem with minimize_expected()",
-            received=f"'{solution.name}'" + ("" if feedback else " with feedback=False") + ": no controller is made",
-            remedy="leave them out",
-        )
+        raise _no_controller("period= and limits= are", solution.name, feedback)
     return Content(laws=tuple(laws), title=f"{solution.name or 'Solution'}: {', '.join(law.name for law in laws)}.")
 
 
-def _phases(solution: PhasesSolution, precision: str, tolerance: float, feedback: bool) -> Content:
-    """The histories of all phases."""
-    if feedback and any(phase.loop is not None for phase in solution):
-        raise ExportError(
-            "A controller that flies through several phases has no C code.",
-            expected="feedback=False: the histories of all phases",
-            received=f"the solution of the phases '{solution.name}', with feedback",
-            remedy="add feedback=False; the controller of the first phase is that of solution[0]",
-        )
+def _phases(
+    solution: PhasesSolution,
+    precision: str,
+    tolerance: float,
+    limits: Given,
+    feedback: bool,
+    largest_spread: float,
+) -> Content:
+    """The histories of all phases, and the controller that flies through them where they have feedback."""
     if not solution.converged:
         warn_user(f"The solution that is exported did not converge: {solution.message}.")
-    laws = phase_laws(solution, precision, tolerance)
-    return Content(laws=laws, title=f"{solution.name or 'Phases'}: {', '.join(law.name for law in laws)}.")
+    found = histories(solution, precision, tolerance)
+    laws = list(found.laws)
+    if feedback and any(phase.loop is not None for phase in solution):
+        if len(solution.links) != len(solution) - 1:
+            raise ExportError(
+                "The controller of these phases cannot be exported: the solution does not know them.",
+                expected="a solution with its phases",
+                received=f"'{solution.name}', read from a file",
+                remedy="load(path, phases) with the phases that were solved",
+            )
+        designs = [design_of(phase, own) for phase, own in zip(solution, limits_of_each(solution, limits), strict=True)]
+        for phase, design, own in zip(solution, designs, found.tables, strict=True):
+            warn_outside(design.statement, design.limits, own)
+            check_flight(interpolated_flight(phase), largest_spread, None)
+        legs = legs_of(solution, designs, found.tables, found.parts, found.starts)
+        laws.append(phases_controller(legs, solution.duration, found.tables[0].margin, tolerance))
+    elif limits is not None:
+        raise _no_controller("limits= are", solution.name, feedback)
+    title = f"{solution.name or 'Phases'}: {', '.join(law.name for law in laws)}."
+    return Content(laws=tuple(laws), title=title)
+
+
+def _no_controller(what: str, name: str, feedback: bool) -> ExportError:
+    """The error for options of a controller where none is made."""
+    return ExportError(
+        f"{what} those of a controller.",
+        expected="a solution of a problem with minimize_expected()",
+        received=f"'{name}'" + ("" if feedback else " with feedback=False") + ": no controller is made",
+        remedy="leave them out",
+    )
 
 
 def _problem(
@@ -315,6 +339,11 @@ def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) 
     for name, value in given.items():
         if value is not None and name not in known:
             raise no_export_option(what, name, value, allowed)
+
+
+def _check_spread(value: Given) -> None:
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not value >= 1:
+        raise _wrong_number("largest_spread", "a number >= 1, or inf", value)
 
 
 def _check_choice(name: str, value: Given, choices: tuple[str, ...]) -> None:

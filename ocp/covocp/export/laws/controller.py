@@ -17,7 +17,7 @@ instant has its variance in place of U/h.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -64,32 +64,12 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     clock = tables.clock(time, last)
     backwards = clock.time < last
     valid = ca.if_else(backwards, 0.0, clock.within)
-    h = ca.if_else(valid, clock.time - last, 0.0)
-    middle = [last + c * h for c in GAUSS_NODES]
-    before = design.error(tables.at(last).e)
-    predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
-    now = tables.at(clock.time)
-    due = design.due(clock.time, tables.margin * tables.duration)
-    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h, due), now, clock.time)
-    feedback = C @ corrected
-    good = finite(corrected, feedback)
-    estimate = ca.if_else(good, corrected, y)
-    nominal = now.u[:m]
-    moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
+    found = stepped(design, tables, (y, last, held, measured), clock.time, valid)
     conditions = [
-        *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
-        (missing, "MEASUREMENT_MISSING"),
+        *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(found.good), "ESTIMATE_LOST"),
+        (found.missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
-    fields = {
-        "time": ca.if_else(valid, clock.time, last),
-        "estimate": estimate,
-        "control": clipped(moved, design.limits),
-        "nominal_state": now.x,
-        "nominal_control": nominal,
-        "feedback_gain": C,
-        "filter_gain": L,
-        "status": status_of(conditions),
-    }
+    fields = {"time": ca.if_else(valid, clock.time, last), **found.fields, "status": status_of(conditions)}
     inputs = [y, last, held, measured, time]
     core = ca.Function("step", inputs, [flat(v) for v in fields.values()])
     return Law(
@@ -107,6 +87,48 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
         points=lambda random, count: points(design, tables, random, count),
         tolerance=tolerance,
     )
+
+
+class Stepped(NamedTuple):
+    """What a step makes: fields of the struct by name, whether the estimate may be used, whether a row is missing."""
+
+    fields: dict[str, Any]
+    good: Any
+    missing: Any
+
+
+def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr, valid: Expr) -> Stepped:
+    """One step to a time.
+
+    Args:
+        design: the model.
+        tables: the nominal.
+        given: estimate, time of the last step, control held since, measurement.
+        time: within the range, no earlier than the last one [s].
+        valid: where it is zero nothing is predicted, counted and fed back.
+    """
+    y, last, held, measured = given
+    m = design.sizes[1]
+    h = ca.if_else(valid, time - last, 0.0)
+    middle = [last + c * h for c in GAUSS_NODES]
+    before = design.error(tables.at(last).e)
+    predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
+    now = tables.at(time)
+    due = design.due(time, tables.margin * tables.duration)
+    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h, due), now, time)
+    feedback = C @ corrected
+    good = finite(corrected, feedback)
+    nominal = now.u[:m]
+    moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
+    fields = {
+        "estimate": ca.if_else(good, corrected, y),
+        "control": clipped(moved, design.limits),
+        "nominal_state": now.x,
+        "nominal_control": nominal,
+        "feedback_gain": C,
+        "filter_gain": L,
+    }
+    return Stepped(fields=fields, good=good, missing=missing)
 
 
 def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
-from covocp.export.laws.history import MARGINS, History, clock, history, time_status
+from covocp.base.short_repr import short_repr
+from covocp.export.laws.history import History, clock, history, time_status
 from covocp.export.laws.law import Law, Port
 from covocp.export.laws.trajectory import BEYOND, STATUSES, block_port, named_values, sample_law
 from covocp.export.text.names import identifier
@@ -22,8 +24,20 @@ ABOUT = (
 )
 
 
-def phase_laws(solution: PhasesSolution, precision: str, tolerance: float) -> tuple[Law, ...]:
-    """The law of all phases, `sample`, and of each, `sample_<phase>`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Histories:
+    """Tables of all phases, their names in C, when they begin [s], and their laws: `sample`, `sample_<phase>`."""
+
+    tables: list[History]
+    parts: list[str]
+    starts: Array
+    laws: tuple[Law, ...]
+
+    __repr__ = short_repr
+
+
+def histories(solution: PhasesSolution, precision: str, tolerance: float) -> Histories:
+    """The tables and laws of all phases.
 
     Args:
         solution: of the phases.
@@ -36,16 +50,17 @@ def phase_laws(solution: PhasesSolution, precision: str, tolerance: float) -> tu
     tables = [history(phase, precision) for phase in solution]
     taken: set[str] = set()
     parts = [identifier(phase.name, taken, "phase") for phase in solution]
+    starts = _starts(solution, precision)
     entries = zip(solution, tables, parts, strict=True)
     each = [sample_law(phase, own, tolerance, part) for phase, own, part in entries]
-    return (_whole(solution, tables, parts, precision, tolerance), *each)
+    whole = _whole(solution, tables, parts, starts, tolerance)
+    return Histories(tables=tables, parts=parts, starts=starts, laws=(whole, *each))
 
 
-def _whole(solution: PhasesSolution, tables: list[History], parts: list[str], precision: str, tolerance: float) -> Law:
+def _whole(solution: PhasesSolution, tables: list[History], parts: list[str], starts: Array, tolerance: float) -> Law:
     """The law (time) -> phase, time in it, what it has, status."""
-    starts = _starts(solution, precision)
     time, own = ca.MX.sym("time"), ca.MX.sym("own")
-    now = clock(time, solution.duration, MARGINS[precision])
+    now = clock(time, solution.duration, tables[0].margin)
     number = sum((now.time >= float(start) for start in starts[1:]), ca.MX(0))
     begun = ca.MX(ca.DM(starts))[number]
     shared = _shared(solution)

@@ -107,7 +107,8 @@ def _controller(package: str, law: Law, sizes: Sizes) -> str:
     kind = struct_name(package, law)
     whole = {port.name for port in law.results if port.whole}
     lines = [f"{kind} next_;", *_work(package, sizes), f"{package}_real status_;"]
-    lines += [f"{package}_real {name}_before_, {name}_after_;" for name in sorted(whole)]
+    lines += [f"{package}_real {name}_after_;" for name in sorted(whole)]
+    lines += [f"{package}_real {name}_before_;" for name in sorted(whole & set(law.held.values()))]
     lines.append("do {")
     inner = []
     ports = {port.name: port for port in law.outputs}
