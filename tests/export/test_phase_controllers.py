@@ -1,0 +1,250 @@
+"""The controller that flies through phases: against that of the whole, independent integrations and flights."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import phased_loops
+import pytest
+from exports import FOLDER, STRICT
+from scipy.integrate import solve_ivp
+
+import covocp as co
+from covocp.export import CPackage, export_c
+
+pytestmark = pytest.mark.needs_cc
+QUIET: dict[str, Any] = {"progress": False}
+PUSHES: list[dict[str, Any]] = [{"u": lambda s: 0.3 - 0.2 * s}, {"w": lambda s: 0.2 + 0.5 * s}]
+
+
+@cache
+def bounced() -> co.PhasesSolution:
+    return co.evaluate(phased_loops.bounce(free=False), nominal=PUSHES, intervals=40)
+
+
+@cache
+def package() -> CPackage:
+    made = export_c(bounced(), FOLDER / "bouncing")
+    made.build(flags=STRICT)
+    return made
+
+
+def test_c_equals_python_everywhere() -> None:
+    check = package().check(200)
+    assert check.ok
+    assert check.laws["step"].deviation < 1e-12
+
+
+def control(t: Any) -> Any:
+    """Of the lag."""
+    return 0.3 * np.sin(t) + 0.1
+
+
+def test_the_controller_of_a_problem_cut_in_two_is_that_of_the_whole() -> None:
+    """The same readings give the same estimates and controls, also at the time where the parts meet."""
+    whole = co.evaluate(phased_loops.lag(10.0, "whole"), nominal={"u": lambda s: control(10 * s)}, substeps=4)
+    parts = co.Phases([phased_loops.lag(4.0, "A", last=False), phased_loops.lag(6.0, "B", first=False)])
+    nominal = [{"u": lambda s: control(4 * s)}, {"u": lambda s: control(4 + 6 * s)}]
+    cut = co.evaluate(parts, nominal=nominal, intervals=[40, 60], substeps=4)
+    one, other = (export_c(s, FOLDER / f"cut_{s.name or 'parts'}").reference() for s in (whole, cut))
+    random = np.random.default_rng(3)
+    for k in range(1, 100):
+        time = 0.1 * k
+        reading = float(whole.at(time)["x"]) + 3.0 * random.standard_normal()
+        known, found = one.step([reading], time), other.step([reading], time)
+        assert (one.status, other.status) == ("OK", "OK")
+        np.testing.assert_allclose(found, known, rtol=1e-8, atol=1e-9, err_msg=f"{time}")
+        np.testing.assert_allclose(other.estimate, one.estimate, rtol=1e-8, atol=1e-9)
+        assert other.state["phase"] == int(k >= 40)
+
+
+def _slopes(phase: co.Solution, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """F and G of the body that bounces, as it falls and rises."""
+    v = float(phase.at(float(np.clip(t, 0.0, phase.duration)))["v"])
+    size = np.sqrt(v**2 + 0.01)
+    n = len(phase.augmented)
+    F, G = np.zeros((n, n)), np.zeros(n)
+    F[0, 1], F[1, 1], F[1, n - 1], G[1] = 1.0, -phased_loops.DRAG * (size + v**2 / size), -v * size, 1.0
+    if n == 5:
+        F[1, 2], F[2, 2] = 1.0, -1.0
+    return F, G
+
+
+def _predicted(phase: co.Solution, name: str, y: np.ndarray, held: float, begin: float, end: float) -> np.ndarray:
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        F, G = _slopes(phase, t)
+        return F @ y + G * (held - float(phase.at(float(np.clip(t, 0.0, phase.duration)))[name]))
+
+    return solve_ivp(rate, (begin, end), y, rtol=1e-10, atol=1e-13).y[:, -1]
+
+
+def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> None:
+    """Prediction to the end, the tangent of the jump, prediction from there, the reading of the time since then."""
+    fall, rise = bounced()
+    step = package().python().step
+    for k in range(1, 100):
+        now = k / 100.0
+        step.step([float(fall.at(now)["x"]) + 1.0, np.nan], now)
+    before, held = step.estimate[:4].copy(), float(step.state["control"])
+    assert abs(before).max() > 0.01
+    assert step.state["phase"] == 0
+    end = _predicted(fall, "u", before, held, 0.99, 1.0)
+    speed = float(fall["v"][-1])
+    J = np.zeros((5, 4))
+    J[0, 0] = J[3, 2] = J[4, 3] = 1.0
+    J[1, 1], J[1, 2] = -phased_loops.RESTITUTION, -speed
+    h, begun = 0.02, float(rise["w"][0])
+    y = _predicted(rise, "w", J @ end, begun, 0.0, h)
+    Phi = np.column_stack([_predicted(rise, "w", c, 0, 0.0, h) for c in np.eye(5)])
+    Phi -= _predicted(rise, "w", np.zeros(5), 0, 0.0, h)[:, None]
+    P = Phi @ rise.values["E"][0] @ Phi.T + h * np.diag([0.01, 0.02, 0.05, 0.0, 0.0])
+    M, U = np.eye(5)[:2], np.diag([0.1, 0.2])
+    L = h * P @ M.T @ np.linalg.inv(h * M @ P @ M.T + U)
+    at = rise.at(h)
+    reading = np.array([float(at["x"]) + 0.2, float(at["v"]) - 0.3])
+    y = y + L @ (reading - np.array([float(at["x"]), float(at["v"])]) - M @ y)
+    control = step.step(reading, 1.0 + h)
+    assert (step.status, step.state["phase"]) == ("OK", 1)
+    np.testing.assert_allclose(step.estimate, y, rtol=1e-6, atol=1e-8)
+    C = rise.at(h)["S"][1] @ np.eye(5)
+    assert float(control[0]) == pytest.approx(float(at["w"]) - float(C @ y), abs=1e-6)
+
+
+def test_a_step_where_phases_meet_takes_the_reading_of_the_one_that_ends() -> None:
+    """It gives out the control of the one that begins, C(0) of its own; the same time again changes nothing."""
+    fall, rise = bounced()
+    laws = package().python(), co.export_c(fall, FOLDER / "fall").python()
+    for k in range(1, 21):
+        time = k / 20.0
+        reading = float(fall.at(time)["x"]) + 0.2 * np.cos(9 * time)
+        control = laws[0].step([reading, np.nan], time)
+        laws[1].step([reading], time)
+    J = np.zeros((5, 4))
+    J[0, 0] = J[3, 2] = J[4, 3] = 1.0
+    J[1, 1], J[1, 2] = -phased_loops.RESTITUTION, -float(fall["v"][-1])
+    y = J @ laws[1].estimate
+    assert laws[0].status == "OK"
+    assert (laws[0].state["phase"], laws[0].state["time"]) == (1, 1.0)
+    np.testing.assert_allclose(laws[0].estimate, y, rtol=1e-9, atol=1e-12)
+    assert float(control[0]) == pytest.approx(float(rise["w"][0] - rise.gains["C"][0, 0] @ y), rel=1e-9)
+    again = laws[0].step([5.0, 5.0], 1.0)
+    np.testing.assert_allclose(again, control, rtol=1e-12)
+    np.testing.assert_allclose(laws[0].estimate, y, rtol=1e-9, atol=1e-12)
+
+
+def test_what_should_not_happen_has_a_status_and_nominal_control() -> None:
+    fall, rise = bounced()
+    step = package().python().step
+    step.step([float(fall.at(0.4)["x"]) + 0.3, 0.0], 0.4)
+    step.step([float(rise.at(0.1)["x"]), float(rise.at(0.1)["v"]) + 0.4], 1.1)
+    kept = step.estimate.copy()
+    assert abs(kept).max() > 1e-3
+    for time, status, nominal in (
+        (0.7, "TIME_BACKWARDS", fall.at(0.7)["u"]),
+        (1.05, "TIME_BACKWARDS", rise.at(0.05)["w"]),
+        (9.0, "TIME_AFTER", rise["w"][-1]),
+        (-1.0, "TIME_BACKWARDS", fall["u"][0]),
+        (np.nan, "TIME_NOT_FINITE", rise.at(0.1)["w"]),
+    ):
+        control = step.step([0.0, 0.0], time)
+        expected = "TIME_BEFORE" if time == -1.0 else status
+        assert step.status == expected
+        assert float(control[0]) == pytest.approx(float(nominal), rel=1e-9)
+        np.testing.assert_array_equal(step.estimate, kept)
+        assert step.state["time"] == 1.1
+
+
+def _leg(name: str, *, first: bool, control: str = "u") -> co.Problem:
+    """An integrator that is measured and moved by noise, for a second."""
+    ocp = co.Problem(1.0, name=name)
+    x = ocp.state("x", initial=1.0 if first else None, variance=0.3 if first else None)
+    u = ocp.control(control, lower=-2.0, upper=2.0)
+    ocp.dynamics(x, u, noise=0.2)
+    ocp.measurement("position", x, noise=0.05)
+    ocp.minimize_expected(running=0.5 * u**2 + x**2, terminal=2.0 * x**2 if name == "three" else 0.0)
+    return ocp
+
+
+@cache
+def kicked() -> co.PhasesSolution:
+    """Three phases, with the jump x+ = -0.8 x + noise before the last."""
+    one, two, three = (_leg(name, first=name == "one") for name in ("one", "two", "three"))
+    phases = co.Phases([one, two, three], name="kicked")
+    phases.jump(three.states[0].symbol, -0.8 * two.states[0].symbol, noise=0.1)
+    return co.solve(phases, intervals=20, tolerance=1e-9, **QUIET)
+
+
+def test_the_loop_flies_as_predicted() -> None:
+    """200 runs of the linear system with the compiled controller: spread at the ends of all phases, and mean."""
+    made = export_c(kicked(), FOLDER / "kicked")
+    made.build(flags=STRICT)
+    step, random, h = made.python().step, np.random.default_rng(8), 0.05
+    runs, ends = 200, {20: "one", 40: "two", 60: "three"}
+    found: dict[str, list[float]] = {name: [] for name in ends.values()}
+    for _ in range(runs):
+        step.init()
+        x, u = 1.0 + np.sqrt(0.3) * random.standard_normal(), float(step.state["control"])
+        for k in range(1, 61):
+            seen = x * h
+            x += h * u + np.sqrt(0.2 * h) * random.standard_normal()
+            seen = (seen + x * h) / 2 / h + np.sqrt(0.05 / h) * random.standard_normal()
+            if k in ends:
+                found[ends[k]].append(x)
+            u = float(step.step([seen], k * h)[0])
+            if k == 40:
+                x = -0.8 * x + np.sqrt(0.1) * random.standard_normal()
+    for phase in kicked():
+        values = np.array(found[phase.name])
+        expected = float(phase.loop.X[-1, 0, 0])
+        assert values.var() == pytest.approx(expected, rel=4.0 * np.sqrt(2.0 / runs) + 0.05)
+        assert values.mean() == pytest.approx(float(phase["x"][-1]), abs=4.0 * np.sqrt(expected / runs) + 0.01)
+
+
+def test_a_step_over_a_whole_phase() -> None:
+    """From the first phase to the last one: y+ = -0.8 (y + what the held control and the nominal make of it)."""
+    solution = kicked()
+    step = export_c(solution, FOLDER / "skipped").reference()
+    step.step([2.0], 0.5)
+    y, held = float(step.estimate[0]), float(step.state["control"])
+    step.step([np.nan], 2.2)
+    moved = y
+    for phase, begin, end in ((solution["one"], 0.5, 1.0), (solution["two"], 0.0, 1.0)):
+        t = np.linspace(begin, end, 2001)
+        moved += held * (end - begin) - np.trapezoid(phase.at(t)["u"], t)
+    t = np.linspace(0.0, 0.2, 401)
+    moved = -0.8 * moved + held * 0.2 - np.trapezoid(solution["three"].at(t)["u"], t)
+    assert (step.status, step.state["phase"]) == ("MEASUREMENT_MISSING", 2)
+    assert float(step.estimate[0]) == pytest.approx(moved, abs=2e-3)  # two points a phase
+    assert step.state["time"] == 2.2
+
+
+def test_limits_hold_in_the_phases_that_have_the_control() -> None:
+    one, two = _leg("one", first=True), _leg("three", first=False, control="w")
+    solution = co.solve(co.Phases([one, two]), intervals=20, **QUIET)
+    with pytest.warns(co.CovocpWarning, match="outside the limits"):
+        made = export_c(solution, FOLDER / "limited", limits={"w": (-0.05, 0.05)})
+    step = made.reference()
+    assert abs(float(step.step([9.0], 0.5)[0])) > 0.05
+    assert float(step.step([9.0], 1.5)[0]) == -0.05
+    header = (made.directory / "limited.h").read_text()
+    assert "LIMITED_THREE_LIMIT_W_LOWER" in header
+    assert "In one: The control is not limited" in header.replace("\n *  ", "")
+    bounded = export_c(solution, FOLDER / "bounded", limits="bounds").reference()
+    assert float(bounded.step([99.0], 0.5)[0]) == -2.0
+    with pytest.raises(co.ProblemError, match="'v' is not in this solution"):
+        export_c(solution, FOLDER / "refused", limits={"v": (0.0, 1.0)})
+
+
+def test_what_does_not_apply_is_refused() -> None:
+    with pytest.raises(co.ExportError, match="a solution of phases"):
+        export_c(kicked(), FOLDER / "refused", period=0.1)
+    with pytest.raises(co.ExportError, match="largest_spread"):
+        export_c(kicked(), FOLDER / "refused", largest_spread=0.5)
+    with pytest.raises(co.ExportError, match="limits= are those of a controller"):
+        export_c(kicked(), FOLDER / "refused", limits="bounds", feedback=False)
+    loaded = co.load(kicked().save(FOLDER / "kicked.npz"))
+    with pytest.raises(co.ExportError, match="does not know them"):
+        export_c(loaded, FOLDER / "refused")
+    assert not (FOLDER / "refused").exists()
