@@ -42,18 +42,32 @@ def control(t: Any) -> Any:
     return 0.3 * np.sin(t) + 0.1
 
 
+def _lag(duration: float, name: str, at: list[float], *, first: bool = True, last: bool = True) -> co.Problem:
+    """The lag, or one part of it, that is measured and also read at instants."""
+    ocp = co.Problem(duration, name=name)
+    x = ocp.state("x", initial=0.0 if first else None, final=1.0 if last else None, variance=1.0 if first else None)
+    b = ocp.unknown("b", mean=1.0, variance=0.5)
+    u = ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=1.0)
+    ocp.measurement("position", x, noise=1.0)
+    ocp.measurement("fix", x, noise=0.1, at=at)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0} if last else None)
+    return ocp
+
+
 def test_the_controller_of_a_problem_cut_in_two_is_that_of_the_whole() -> None:
-    """The same readings give the same estimates and controls, also at the time where the parts meet."""
-    whole = co.evaluate(phased_loops.lag(10.0, "whole"), nominal={"u": lambda s: control(10 * s)}, substeps=4)
-    parts = co.Phases([phased_loops.lag(4.0, "A", last=False), phased_loops.lag(6.0, "B", first=False)])
+    """The same readings give the same estimates and controls, also those at the time where the parts meet."""
+    whole = co.evaluate(_lag(10.0, "whole", [2, 4, 7]), nominal={"u": lambda s: control(10 * s)}, substeps=4)
+    parts = co.Phases([_lag(4.0, "A", [2, 4], last=False), _lag(6.0, "B", [3], first=False)])
     nominal = [{"u": lambda s: control(4 * s)}, {"u": lambda s: control(4 + 6 * s)}]
     cut = co.evaluate(parts, nominal=nominal, intervals=[40, 60], substeps=4)
     one, other = (export_c(s, FOLDER / f"cut_{s.name or 'parts'}").reference() for s in (whole, cut))
     random = np.random.default_rng(3)
-    for k in range(1, 100):
-        time = 0.1 * k
-        reading = float(whole.at(time)["x"]) + 3.0 * random.standard_normal()
-        known, found = one.step([reading], time), other.step([reading], time)
+    for k in range(1, 101):
+        time, x = 0.1 * k, float(whole.at(0.1 * k if k < 100 else 10.0)["x"])
+        fix = x + 0.5 * random.standard_normal() if k in (20, 40, 70) else np.nan
+        reading = [x + 3.0 * random.standard_normal(), fix]
+        known, found = one.step(reading, time), other.step(reading, time)
         assert (one.status, other.status) == ("OK", "OK")
         np.testing.assert_allclose(found, known, rtol=1e-8, atol=1e-9, err_msg=f"{time}")
         np.testing.assert_allclose(other.estimate, one.estimate, rtol=1e-8, atol=1e-9)

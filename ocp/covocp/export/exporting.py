@@ -90,8 +90,8 @@ def export_c(
     """Write C sources of a solution, of functions or of a solver.
 
     An open-loop solution becomes `sample(time)`; one with feedback also a controller, `init` and
-    `step(measurement, time)` -> control; one of phases `sample(time)`, which finds the phase, and `sample_<phase>` of
-    each; functions themselves; a problem a solver for re-planning,
+    `step(measurement, time)` -> control; those of phases `sample(time)`, which finds the phase, `sample_<phase>` of
+    each, and such a controller; functions themselves; a problem a solver for re-planning,
     `solve(initial state, parameters, ...)` -> plan.
 
     Args:
@@ -101,13 +101,12 @@ def export_c(
         precision: "double" or "single".
         overwrite: replace a package that is there: the files it consists of, and what was built of them. Other files in
             its folder stay.
-        period: of a controller [s]: gains and transitions are made for samples of this period; None: any time between
-            two steps, everything computed along the nominal as it is needed.
+        period: of a controller [s]: gains and transitions are made for samples of this period, not of phases; None: any
+            time between two steps, everything computed along the nominal as it is needed.
         limits: of the control that a controller gives out: None (not limited, not even to the bounds of the problem),
             "bounds" (those of the problem), or a dict of control to (lower, upper). A nominal control outside of them
             is a warning.
-        feedback: whether a solution with feedback is exported as a controller; False: its histories only, which is all
-            that there is of phases.
+        feedback: whether a solution with feedback is exported as a controller; False: its histories only.
         largest_spread: of a controller: the largest factor between the standard deviations of the loop as it flies with
             these gains (interpolated between the nodes, or held over a period) and those that the solution predicts;
             where it is more, nothing is exported. float("inf"): whatever it is.

@@ -22,7 +22,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.controller import ABOUT, HELD, STATUSES, about, first_fields, points, stepped
+from covocp.export.laws.controller import ABOUT, HELD, STATUSES, about, first_fields, points, stepped, with_units
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, clock
 from covocp.export.laws.law import Law, Port, flat, span, status_of
@@ -249,9 +249,14 @@ def _entries(names: list[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
     return tuple(f"in {phase}: {', '.join(own) or 'nothing'}" for phase, own in names)
 
 
+def _named(leg: Leg, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of entries with their units."""
+    return with_units(leg.design.statement, names)
+
+
 def _inputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
     """Ports of the inputs; those that are held take the place of fields of the struct."""
-    measured = _entries([(leg.name, entry_names(leg.design.measured)) for leg in legs])
+    measured = _entries([(leg.name, _named(leg, entry_names(leg.design.measured))) for leg in legs])
     return (
         Port(name="estimate", rows=room.n),
         Port(name="last"),
@@ -264,16 +269,17 @@ def _inputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
 def _outputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
     """Ports of the fields of the struct."""
     listed = ", ".join(f"{k} {leg.name}" for k, leg in enumerate(legs))
-    controls = _entries([(leg.name, leg.design.statement.control_names[: leg.design.sizes[1]]) for leg in legs])
+    fed = [leg.design.statement.control_names[: leg.design.sizes[1]] for leg in legs]
+    controls = _entries([(leg.name, _named(leg, names)) for leg, names in zip(legs, fed, strict=True)])
     about = {
         "estimate": (
             "of the deviation of the state (and of unknown constants) from the nominal",
-            _entries([(leg.name, leg.design.labels) for leg in legs]),
+            _entries([(leg.name, _named(leg, leg.design.labels)) for leg in legs]),
         ),
         "control": ("given out by the last step and held since; overwrite it where another one was applied", controls),
         "nominal_state": (
             "the nominal at that time",
-            _entries([(leg.name, leg.design.statement.state_names) for leg in legs]),
+            _entries([(leg.name, _named(leg, leg.design.statement.state_names)) for leg in legs]),
         ),
         "nominal_control": ("the nominal at that time", controls),
         "feedback_gain": ("C", ()),
