@@ -30,7 +30,7 @@ from covocp.statement.statement import ROLES, Role
 from covocp.statement.time_data import TimeData
 
 Guess = float | Array | Callable[[Array], Any] | None
-Place = Literal["path", "initial", "final"]
+Place = Literal["path", "initial", "final", "inside"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,9 +363,9 @@ class Data:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
-    """lower <= expression <= upper along the path, at the start or at the end.
+    """lower <= expression <= upper along the path, at the start, at the end or at an instant of the horizon.
 
-    between: not at the nodes alone.
+    between: not at the nodes alone. instant: share of T of one that holds inside; late: whether after what happens then.
     chance: the condition on probabilities that it stands for, with this name; else None.
     """
 
@@ -376,6 +376,8 @@ class Constraint:
     at: Place
     where: str
     between: bool = False
+    instant: float | None = None
+    late: bool = True
     chance: Chance | None = None
 
     __repr__ = short_repr

@@ -209,7 +209,7 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
         "t": t,
         "x": x,
         "u": u,
-        "e": e if any(c.uses_matrices for c in (st.path, st.start, st.end)) else symbolic.zeros(0, 1),
+        "e": e if any(c.uses_matrices for c in st.conditions) else symbolic.zeros(0, 1),
         "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
     }

@@ -88,8 +88,10 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
         trajectory = _resampled(statement, mesh, parameters, solution, matched)
-    constraints = (statement.path.size, statement.start.size, statement.end.size)
-    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+    st = statement
+    constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
+    own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
+    if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
     costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
     return Guess(
