@@ -115,11 +115,11 @@ def stored_times(grid: Grid, points: int, samples: Given, instants: tuple[float,
 
 
 def indices(grid: Grid, times: Array) -> Any:
-    """Where some times lie in a grid; of two that are the same the second is after what is read there."""
-    at = np.searchsorted(grid.t, times)
-    again = np.append(False, times[1:] == times[:-1])
-    last = np.searchsorted(grid.t, times, side="right") - 1
-    return np.where(again, last, at)
+    """Where some times lie in a grid; of those that are the same the last is after what happens there."""
+    first, own = np.searchsorted(grid.t, times), np.searchsorted(times, times)
+    others = np.searchsorted(grid.t, times, side="right") - 1 - first
+    count = np.searchsorted(times, times, side="right") - 1 - own
+    return first + (np.arange(times.size) - own) * others // np.maximum(count, 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

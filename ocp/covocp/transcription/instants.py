@@ -31,10 +31,10 @@ def with_instants(statement: Statement, options: Options) -> Options:
 
     Args:
         statement: the problem.
-        options: a grid that is complete stays as it is.
+        options: a grid that has them stays as it is.
     """
     if isinstance(options.grid, Graded):
-        return options
+        return _completed_grid(statement, options, options.grid)
     nodes = np.unique(options.nodes())
     asked = nodes.size - 1
     needed = _needed(statement, asked)
@@ -59,6 +59,15 @@ def completed(statement: Statement, nodes: Array, asked: int | None = None) -> A
     others = np.unique(nodes)
     kept = others[~_near(others, needed) | (others == 0.0) | (others == 1.0)]
     return np.sort(np.concatenate([np.union1d(kept, needed), statement.instants, statement.inside.thrice]))
+
+
+def _completed_grid(statement: Statement, options: Options, grid: Graded) -> Options:
+    """The options with the instants in a grid that was graded, perhaps for another problem."""
+    twice, thrice = np.array(statement.instants), np.array(statement.inside.thrice)
+    there = all((np.sum(grid.nodes == place) >= 2 + (place in thrice)) for place in twice)
+    if there:
+        return options
+    return replace(options, grid=replace(grid, nodes=completed(statement, grid.nodes, grid.asked)))
 
 
 def _needed(statement: Statement, asked: int) -> Array:
