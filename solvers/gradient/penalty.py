@@ -1,7 +1,8 @@
 """Inequalities as penalties d int c^2 1[c > 0] dt, with weights raised and shifts learnt (gradient method).
 
 Path conditions and bounds on states and matrices count at the nodes of the mesh, with the trapezoidal weights of the
-nodes; initial and final conditions and those at instants count once. Each row lower <= c <= upper has its own weight d and its shift m/(2 d),
+nodes; initial and final conditions and those at instants count once. Each row lower <= c <= upper has its own weight d
+and its shift m/(2 d),
 
     d { c + m/(2d) - clip(c + m/(2d)) }^2,
 

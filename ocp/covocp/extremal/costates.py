@@ -44,7 +44,8 @@ def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
 def impulses(extremal: Extremal) -> Array:
     """Jumps of the costates at the nodes, (N + 1, nx + ne), by the multipliers of what acts there.
 
-    That are path constraints, bounds, and conditions at instants: costates at a node are those before them. The row of the last node is zero: what acts there is part of the terminal costates.
+    That are path constraints, bounds, and conditions at instants: costates at a node are those before them. The row of
+    the last node is zero: what acts there is part of the terminal costates.
     """
     statement, multipliers = extremal.statement, extremal.multipliers
     jumps = np.hstack([multipliers.states, multipliers.matrices]) + instant_jumps(extremal)

@@ -13,7 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
 from covocp.problem.decisions import decisions_of
-from covocp.problem.declarations import Constraint, Declarations, Place
+from covocp.problem.declarations import Constraint, Declarations, Where
 from covocp.problem.integrals import integrals_of
 
 # Share of the terminal time within which an instant is one of its ends.
@@ -135,7 +135,7 @@ def _wrong_instant(label: str, expected: str, received: str, remedy: str) -> Pro
     )
 
 
-def _place(own: Declarations, label: str, value: ca.MX, at: Any, instant: tuple[float, bool] | None) -> Place:
+def _place(own: Declarations, label: str, value: ca.MX, at: Any, instant: tuple[float, bool] | None) -> Where:
     """Where a constraint holds: integrals have their value at the end, decisions need one row."""
     symbols = {symbol.__hash__() for symbol in ca.symvar(value)}
     inside = [entry.name for entry in integrals_of(own) if entry.symbol.__hash__() in symbols]
@@ -152,5 +152,5 @@ def _place(own: Declarations, label: str, value: ca.MX, at: Any, instant: tuple[
         return "final"
     if instant is not None:
         return "final" if symbols <= constant else "inside"
-    place: Place = "path" if at is None else at
+    place: Where = "path" if at is None else at
     return place

@@ -30,7 +30,8 @@ from covocp.statement.statement import ROLES, Role
 from covocp.statement.time_data import TimeData
 
 Guess = float | Array | Callable[[Array], Any] | None
-Place = Literal["path", "initial", "final", "inside"]
+Place = Literal["path", "initial", "final"]
+Where = Literal[Place, "inside"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,7 +366,7 @@ class Data:
 class Constraint:
     """lower <= expression <= upper along the path, at the start, at the end or at an instant of the horizon.
 
-    between: not at the nodes alone. instant: share of T of one that holds inside; late: whether after what happens then.
+    between: not at the nodes alone. instant: share of T of one that holds inside; late: after what happens then.
     chance: the condition on probabilities that it stands for, with this name; else None.
     """
 
@@ -373,7 +374,7 @@ class Constraint:
     expression: ca.MX
     lower: Array
     upper: Array
-    at: Place
+    at: Where
     where: str
     between: bool = False
     instant: float | None = None

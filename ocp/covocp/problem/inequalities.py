@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.problem.closed_loop_covariance import floored, used_in
-from covocp.problem.declarations import Constraint, Declarations, Place
+from covocp.problem.declarations import Constraint, Declarations, Where
 from covocp.problem.stacked import Stacked
 from covocp.statement.conditions import Conditions, Inside, Instant
 
@@ -22,7 +22,7 @@ def row_names(constraint: Constraint) -> list[str]:
     return [constraint.name] if size == 1 else [f"{constraint.name}[{i}]" for i in range(size)]
 
 
-def conditions_at(problem: Declarations, stacked: Stacked, at: Place) -> Conditions:
+def conditions_at(problem: Declarations, stacked: Stacked, at: Where) -> Conditions:
     """The inequalities of one place as one function."""
     return _conditions(problem, stacked, at, [c for c in problem.constraints if c.at == at])
 
@@ -58,7 +58,7 @@ def _merged(known: list[float], given: list[float]) -> dict[float, float]:
     return result
 
 
-def _conditions(problem: Declarations, stacked: Stacked, at: Place, chosen: list[Constraint]) -> Conditions:
+def _conditions(problem: Declarations, stacked: Stacked, at: Where, chosen: list[Constraint]) -> Conditions:
     """Some inequalities as one function."""
     values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
     names = [name for c in chosen for name in row_names(c)]

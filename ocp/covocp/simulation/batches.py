@@ -300,7 +300,7 @@ class _Simulation:
         self.flags[place] = np.count_nonzero(np.where(counted, flags, 0.0), axis=1)
         if place in (0, self.flags.shape[0] - 1):
             self.seen[int(place > 0)] = flags[self.plan.fed_back :] > 0
-        for i in np.flatnonzero(self.plan.once == place):
+        for i in np.flatnonzero(self.plan.once == place).tolist():
             self.then[i] = (flags[self.plan.fed_back + i] > 0) | ~counted
         grouped = np.where(counted, y, 0.0).reshape(rows, -1, LANES)
         square = grouped * grouped

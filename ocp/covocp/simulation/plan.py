@@ -27,8 +27,8 @@ class Plan:
     read: the same of steps of no length, at which something is read; None where nothing is.
     observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
     finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
-    steps: coefficients, a row for each step; reads: which of them have no length, so that nothing moves; times: at which
-        they start [s].
+    steps: coefficients, a row for each step; reads: which of them have no length: nothing moves; times: at which they
+        start [s].
     stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
     start: state of a run that starts at its mean; unknowns: their mean; motion: how x moves.
     spread: factor of the covariance of the start, (n, n).

@@ -121,7 +121,11 @@ def _violations(sample: MonteCarlo) -> Section:
     columns = ["runs that violate", "at", "at any time", "at T", "promised", "most at once", "at t [s]", "promised", ""]
     rows = []
     for entry in shown:
-        kind = "bounds" if entry.bound else {"initial": "start", "final": "end", "inside": "instant"}.get(entry.place, "path")
+        kind = (
+            "bounds"
+            if entry.bound
+            else {"initial": "start", "final": "end", "inside": "instant"}.get(entry.place, "path")
+        )
         once = entry.place in ("initial", "inside")
         end = ["-", "-"] if once else [_share(entry.end_share), _share(entry.promised_end)]
         rows.append([entry.name, kind, _share(entry.share), *end, _share(entry.most), number(entry.most_time, 4)])

@@ -427,7 +427,12 @@ def _lengths(solution: Solution) -> dict[str, int]:
     points |= {"inside": mesh.points - 1, "knots": knots, "pieces": knots - 1}
     points["points"] = kept.points.shape[0] if kept is not None and kept.points.ndim else 0
     entries = {"x": nx, "u": nu, "e": ne, "xe": nx + ne, "p": constants, "augmented": len(solution.augmented)}
-    return {**points, **entries, **{"instants": 0}, **{place: len(names) for place, names in solution.constraints.items()}}
+    return {
+        **points,
+        **entries,
+        **{"instants": 0},
+        **{place: len(names) for place, names in solution.constraints.items()},
+    }
 
 
 def _misfits(hint: Any, value: Any, place: str, lengths: Mapping[str, int]) -> Iterator[str]:

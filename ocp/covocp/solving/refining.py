@@ -355,7 +355,7 @@ def _next_nodes(statement: Statement, coarse: Measured, fine: Measured, errors: 
 
 
 def _jumps(extremal: Extremal) -> list[Any]:
-    """Jumps of the controls between the instants; at these they may jump, and few intervals have nothing beside them."""
+    """Jumps of the controls between the instants, at which they may jump; few intervals have nothing beside them."""
     mesh, u, found = extremal.mesh, extremal.trajectory.u, []
     constant = mesh.control == "constant"
     for part in stretches(extremal):

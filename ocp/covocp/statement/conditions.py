@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -123,4 +124,4 @@ class Inside:
     def split(self, values: Any) -> list[Any]:
         """Values of all rows, an array or a column, shared out among the instants."""
         ends = np.cumsum([0, *(part.conditions.size for part in self.parts)]).tolist()
-        return [values[i:j] for i, j in zip(ends, ends[1:], strict=False)]
+        return [values[i:j] for i, j in pairwise(ends)]
