@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import is_number
-from covocp.base.checks import caller
+from covocp.base.checks import caller, column
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
@@ -46,7 +46,8 @@ def with_constraint(
     check_constrains(label, value, constants)
     place = _place(own, label, value, at, instant)
     check_name(label, list(own.named))
-    low, high = limit_columns(label, *_both_limits(label, *limits), check_size(label, value.shape[0]))
+    size = check_size(label, value.shape[0])
+    low, high = limit_columns(label, *_both_limits(label, *limits, size), size)
     if not (between is None or (isinstance(between, str) and between == "auto")) or (between and place != "path"):
         raise ProblemError(
             f"'{label}' has a wrong between=.",
@@ -61,11 +62,11 @@ def with_constraint(
     return own.adding(constraints=entry)
 
 
-def _both_limits(label: str, lower: Given, upper: Given, equals: Given) -> tuple[Given, Given]:
+def _both_limits(label: str, lower: Given, upper: Given, equals: Given, size: int) -> tuple[Given, Given]:
     """Lower and upper limit; both are what the expression equals, where that is given.
 
     Raises:
-        ProblemError: it is given beside a limit.
+        ProblemError: it is given beside a limit, or is no finite number.
     """
     if equals is None:
         return lower, upper
@@ -76,7 +77,8 @@ def _both_limits(label: str, lower: Given, upper: Given, equals: Given) -> tuple
             received=f"equals={equals}, lower={lower}, upper={upper}",
             remedy="leave one of them out",
         )
-    return equals, equals
+    both = column(label, "value of equals=", equals, size)
+    return both, both
 
 
 def check_place(label: str, at: Given) -> None:
