@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ TIMES, POINTS = np.array([0.0, 4.0, 7.0, 10.0]), np.array([0.0, 1.0, -1.0, 2.0])
 def through(shift: float = 0.0, *, relative: bool = False) -> co.Problem:
     """Least energy through points, the first of them moved."""
     ocp, x, *_ = errand(10.0, rest=False)
-    for k, (time, point) in enumerate(zip(TIMES[1:3], POINTS[1:3] + [shift, 0.0], strict=True)):
+    for k, (time, point) in enumerate(zip(TIMES[1:3], POINTS[1:3] + np.array([shift, 0.0]), strict=True)):
         ocp.subject_to(x, at=time / 10.0 if relative else time, relative=relative, equals=point, name=f"point {k}")
     ocp.subject_to(x, at="final", equals=POINTS[3], name="end")
     return ocp
@@ -162,7 +163,7 @@ def variance_at(solution: co.Solution, time: float) -> float:
 
     grid = np.unique(solution.t[solution.t <= time])
     E = np.diag([0.1, 0.1, 0.5]).ravel()
-    for begin, end in zip(grid, grid[1:], strict=False):
+    for begin, end in pairwise(grid):
         E = solve_ivp(rate, (begin, end), E, rtol=1e-10, atol=1e-13).y[:, -1]
     return float(E[8])
 
@@ -454,7 +455,7 @@ def test_files_have_them(tmp_path: Any) -> None:
     moved.subject_to(x, at="final", equals=2.0, name="end")
     with pytest.raises(co.ProblemError, match="the instant of 'point 0'"):
         co.load(tmp_path / "errand.npz", problem=moved)
-    with pytest.raises(co.ProblemError, match="the constraint .end."):
+    with pytest.raises(co.ProblemError, match=r"the constraint .end."):
         co.load(tmp_path / "errand.npz", problem=errand(10.0, rest=False)[0])
 
 
