@@ -13,6 +13,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.optimize import minimize_scalar
 
 import covocp as co
+from covocp.solving.comparison import terminal_miss
 
 FORMS = ("eliminated", "states")
 QUIET: dict[str, Any] = {"tolerance": 1e-10, "progress": False}
@@ -210,6 +211,18 @@ def test_a_reading_at_the_instant_counts_after_it(side: Any, form: str) -> None:
     assert found.multiplier("learnt") == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=2e-5)
 
 
+@pytest.mark.parametrize(
+    "options", [{"step": "rodas"}, {"covariance_step": "strang"}, {"covariance_step": "rk4", "substeps": 4}]
+)
+def test_every_step_passes_an_instant(options: dict[str, Any]) -> None:
+    found = co.solve(learning(0.05), intervals=60, progress=False, **options)
+    gauss = co.solve(learning(0.05), intervals=60, progress=False)
+    assert found.cost == pytest.approx(gauss.cost, rel=1e-3)
+    assert found.multiplier("learnt") == pytest.approx(gauss.multiplier("learnt"), rel=1e-2)
+    assert found.optimality.stationarity < 1e-6
+    assert found.optimality.costate_difference < 1e-3
+
+
 def test_rows_that_nothing_needs_are_left_out_with_a_condition_too() -> None:
     """A lag that is known exactly: as with a variance of next to nothing."""
     found = [co.solve(learning(0.1, actuator=0.0), intervals=40, covariances=form, **QUIET) for form in FORMS]
@@ -272,6 +285,40 @@ def test_a_phase_has_conditions_at_instants_of_its_own_time() -> None:
     joined = np.concatenate([parts["two"].costate("E"), parts["three"].costate("E")])
     np.testing.assert_allclose(found["two"].costate("E"), joined, atol=1e-7 * np.abs(joined).max())
     assert found["two"].optimality.hamiltonian_variation < 1e-5
+
+
+@pytest.mark.parametrize("method", ["ipopt", "gradient"])
+def test_shares_of_the_free_durations_of_phases(method: str) -> None:
+    """Transversality of each, with what the Hamiltonian jumps by; the least cost by given durations is there."""
+
+    def part(name: str, first: bool, duration: Any) -> co.Problem:
+        ocp, x, v, u = errand(duration)
+        gate = x + 0.1 * v**2 - 0.05 * ocp.time
+        ocp.subject_to(gate, at=0.3 if first else 0.6, relative=True, equals=0.5 if first else 2.5, name="gate")
+        ocp.subject_to(x, at="final", equals=2.0 if first else 3.0, name="place")
+        own = ocp.declarations
+        if first:
+            return co.Problem.of(replace(own, name=name, cost=(u**2 + 0.5, own.cost[1])))
+        states = tuple(replace(state, initial=state.final) for state in own.states)  # free
+        return co.Problem.of(replace(own, name=name, states=states, cost=(u**2 + 0.5, own.cost[1])))
+
+    free = co.Phases([part("one", True, co.Free(3.0, 0.3, 20.0)), part("two", False, co.Free(3.0, 0.3, 20.0))])
+    found = co.solve(free, intervals=20, **(QUIET if method == "ipopt" else GRADIENT))
+    for phase in found.phases:
+        assert phase.optimality.transversality < 1e-6
+        assert phase.optimality.hamiltonian_variation < 1e-5
+        assert abs(phase.multiplier("gate")) > 0.1
+    if method == "ipopt":
+        h, times = 0.005, [phase.duration for phase in found.phases]
+        for k in range(2):
+            costs = []
+            for step in (-h, 0.0, h):
+                moved = [t + step * (i == k) for i, t in enumerate(times)]
+                given = co.Phases([part("one", True, moved[0]), part("two", False, moved[1])])
+                costs.append(co.solve(given, intervals=20, **QUIET).cost)
+            least = h * (costs[0] - costs[2]) / (2.0 * (costs[0] - 2.0 * costs[1] + costs[2]))
+            assert found.cost == pytest.approx(costs[1], rel=1e-9)
+            assert abs(least) < 5e-5 * times[k]
 
 
 # --- shares of a free duration ----------------------------------------------------------------------------------------
@@ -472,6 +519,13 @@ def test_the_printout_has_values_and_multipliers() -> None:
     assert "condition at an instant" in text
     assert "a node for conditions at 2 instants" in text
     assert "measurements taken" not in text
+
+
+def test_a_comparison_counts_what_is_missed_there() -> None:
+    ocp, x, *_ = errand(3.0)
+    ocp.subject_to(x, at=1.0, lower=0.25, name="gate")
+    assert terminal_miss(co.evaluate(ocp, nominal={"u": 0.0})) == pytest.approx(0.25)
+    assert terminal_miss(co.evaluate(ocp, nominal={"u": 1.0})) == 0.0
 
 
 def test_the_certificate_says_that_it_does_not_know_them() -> None:
