@@ -61,15 +61,18 @@ class Monitor(ca.Callback):
 
     def eval_buffer(self, arg: tuple[memoryview, ...], res: tuple[memoryview, ...]) -> int:
         """One iteration."""
-        stop = False
-        if self._progress is not None:
-            cost, g = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in ("f", "g"))
-            violation = np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0)
-            self._progress.update(self._iteration, float(cost[0]) * self._scale, float(violation))
-            self._iteration += 1
-            stop = self._progress.stop or self._wanders(float(violation))
-        np.frombuffer(res[0], dtype=float)[:] = stop
+        cost, g = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in ("f", "g"))
+        np.frombuffer(res[0], dtype=float)[:] = self.seen(float(cost[0]), g)
         return 0
+
+    def seen(self, cost: float, g: Array) -> bool:
+        """Report an iteration with such a cost and such rows; whether to stop."""
+        if self._progress is None:
+            return False
+        violation = float(np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0))
+        self._progress.update(self._iteration, cost * self._scale, violation)
+        self._iteration += 1
+        return self._progress.stop or self._wanders(violation)
 
     def _wanders(self, violation: float) -> bool:
         """Whether a run that need not be finished has made no progress for long."""

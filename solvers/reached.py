@@ -83,12 +83,12 @@ class Round:
 class FirstOrder:
     """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
 
-    def __init__(self, nlp: Program, solver: ca.Function, plugin: str) -> None:
-        """Take Ipopt's functions, or make one: every other plugin has its own."""
+    def __init__(self, nlp: Program, solver: Any) -> None:
+        """Take the functions of a solver that tells them, or make one for a solver that does not (None)."""
         self.nlp = nlp
         self._gradient: Any = None
         self._jacobian: Any = None
-        if plugin == "ipopt":
+        if solver is not None:
             self._gradient, self._jacobian = solver.get_function("nlp_grad_f"), solver.get_function("nlp_jac_g")
 
     def cost(self, w: Array, parameters: Arrays) -> tuple[float, Array]:

@@ -13,6 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import ENDED, STOPPED, Guess
+from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
 from covocp.solvers.reached import (
@@ -69,12 +70,14 @@ class Runs:
         """
         self._build_program = build
         self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
+        # Ipopt tells its functions and its iterations, and takes multipliers to start from
+        self._open = plugin == "ipopt"
         self._strictness = 1.0
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: Monitor | None = None
         self._nlp: Program | None = None
-        self._cold: ca.Function | None = None
-        self._warm: ca.Function | None = None
+        self._cold: Any = None
+        self._warm: Any = None
 
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
         """Run from these guesses, one for each part; the last iterate is returned whatever happens.
@@ -127,7 +130,7 @@ class Runs:
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
             at_once = 0 <= done[-1].point.iterations <= AT_ONCE
-            if self._plugin == "ipopt" and done[-1] is best and at_once:  # new scales alone do not move it
+            if self._open and done[-1] is best and at_once:  # new scales alone do not move it
                 self._tighten()
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
             solver = self._warm_solver() if start.lam_x is not None else self._cold
@@ -146,11 +149,11 @@ class Runs:
     def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
         where = point.where
-        status = status_of(point.status)
+        status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
         assert self._cold is not None
-        first = FirstOrder(nlp, self._cold, self._plugin)
+        first = FirstOrder(nlp, self._cold if self._open else None)
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
@@ -168,7 +171,7 @@ class Runs:
     def _run(
         self,
         nlp: Program,
-        solver: ca.Function,
+        solver: Any,
         start: Start,
         parameters: Arrays,
         progress: Progress,
@@ -210,16 +213,20 @@ class Runs:
             evaluable=evaluable,
         )
 
+    def _ending(self, name: str) -> Ending | None:
+        """The ending of that name; None for those that only a plugin knows."""
+        return status_of(name)
+
     def _lost_way(self, status: str) -> dict[str, Any]:
         """Whether the run lost its way, as a count."""
         if self._monitor is not None and self._monitor.wandered:
             return {"wandered": STOPPED}
-        known = status_of(status)
+        known = self._ending(status)
         return {"wandered": ENDED} if known is not None and known.lost else {}
 
     def message(self, last: Round) -> str:
         """How the run ended, a sentence."""
-        status, known = last.point.status, status_of(last.point.status)
+        status, known = last.point.status, self._ending(last.point.status)
         if last.converged:
             return str(known or Status.SOLVED) if last.point.success else str(Status.SOLVED)
         if last.residuals is not None and last.point.success:
@@ -228,15 +235,13 @@ class Runs:
             return status
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
-    def _build(
-        self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool
-    ) -> tuple[Program, ca.Function]:
+    def _build(self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool) -> tuple[Program, Any]:
         """The program and its solver, made at the first call; a second solver shares the functions for warm starts.
 
         Other plugins than Ipopt print their iterations where somebody watches that call.
         """
         if self._nlp is None or self._cold is None:
-            if self._plugin != "ipopt" and not watched:
+            if not self._open and not watched:
                 self._settings = silent(self._plugin, self._settings)
             self._transcribe(None, trajectories, parameters)
         assert self._nlp is not None
@@ -246,14 +251,14 @@ class Runs:
     def _transcribe(self, scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> None:
         """The program in these scales, and its solver."""
         self._nlp = self._build_program(scales, trajectories, parameters)
-        if self._plugin == "ipopt":
+        if self._open:
             self._monitor = Monitor(self._nlp)
         self._cold, self._warm = self._make({}), None
 
-    def _warm_solver(self) -> ca.Function:
+    def _warm_solver(self) -> Any:
         """The solver for starts with multipliers; other plugins than Ipopt have one for all."""
         assert self._cold is not None
-        if self._plugin != "ipopt":
+        if not self._open:
             return self._cold
         if self._warm is None:
             shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
@@ -264,7 +269,7 @@ class Runs:
             )
         return self._warm
 
-    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> ca.Function:
+    def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> Any:
         nlp = self._nlp
         assert nlp is not None
         settings = {**self._settings, **functions}
@@ -292,12 +297,12 @@ class Runs:
                 remedy="correct plugin_options=, or leave compile= out",
             ) from error
 
-    def _cost_scale(self, solver: ca.Function, w0: Array, parameters: Arrays) -> float:
+    def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
         """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
 
         Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
         """
-        if self._plugin != "ipopt":  # each plugin has functions of its own, and a scaling of its own
+        if not self._open:  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
             return self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)

@@ -3,7 +3,7 @@
 MUMPS inside Ipopt has static data, CasADi's OpenBLAS waits for ever when several threads call it, and a CasADi function
 that two threads share may write where the other reads. So whatever covocp offers that calls CasADi takes its turn:
 several threads may use the same problem, solver or solution and get the same numbers as one after the other. Processes
-run in parallel.
+run in parallel. For as long as a turn lasts linear algebra has one thread (`covocp.base.blas`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from functools import wraps
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, Self, TypeVar, overload
 
+from covocp.base.blas import Limits, one_blas_thread
+
 P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
@@ -27,13 +29,18 @@ class _Turn:
     def __init__(self) -> None:
         self._lock = threading.RLock()
         self._held = threading.local()
+        self._limits: Limits | None = None
 
     def __enter__(self) -> None:
         self._lock.acquire()
+        if not self._depth:
+            self._limits = one_blas_thread()
         self._held.depth = self._depth + 1
 
     def __exit__(self, *_: object) -> None:
         self._held.depth = self._depth - 1
+        if not self._depth and self._limits is not None:
+            self._limits.restore_original_limits()
         self._lock.release()
 
     @property

@@ -22,6 +22,7 @@ from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
+from covocp.solving.comparison import COMPARED
 from covocp.solving.methods import method_options
 from covocp.solving.solver import INTERVALS, STARTS
 from covocp.transcription.mesh import Options
@@ -214,7 +215,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     """covocp compare MODEL."""
     _check_targets((arguments.plot, FIGURES))
     problem = find_model(arguments.model).build(arguments.set)
-    methods = arguments.method or list(co.methods())
+    methods = arguments.method or list(COMPARED)
     shared, own = _options(arguments.option, co.methods())
     comparison = co.compare(
         problem, methods, intervals=arguments.intervals, progress=not arguments.quiet, method_options=own, **shared

@@ -107,17 +107,24 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     if st.behind or along:
         return _costates_of_passages(extremal)
     last = np.concatenate(terminal_costates(extremal))
-    interval = adjoint_interval(st, extremal.mesh.substeps, extremal.mesh.step)
     z = ca.DM(np.hstack([extremal.trajectory.x, extremal.trajectory.e]).T)
-    costates, slopes, by_duration = _swept(extremal, interval, last, impulses(extremal), z)
+    costates, slopes, by_duration = _swept(extremal, last, impulses(extremal), z)
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 
-def _swept(extremal: Extremal, interval: ca.Function, last: Array, jumps: Array, z: Expr) -> tuple[Array, Array, float]:
+@lru_cache(maxsize=KEPT)
+def _sweep(statement: Statement, substeps: int, step: StepKind, nominal: bool, intervals: int) -> ca.Function:
+    """The adjoint of so many intervals one after the other."""
+    return adjoint_interval(statement, substeps, step, nominal=nominal).mapaccum("sweep", intervals)
+
+
+def _swept(
+    extremal: Extremal, last: Array, jumps: Array, z: Expr, *, nominal: bool = False
+) -> tuple[Array, Array, float]:
     """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
-    sweep = interval.mapaccum("sweep", n)
+    sweep = _sweep(st, mesh.substeps, mesh.step, nominal, n)
     backward = list(range(n - 1, -1, -1))
     keep, known = (values[:size] for values in _restarts(extremal))
     stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
@@ -151,8 +158,7 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
     last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
-    interval = adjoint_interval(st, mesh.substeps, mesh.step, nominal=True)
-    costates, slopes, total = _swept(extremal, interval, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T))
+    costates, slopes, total = _swept(extremal, last_x, jumps[:, :nx] + by_x, ca.DM(t.x.T), nominal=True)
     return Costates(state=costates, matrices=kicks), slopes + by_u, total + float(by_duration.item())
 
 

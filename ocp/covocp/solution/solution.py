@@ -111,7 +111,8 @@ class Solution:
     ) -> Solution:
         """The solution of an outcome, with the estimate of its mesh error, or nan in its place.
 
-        `closed` is the loop of one of several phases, which begins where that before it ends.
+        `closed` is the loop of one of several phases, which begins where that before it ends. A method that lets
+        another one solve says which, among its counts.
         """
         extremal, st = outcome.extremal, outcome.extremal.statement
         rates, end_rates = rates_along(extremal)
@@ -121,7 +122,7 @@ class Solution:
         read_only(extremal.trajectory)
         solution = Solution(
             name=st.name,
-            method=method,
+            method=str(outcome.stats.get("method", method)),
             converged=outcome.converged,
             message=outcome.message,
             cost_terms=_split_cost(outcome.cost_terms, loop, 0.0 if closed is None else closed.handed),

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from covocp.problem.builder import Problem
 
-DEFAULT = ("ipopt", "gradient")
+COMPARED = ("ipopt", "gradient")
 SOLVE_OPTIONS = ("starts", "seed", "guess", "parameters")
 INTERRUPTED = "interrupted by the user"
 
@@ -178,7 +178,7 @@ class Comparison:
 @checked(methods=either(text, sequence), progress=truth, method_options=optional(mapping))
 def compare(
     problem: Problem | Phases,
-    methods: Sequence[Any] = DEFAULT,
+    methods: Sequence[Any] = COMPARED,
     *,
     intervals: Given = None,
     guess: Given = None,

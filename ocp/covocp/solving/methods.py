@@ -8,7 +8,12 @@ from typing import Any
 
 from covocp.base.errors import ProblemError, spelling
 
-METHODS = {"ipopt": "covocp.solvers.ipopt", "gradient": "covocp.solvers.gradient"}
+METHODS = {
+    "ipopt": "covocp.solvers.ipopt",
+    "gradient": "covocp.solvers.gradient",
+    "reduced": "covocp.solvers.reduced",
+    "auto": "covocp.solving.automatic",
+}
 
 
 def methods() -> tuple[str, ...]:

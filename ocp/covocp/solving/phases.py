@@ -289,7 +289,7 @@ class _Run:
             filled.append(value)
             fine.append(graded(st, own, value))
             mesh = resolve_mesh(st, fine[-1], value)
-            candidates = list(islice(make_guesses(st, mesh, value, guess), attempt + 1))
+            candidates = list(islice(make_guesses(st, mesh, value, guess, linked=True), attempt + 1))
             found.append(candidates[-1])
         return tuple(found), tuple(filled), tuple(fine)
 

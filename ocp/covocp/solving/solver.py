@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from covocp.base.arguments import checked, text, truth
+from covocp.base.arguments import checked, optional, positive, text, truth, whole
 from covocp.base.checks import check_kind, is_whole
 from covocp.base.errors import (
     CovocpError,
@@ -40,6 +40,8 @@ from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.between_nodes import check_between, watched
 from covocp.solving.decisions import bent_data, far_away
+from covocp.solving.elsewhere import Elsewhere
+from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.methods import METHODS, check_method, method_options
@@ -134,6 +136,9 @@ class Solver:
         self.statement: Statement = problem.statement()
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
+        self._elsewhere = Elsewhere(
+            problem=problem, make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options)
+        )
         count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
@@ -160,24 +165,47 @@ class Solver:
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
-    @checked(progress=truth, allow_failure=truth, assess=truth)
+    @checked(
+        progress=truth,
+        allow_failure=truth,
+        assess=truth,
+        time_limit=optional(positive),
+        iteration_limit=optional(whole(0)),
+    )
     def solve(
         self,
         parameters: Mapping[str, Any] | None = None,
         *,
+        initial: Mapping[Any, Any] | None = None,
+        means: Mapping[Any, Any] | None = None,
+        covariance: Given = None,
+        duration: float | None = None,
         guess: Given = None,
+        elapsed: float | None = None,
         progress: bool = True,
         allow_failure: bool = False,
         starts: int = STARTS,
         seed: int = 0,
         assess: bool = True,
+        time_limit: float | None = None,
+        iteration_limit: int | None = None,
     ) -> Solution:
-        """Solve for some values of the parameters.
+        """Solve for some values of the parameters, or from elsewhere.
+
+        With any of `initial`, `means`, `covariance` and `duration` the problem is that of `movable`, built at the first
+        such call: its solution has "initial_<name>" among its parameters, and is evaluated and simulated from there.
 
         Args:
             parameters: new values of known parameters and of means of unknowns, by name; the others keep theirs.
+            initial: other initial values of states, by symbol or name, NaN in entries that are free; the others keep
+                theirs.
+            means: other means of unknowns, by symbol or name.
+            covariance: another initial covariance of what is estimated, (n, n), rows of states, then of unknowns; or
+                initial values of matrices, by symbol or name.
+            duration: another duration [s]; builds a solver of its own, of which the last few are kept.
             guess: None: the problem's own; a `Solution` (also on another mesh, or of another problem with the same
                 names): warm start; "multistart": the best of several random starts; a dict of name to guess.
+            elapsed: time that has passed of the plan in guess= [s]: what is left of it is where to start.
             progress: whether to show the iterations on a terminal.
             allow_failure: return the last iterate of a run that did not converge instead of raising.
             starts: number of random starts of "multistart".
@@ -185,15 +213,31 @@ class Solver:
             assess: False in a loop that solves again and again: what is looked at after a run is left out (error of the
                 mesh and steps that are too long, curvature where a run ends as it began, cost of the classical design,
                 warnings). `mesh_error` is then nan; the residuals that a converged run must meet are the same.
+            time_limit: of the iterations [s], looked at after each of them.
+            iteration_limit: of all runs together.
 
         Returns:
-            The solution.
+            The solution; where a limit was reached the last iterate, with what it violates, without raising.
 
         Raises:
             ProblemError: a name or a guess is wrong.
             SolveError: the method did not converge (carries the last iterate).
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
+        if not all(value is None for value in (initial, means, covariance, duration)):
+            other, known = self._elsewhere.solver(duration)
+            return other.solve(
+                self._elsewhere.values(known, parameters, initial, means, covariance),
+                guess=guess,
+                elapsed=elapsed,
+                progress=progress,
+                allow_failure=allow_failure,
+                starts=starts,
+                seed=seed,
+                assess=assess,
+                time_limit=time_limit,
+                iteration_limit=iteration_limit,
+            )
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
             self._keep(*self._first)
@@ -203,8 +247,10 @@ class Solver:
         guess = guess if first is None else meeting_conditions(self._problem, first, parameters or {})
         if isinstance(guess, Solution):
             self._take_steps(guess.mesh)
+        guess = later_of(guess, elapsed)
+        title = self.statement.name or "solving"
         with evaluating(self.statement.name):
-            with Progress(self.statement.name or "solving", progress) as reporter:
+            with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
@@ -218,9 +264,12 @@ class Solver:
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
-            if reporter.stop:
+            if reporter.asked:
                 raise interrupted(Solution.of(outcome, self.method))
             outcome = with_gain_told(self._problem, outcome, first)
+            if reporter.spent and not outcome.converged:
+                outcome = replace(outcome, message=f"stopped at {reporter.spent}")
+                return self._finish(outcome, allow_failure=True, assess=assess)
             solution = self._finish(outcome, allow_failure, assess)
             return self._beside_classical(solution, values) if assess else solution
 

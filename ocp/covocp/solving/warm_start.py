@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
 from covocp.base.quadrature import interpolated
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
@@ -24,13 +25,27 @@ from covocp.transcription.steering import quadrature_weights, resampled
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 
+@dataclass(frozen=True, kw_only=True)
+class Later:
+    """A plan of which some time has passed [s]."""
+
+    plan: Solution
+    elapsed: float
+
+    __repr__ = short_repr
+
+
 def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Guess:
     """The first of `make_guesses`."""
     return next(make_guesses(statement, mesh, parameters, guess))
 
 
-def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Iterator[Guess]:
+def make_guesses(
+    statement: Statement, mesh: Mesh, parameters: Array, guess: Given, *, linked: bool = False
+) -> Iterator[Guess]:
     """Guesses on a mesh from what the user gave, the best first; the others are made when they are asked for.
+
+    `linked`: to a phase before, so that costates count where it starts.
 
     Raises:
         ProblemError: where it is none of None, a solution, a trajectory, a dict of name to guess, or a solution
@@ -38,8 +53,10 @@ def make_guesses(statement: Statement, mesh: Mesh, parameters: Array, guess: Giv
     """
     if isinstance(guess, Trajectory):
         yield Guess(trajectory=guess)
+    elif isinstance(guess, Later):
+        yield _shifted(statement, mesh, parameters, guess)
     elif isinstance(guess, Solution):
-        yield _from_solution(statement, mesh, parameters, guess)
+        yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
         for trajectory in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
             yield Guess(trajectory=trajectory)
@@ -72,16 +89,16 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
     return replace(statement, guesses=guesses) if given else statement
 
 
-def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution) -> Guess:
+def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, linked: bool) -> Guess:
     """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
     _check_common(statement, solution)
     own = solution.mesh
     t, m = solution.trajectory, solution.multipliers
     blocks = (*statement.states, *statement.controls, *statement.matrices)
     others = {(b.name, b.kind, b.size): b for b in solution.blocks}
-    found = [others.get((b.name, b.kind, b.size)) for b in blocks]
+    there = [others.get((b.name, b.kind, b.size)) for b in blocks]
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
-    matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, found, strict=True))
+    matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, there, strict=True))
     nodes = np.array_equal(own.nodes, mesh.nodes) and np.array_equal(own.instants, mesh.instants)
     duration = solution.duration if statement.duration.free else statement.duration.guess
     if matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
@@ -93,7 +110,13 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
     if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
-    costates = interpolated(np.hstack([solution.costates.state, solution.costates.matrices]), own.nodes, mesh.nodes)
+    width = statement.nx + (0 if mesh.eliminated else statement.ne)
+    if nodes and own.segments == mesh.segments and m.gaps.shape == (len(mesh.segments), width) and not linked:
+        costates = np.zeros((mesh.nodes.size, statement.nx + statement.ne))  # read where segments meet and nowhere else
+        costates[list(mesh.starts[1:]), :width] = m.gaps
+    else:
+        found = np.hstack([solution.costates.state, solution.costates.matrices])
+        costates = interpolated(found, own.nodes, mesh.nodes)
     return Guess(
         trajectory=trajectory,
         multipliers=_multipliers(m, own, mesh),
@@ -132,6 +155,33 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:
         e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
     return Trajectory(x=x, u=u, e=e, duration=duration)
+
+
+def _shifted(statement: Statement, mesh: Mesh, parameters: Array, later: Later) -> Guess:
+    """What is left of a plan, primal and dual; where it ends its last values are kept."""
+    plan, elapsed = later.plan, later.elapsed
+    duration = max(plan.duration - elapsed, 0.0) if statement.duration.free else statement.duration.guess
+    duration = float(np.clip(duration, statement.duration.lower, statement.duration.upper))
+    whole = _from_solution(statement, mesh, parameters, plan, linked=False)
+    x, u, e = (values.copy() for values in (whole.trajectory.x, whole.trajectory.u, whole.trajectory.e))
+    at = np.minimum(mesh.nodes * duration + elapsed, plan.duration)
+    at_controls = np.minimum(control_places(mesh.nodes, mesh.control) * duration + elapsed, plan.duration)
+    sample, controls = plan.at(at), plan.at(at_controls)
+    known = {(b.name, b.kind, b.size) for b in plan.blocks}
+    for block in (*statement.states, *statement.controls, *statement.matrices):
+        if (block.name, block.kind, block.size) in known:
+            if block.kind == "state":
+                x[:, block.span] = sample[block.name].reshape(-1, block.size)
+            elif block.kind == "control":
+                u[:, block.span] = controls[block.name].reshape(-1, block.size)
+            else:
+                e[:, block.span] = pack(sample[block.name])
+    costates = whole.costates
+    if costates is not None:
+        found = np.hstack([plan.costates.state, plan.costates.matrices])
+        moved = interpolated(found, plan.t, at)
+        costates = moved[:, : statement.nx], moved[:, statement.nx :]
+    return replace(whole, trajectory=Trajectory(x=x, u=u, e=e, duration=duration), costates=costates)
 
 
 def _check_common(statement: Statement, solution: Solution) -> None:

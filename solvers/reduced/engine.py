@@ -1,0 +1,145 @@
+"""The sequence of subproblems in place of an NLP solver of CasADi: called as these are, and never built anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.buffered import Buffered
+from covocp.base.matrices import Array
+from covocp.solvers.monitor import Monitor
+from covocp.solvers.reduced.condensed import Bounds, Layout, layout_of
+from covocp.solvers.reduced.curvature import Curvature, first_curvature
+from covocp.solvers.reduced.sequence import Functions, Memory, Place, Sequence
+from covocp.solvers.reduced.statuses import Status
+from covocp.transcription.program import Program
+
+
+class Engine:
+    """The functions of a program, and what was learnt of it."""
+
+    def __init__(self, program: Program, tolerance: float, most: int, monitor: Monitor) -> None:
+        """Make the functions.
+
+        Args:
+            program: of one statement whose matrices are no variables.
+            tolerance: see `Sequence`.
+            most: iterations.
+            monitor: that is told of each iteration.
+        """
+        w, p = program.w, program.p
+        jacobian = program.jacobian
+        rows = jacobian(w, p)[1] if jacobian is not None else ca.jacobian(program.g, w)
+        self._program, self._monitor = program, monitor
+        self.tolerance, self._most = tolerance, most
+        outputs = [program.f, ca.densify(ca.gradient(program.f, w)), ca.densify(program.g), rows]
+        self._pattern = rows.sparsity()
+        self._full = Buffered(ca.Function("full", [w, p], outputs))
+        self._value = Buffered(ca.Function("value", [w, p], outputs[:1] + outputs[2:3]))
+        self._memory: Memory | None = None
+        self._last: tuple[bytes, tuple[Array, ...] | None] | None = None
+        self._stats: dict[str, Any] = {}
+
+    def __call__(
+        self, *, x0: Array, p: Array, lam_x0: Any = None, lam_g0: Any = None, **limits: Array
+    ) -> dict[str, Any]:
+        """Solve; arguments and results by the names of CasADi's solvers. Multipliers to start from are not needed."""
+        bounds = Bounds(**{name: np.asarray(value, dtype=float) for name, value in limits.items()})
+        layout = layout_of(self._program, bounds, self._pattern)
+        start = self._at(layout, p)(x0)
+        if start is None:
+            self._program.check_finite(x0, (p[:-1],))
+            self._stats = {"success": False, "return_status": str(Status.NO_NUMBER), "iter_count": 0}
+            return {"x": ca.DM(x0), "lam_x": ca.DM.zeros(x0.size), "lam_g": ca.DM.zeros(bounds.lbg.size)}
+        sequence = Sequence(
+            Functions(full=self._at(layout, p), value=self._values(p)),
+            layout,
+            bounds,
+            first=self._first(layout, p),
+            tolerance=self.tolerance,
+            most=self._most,
+            watch=self._monitor.seen,
+        )
+        memory = self._memory if lam_g0 is not None else None  # what was learnt at a plan helps near it
+        if memory is not None and memory.curvature.matrix.shape[0] != layout.chosen.size:
+            memory = None
+        ended = sequence.run(start, memory)
+        self._memory = ended.memory if ended.status is Status.SOLVED else None
+        self._stats = {
+            "success": ended.status is Status.SOLVED,
+            "return_status": str(ended.status),
+            "iter_count": ended.iterations,
+        }
+        return {"x": ca.DM(ended.place.w), "lam_x": ca.DM(ended.lam_x), "lam_g": ca.DM(ended.lam_g)}
+
+    def stats(self) -> dict[str, Any]:
+        """How the last call ended."""
+        return self._stats
+
+    def get_function(self, name: str) -> Callable[[Array, Array], tuple[Any, Any]]:
+        """Cost and slope ('nlp_grad_f'), or rows and their Jacobian ('nlp_jac_g'), at a point."""
+        first = {"nlp_grad_f": 0, "nlp_jac_g": 2}[name]
+
+        def chosen(w: Array, p: Array) -> tuple[Any, Any]:
+            outputs = self._outputs(np.asarray(w, dtype=float), p)
+            if outputs is None:
+                raise RuntimeError("the model fails")
+            if first:
+                return ca.DM(outputs[2]), ca.DM(self._pattern, outputs[3])
+            return ca.DM(outputs[0]), ca.DM(outputs[1])
+
+        return chosen
+
+    def _outputs(self, w: Array, p: Array) -> tuple[Array, ...] | None:
+        """Cost, slope, rows and the entries of their Jacobian at a point, the last one remembered; None: it fails."""
+        key = np.concatenate([w, p]).tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._full(w, p)
+        return self._last[1]
+
+    def _at(self, layout: Layout, p: Array) -> Callable[[Array], Place | None]:
+        """Everything at a point."""
+
+        def full(w: Array) -> Place | None:
+            outputs = self._outputs(w, p)
+            if outputs is None or not all(np.isfinite(values).all() for values in outputs):
+                return None
+            cost, slope, g, entries = outputs
+            return Place(w=w, cost=float(cost[0]), slope=slope, g=g, jacobian=layout.slopes(entries))
+
+        return full
+
+    def _values(self, p: Array) -> Callable[[Array], tuple[float, Array] | None]:
+        """Cost and rows at a point."""
+
+        def value(w: Array) -> tuple[float, Array] | None:
+            outputs = self._value(w, p)
+            if outputs is None or not all(np.isfinite(values).all() for values in outputs):
+                return None
+            return float(outputs[0][0]), outputs[1]
+
+        return value
+
+    def _slope(self, w: Array, p: Array) -> Array:
+        """Slope of the cost; NaN where it has none."""
+        outputs = self._outputs(w, p)
+        return np.full(w.size, np.nan) if outputs is None else outputs[1]
+
+    def _first(self, layout: Layout, p: Array) -> Callable[[Place], Curvature]:
+        (part,) = self._program.parts
+
+        def first(place: Place) -> Curvature:
+            trajectory, _ = part.unpack(place.w, p[:-1])
+            return first_curvature(
+                part,
+                layout.chosen,
+                place.w,
+                trajectory,
+                p[:-1],
+                lambda w: self._slope(w, p),
+            )
+
+        return first

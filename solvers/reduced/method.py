@@ -1,0 +1,170 @@
+"""The reduced method: sequential quadratic programming in the controls alone, on the compiled passage of covariances.
+
+States at the starts of the shooting segments follow from the controls by linearised continuity, matrices by their
+passage, so that the quadratic subproblems have the controls, free initial values, decisions and a free duration as
+variables and nothing else. Their Hessian is dense: at first that of the running cost, then learnt by damped updates
+(Nocedal and Wright, Numerical Optimization, 2006, procedure 18.2), and kept for the next solve that starts at a plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from covocp.base.arguments import checked, positive, whole
+from covocp.base.errors import ProblemError
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.base.residuals import LIMIT
+from covocp.extremal.costates import without_passage
+from covocp.extremal.extremal import Extremal, Guess, Outcome
+from covocp.solvers.endings import Ending
+from covocp.solvers.reached import Magnitudes
+from covocp.solvers.reduced.engine import Engine
+from covocp.solvers.reduced.statuses import Status
+from covocp.solvers.runs import Runs
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.program import Arrays, Program, Trajectories, alone
+from covocp.transcription.scales import choose_scales, evened
+from covocp.transcription.stiffness import resolve_mesh
+from covocp.transcription.transcribing import transcribe
+
+TOLERANCE = 3e-7
+# What is left at a point is judged by residuals of the first order, larger than the tolerance by this factor.
+LIMIT_PER_TOLERANCE = LIMIT / TOLERANCE
+# Control values from which on a dense Hessian is no longer the way.
+MOST_CONTROLS = 2000
+
+
+@checked("the method 'reduced'", tolerance=positive, max_iterations=whole(0))
+def prepare(
+    statement: Statement, options: Options, *, tolerance: float = TOLERANCE, max_iterations: int = 300
+) -> ReducedSolver:
+    """Make a problem ready; its functions are built at the first guess, which gives the scales.
+
+    The run has converged when the subproblem promises no more than tolerance^2 of the cost (or of what the controls
+    spend of it, where that is more), rows are met to 1e-8 of their units, and what is left in the scale of the point
+    that was reached holds (`covocp.base.residuals`).
+
+    Args:
+        statement: the problem.
+        options: mesh; matrices are eliminated.
+        tolerance: see above.
+        max_iterations: of one run.
+
+    Returns:
+        The solver; `solve` may be called often.
+
+    Raises:
+        ProblemError: an option is wrong, matrices cannot be eliminated, or there are too many control values.
+    """
+    mesh = _resolved(statement, options)
+    count = mesh.control_nodes * statement.nu
+    if count > MOST_CONTROLS:
+        raise ProblemError(
+            "The method 'reduced' has a dense Hessian in the control values.",
+            expected=f"at most {MOST_CONTROLS} of them",
+            received=f"{count}: {mesh.control_nodes} places, {statement.nu} entries of the controls",
+            remedy="use fewer intervals, or method='ipopt'",
+        )
+    return ReducedSolver(statement, mesh, float(tolerance), int(max_iterations))
+
+
+def _resolved(statement: Statement, options: Options) -> Mesh:
+    """The mesh, matrices eliminated.
+
+    Raises:
+        ProblemError: they cannot be.
+    """
+    if not statement.matrices:
+        return resolve_mesh(statement, options, statement.values)
+    if options.covariances == "states":
+        raise ProblemError(
+            "The method 'reduced' has no matrices as variables.",
+            expected="covariances='eliminated' or 'auto'",
+            received="'states'",
+            remedy="leave covariances= out, or use method='ipopt'",
+        )
+    try:
+        return resolve_mesh(statement, replace(options, covariances="eliminated"), statement.values)
+    except ProblemError as error:
+        if options.covariances == "eliminated" or "eliminated" not in str(error):
+            raise
+        raise ProblemError(
+            "The method 'reduced' needs matrices that follow from the nominal.",
+            expected="matrices that can be eliminated",
+            received=str(error.received),
+            remedy="use method='ipopt'",
+        ) from error
+
+
+class ReducedRuns(Runs):
+    """Runs of the sequence of subproblems in place of those of an NLP solver of CasADi."""
+
+    def __init__(self, statement: Statement, mesh: Mesh, tolerance: float, most: int) -> None:
+        """Keep the settings; see `prepare`."""
+
+        def build(scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> Program:
+            if scales is None:
+                scales = (choose_scales(statement, mesh, trajectories[0], parameters[0]),)
+            return alone(transcribe(statement, mesh, evened(scales[0], mesh), "compiled"))
+
+        super().__init__(build, "reduced", {}, True, max(LIMIT, LIMIT_PER_TOLERANCE * tolerance))
+        self._open = True
+        self._tolerance, self._most = tolerance, most
+
+    def _make(self, functions: dict[str, Any], warm: bool = False) -> Engine:
+        """The sequence on the present program; it needs no functions of another."""
+        assert self._nlp is not None
+        assert self._monitor is not None
+        return Engine(self._nlp, self._tolerance, self._most, self._monitor)
+
+    def _warm_solver(self) -> Engine:
+        """The same for all starts: what was learnt stays."""
+        assert isinstance(self._cold, Engine)
+        self._cold.tolerance = self._tolerance * self._strictness
+        return self._cold
+
+    def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
+        """The Hessian has a magnitude of its own."""
+        return 1.0
+
+    def _ending(self, name: str) -> Ending | None:
+        """The ending in these words."""
+        return next((status for status in Status if str(status) == name), None)
+
+
+class ReducedSolver:
+    """A problem made ready for the reduced method."""
+
+    def __init__(self, statement: Statement, mesh: Mesh, tolerance: float, most: int) -> None:
+        """Keep the settings; see `prepare`."""
+        self._statement, self._mesh = statement, mesh
+        self._runs = ReducedRuns(statement, mesh, tolerance, most)
+
+    @property
+    def mesh(self) -> Mesh:
+        """The resolved mesh."""
+        return self._mesh
+
+    def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
+        """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
+        last, counts = self._runs.solve((parameters,), (guess,), progress)
+        nlp, point, (trajectories, values) = last.nlp, last.point, last.where
+        (multipliers,) = nlp.unpack_multipliers(point.lam_x, point.lam_g, trajectories, (parameters,))
+        extremal = Extremal(
+            stated=self._statement,
+            mesh=self._mesh,
+            trajectory=trajectories[0],
+            parameters=parameters,
+            multipliers=multipliers,
+        )
+        return Outcome(
+            extremal=without_passage(extremal),
+            cost_terms={"terminal": values["terminal"], "running": values["running"]},
+            converged=last.converged,
+            message=self._runs.message(last),
+            violations=nlp.violations(values["g"], (parameters,)),
+            stats=counts,
+        )

@@ -1,0 +1,50 @@
+"""Threads of linear algebra are one while covocp computes, and as many as before afterwards."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import covocp as co
+from covocp.base.threads import TURN
+
+
+def counts() -> list[int]:
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+
+def test_linear_algebra_has_one_thread_for_as_long_as_a_call_lasts():
+    seen = []
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = counts()
+
+        def guess(s):
+            seen.append(counts())
+            return np.ones_like(s)
+
+        ocp = co.Problem(1.0)
+        x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u", guess=guess)
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2)
+        assert co.solve(ocp, intervals=10).cost == pytest.approx(1.0)
+        assert counts()[: len(before)] == before
+    assert len(before) >= 1
+    assert seen
+    assert set(seen[0]) == {1}
+
+
+def test_they_are_restored_after_an_error_and_while_other_threads_have_their_turn():
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = counts()
+        with pytest.raises(co.ProblemError):
+            co.solve(co.Problem(1.0))
+        assert counts() == before
+        with TURN:
+            with TURN:
+                assert set(counts()) == {1}
+            assert set(counts()) == {1}
+            with TURN.handed_over():
+                assert counts() == before
+            assert set(counts()) == {1}
+        assert counts() == before
