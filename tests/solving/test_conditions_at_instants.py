@@ -531,3 +531,39 @@ def test_a_comparison_counts_what_is_missed_there() -> None:
 def test_the_certificate_says_that_it_does_not_know_them() -> None:
     found = co.solve(learning(0.05), intervals=10, progress=False)
     assert "instants" in str(co.certify(found))
+
+
+# --- other methods, solved from elsewhere -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        through,
+        lambda: swift(0.0, upper=0.2),
+        lambda: learning(0.05, sampled=True),
+        lambda: timed(co.Free(4.0, 0.5, 20.0), moving=True),
+    ],
+)
+def test_the_reduced_method_meets_them(problem: Any) -> None:
+    found = co.solve(problem(), intervals=30, **QUIET)
+    reduced = co.solve(problem(), "reduced", intervals=30, progress=False)
+    assert reduced.cost == pytest.approx(found.cost, rel=1e-6)
+    np.testing.assert_allclose(reduced.multipliers.instants, found.multipliers.instants, rtol=2e-6)
+
+
+def test_instants_stay_where_another_start_is_solved_for() -> None:
+    solver = co.Solver(swift(0.9), intervals=10, tolerance=1e-10)
+    found = solver.solve(initial={"x": 0.2}, progress=False)
+    assert found.at(1.2)["v"] == pytest.approx(0.9, abs=1e-9)
+    assert found.at(0.0)["x"] == pytest.approx(0.2)
+    with pytest.raises(co.ProblemError, match="'speed' holds at an instant, which another duration"):
+        solver.solve(duration=2.0, progress=False)
+
+
+def test_a_share_of_another_duration_is_a_share_of_it() -> None:
+    solver = co.Solver(timed(4.0, moving=False), intervals=30, tolerance=1e-10)
+    found = solver.solve(duration=3.5, progress=False)
+    other = co.solve(timed(3.5, moving=False), intervals=30, **QUIET)
+    assert found.cost == pytest.approx(other.cost, rel=1e-9)
+    assert found.at(1.4)["x"] == pytest.approx(other.at(1.4)["x"], rel=1e-7)

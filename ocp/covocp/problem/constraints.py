@@ -57,7 +57,7 @@ def with_constraint(
         )
     own_place: dict[str, Any] = {"at": place, "where": caller(), "between": between is not None}
     if place == "inside" and instant is not None:
-        own_place |= {"instant": instant[0], "late": instant[1]}
+        own_place |= {"instant": instant[0], "late": instant[1], "relative": relative}
     entry = Constraint(name=label, expression=value, lower=low, upper=high, **own_place)
     return own.adding(constraints=entry)
 

@@ -366,7 +366,8 @@ class Data:
 class Constraint:
     """lower <= expression <= upper along the path, at the start, at the end or at an instant of the horizon.
 
-    between: not at the nodes alone. instant: share of T of one that holds inside; late: after what happens then.
+    between: not at the nodes alone. instant: share of T of one that holds inside; late: after what happens then;
+    relative: whether it was stated as a share.
     chance: the condition on probabilities that it stands for, with this name; else None.
     """
 
@@ -379,6 +380,7 @@ class Constraint:
     between: bool = False
     instant: float | None = None
     late: bool = True
+    relative: bool = False
     chance: Chance | None = None
 
     __repr__ = short_repr

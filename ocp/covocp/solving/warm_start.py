@@ -149,6 +149,8 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
         elif block.kind == "control":
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+            if mesh.control == "linear":  # which may jump at an instant
+                u[mesh.instants, block.span] = ahead[block.name].reshape(-1, block.size)
         else:
             e[:, block.span] = pack(sample[block.name])
             e[mesh.instants, block.span] = pack(ahead[block.name])
