@@ -303,7 +303,7 @@ def test_shares_of_the_free_durations_of_phases(method: str) -> None:
         return co.Problem.of(replace(own, name=name, states=states, cost=(u**2 + 0.5, own.cost[1])))
 
     free = co.Phases([part("one", True, co.Free(3.0, 0.3, 20.0)), part("two", False, co.Free(3.0, 0.3, 20.0))])
-    found = co.solve(free, intervals=20, **(QUIET if method == "ipopt" else GRADIENT))
+    found = co.solve(free, intervals=20 if method == "ipopt" else 10, **(QUIET if method == "ipopt" else GRADIENT))
     for phase in found.phases:
         assert phase.optimality.transversality < 1e-6
         assert phase.optimality.hamiltonian_variation < 1e-5
@@ -519,6 +519,18 @@ def test_the_printout_has_values_and_multipliers() -> None:
     assert "condition at an instant" in text
     assert "a node for conditions at 2 instants" in text
     assert "measurements taken" not in text
+    rows = {line.split()[0]: line.split() for line in str(sided()).splitlines() if line.startswith(("late", "early"))}
+    assert rows["late"][1:3] == ["2", "after"]
+    assert rows["early"][1:3] == ["2", "before"]
+    assert float(rows["late"][3]) == pytest.approx(0.5)
+
+
+def sided() -> co.Solution:
+    """A control that is something else before and after an instant."""
+    ocp, _, _, u = errand(5.0)
+    ocp.subject_to(u, at=2.0, lower=0.5, name="late")
+    ocp.subject_to(u, at=2.0, upper=-0.5, name="early", side="before")
+    return co.solve(ocp, intervals=10, progress=False)
 
 
 def test_a_comparison_counts_what_is_missed_there() -> None:

@@ -10,6 +10,7 @@ from covocp.base.pages import Section, Sentence, Table, number
 
 if TYPE_CHECKING:
     from covocp.solution.solution import Solution
+    from covocp.statement.conditions import Instant
 
 # Rows that a printout lists.
 MOST_ROWS = 20
@@ -27,12 +28,18 @@ def instant_section(solution: Solution) -> Section:
     if st is None or not st.inside.size:
         return []
     values = next(rows[0] for _, place, rows in solution.extremal.inequalities() if place == "instants")
-    times = np.repeat([part.place for part in st.inside.parts], [part.conditions.size for part in st.inside.parts])
+    whens = [_when(part, solution.duration) for part in st.inside.parts for _ in part.conditions.names]
     rows = []
     for i, name in enumerate(st.inside.names[:MOST_ROWS]):
         low, high = (number(float(v)) if np.isfinite(v) else "-" for v in (st.inside.lower[i], st.inside.upper[i]))
-        row = [name, number(float(times[i] * solution.duration)), low, number(float(values[i])), high]
+        row = [name, whens[i], low, number(float(values[i])), high]
         rows.append([*row, number(float(solution.multipliers.instants[i]))])
     left = st.inside.size - len(rows)
     table = Table(columns=["condition at an instant", "t [s]", "lower", "value", "upper", "multiplier"], rows=rows)
     return [table, Sentence(f"and {left} more")] if left else [table]
+
+
+def _when(part: Instant, duration: float) -> str:
+    """The time of an instant [s], with its side where that makes a difference."""
+    side = "" if not part.apart else " after" if part.late else " before"
+    return f"{number(part.place * duration, 6)}{side}"
