@@ -38,7 +38,7 @@ from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
-from covocp.solving.between_nodes import check_between, watched
+from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.decisions import bent_data, far_away
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -143,7 +143,7 @@ class Solver:
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
-            asked = refining.first_options(self.statement, asked, nominal, points=method == "ipopt")
+            asked = refining.first_options(self.statement, asked, nominal, points=method != AT_NODES)
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)

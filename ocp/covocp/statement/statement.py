@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -397,8 +398,7 @@ class Statement:
 
     def boundary_values(self, parameters: Array) -> Boundary:
         """Initial state, final state, initial matrices, final matrices for these parameters (NaN: free)."""
-        values = self.boundary(parameters)
-        return Boundary(*(np.asarray(value.full()).ravel() for value in values))
+        return Boundary(*(values.copy() for values in _boundary_values(self, tuple(parameters.tolist()))))
 
     def started(self, x0: Expr, parameters: Expr, e0: Expr = None) -> tuple[Any, Any]:
         """Initial state and half-vectors with what decisions give of them; numbers or symbols.
@@ -479,3 +479,9 @@ def entries_of(matrix: Any) -> list[str]:
 def half_names(name: str, labels: tuple[str, ...]) -> list[str]:
     """Names of the entries of the half-vector of a matrix, such as 'E[x, b]'."""
     return [f"{name}[{labels[i]}, {labels[j]}]" for i, j in zip(*half_indices(len(labels)), strict=True)]
+
+
+@lru_cache(maxsize=16)
+def _boundary_values(statement: Statement, parameters: tuple[float, ...]) -> Boundary:
+    """See `Statement.boundary_values`, which is asked several times in every solve."""
+    return Boundary(*(np.asarray(value.full()).ravel() for value in statement.boundary(np.array(parameters))))
