@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,7 @@ class Elsewhere:
         """The duration, None where it is that of the problem.
 
         Raises:
-            ProblemError: it is free, or something is read at instants.
+            ProblemError: it is free, or something is read or holds at instants.
         """
         own = self.problem.declarations
         value = check_positive("duration", duration, unit="s")
@@ -91,10 +91,12 @@ class Elsewhere:
                 received=f"duration={value:g}, and {own.free_duration}",
                 remedy="leave duration= out, or state the problem with a number",
             )
-        if own.sampled:
+        held = [entry.name for entry in own.constraints if entry.instant is not None and not entry.relative]
+        if own.sampled or held:
+            what = f"'{own.sampled[0].name}' is read at instants" if own.sampled else f"'{held[0]}' holds at an instant"
             raise ProblemError(
-                f"'{own.sampled[0].name}' is read at instants, which another duration would have elsewhere.",
-                expected="continuous measurements",
+                f"{what}, which another duration would have elsewhere.",
+                expected="continuous measurements, and conditions at shares of the duration (relative=True)",
                 received=f"duration={value:g}",
                 remedy="state the problem anew, with the instants that are left",
             )
@@ -109,8 +111,16 @@ class Elsewhere:
             ProblemError: one of them is wrong.
         """
         own = self.problem.declarations
+        for argument, given in (("parameters", parameters), ("means", means)):
+            if given is not None and not isinstance(given, Mapping):
+                raise ProblemError(
+                    f"The values of {argument}= are not given by name.",
+                    expected="a dict of symbol or name to value",
+                    received=repr(given)[:100],
+                    remedy=f"write {argument}={{'name': value}}",
+                )
         result = dict(parameters or {})
-        for key, value in dict(means or {}).items():
+        for key, value in (means or {}).items():
             name = find_name(key, "means", list(own.unknowns), own.unknowns)
             if any(find_name_or_none(given, own.unknowns) == name for given in result):
                 raise ProblemError(
