@@ -27,6 +27,7 @@ class Start:
     Args:
         of: the state or the matrix.
         parameter: name of the parameter: known entries of the state, half-vector of the matrix.
+        place: its rows among all initial states, or among all half-vectors.
         value: as declared, of the parameter.
         known: which entries of a state are no free ones; of a matrix all.
         lower, upper: bounds of these entries.
@@ -34,6 +35,7 @@ class Start:
 
     of: State | Matrix
     parameter: str
+    place: slice
     value: Array
     known: tuple[int, ...]
     lower: Array
@@ -69,9 +71,15 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
     for position, state in enumerate(declarations.states):
         if state.role == "moving":
             span = next(b for b in statement.states if b.name == state.name).span
-            declarations = _with_start(declarations, position, start[span], starts)
+            declarations = _with_start(declarations, position, span, start[span], starts)
+    estimated = next((position for position, matrix in enumerate(declarations.matrices) if matrix.estimation), None)
+    spreads = {c.chance.spread for c in declarations.constraints if c.chance is not None} - {None}
+    followers = [] if estimated is None else [i for i, m in enumerate(declarations.matrices) if m.name in spreads]
     for position, matrix in enumerate(declarations.matrices):
-        half = matrices[next(b for b in statement.matrices if b.name == matrix.name).span]
+        if position in followers and position != estimated:
+            continue  # the actual system starts where its filter does
+        place = next(b for b in statement.matrices if b.name == matrix.name).span
+        half = matrices[place]
         if matrix.backward is None and matrix.role == "moving" and not np.isnan(half).any():
             own = _parameter(declarations, matrix, half)
             limits = np.full(half.size, np.inf)
@@ -79,17 +87,22 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
                 Start(
                     of=matrix,
                     parameter=own.name,
+                    place=place,
                     value=half,
                     known=tuple(range(half.size)),
                     lower=-limits,
                     upper=limits,
                 )
             )
-            declarations = _started(declarations.adding(parameters=own), "matrices", position, own.symbol)
+            declarations = declarations.adding(parameters=own)
+            for one in {position, *followers} if position == estimated else {position}:
+                declarations = _started(declarations, "matrices", one, own.symbol)
     return Restartable(declarations=declarations, starts=tuple(starts))
 
 
-def _with_start(declarations: Declarations, position: int, start: Array, starts: list[Start]) -> Declarations:
+def _with_start(
+    declarations: Declarations, position: int, place: slice, start: Array, starts: list[Start]
+) -> Declarations:
     """The declarations with the known initial values of a state as a parameter."""
     state, known = declarations.states[position], np.flatnonzero(~np.isnan(start)).tolist()
     if not known:
@@ -100,6 +113,7 @@ def _with_start(declarations: Declarations, position: int, start: Array, starts:
         Start(
             of=state,
             parameter=own.name,
+            place=place,
             value=start[known],
             known=tuple(known),
             lower=state.lower[known],
@@ -124,6 +138,19 @@ def _started(declarations: Declarations, group: str, position: int, initial: Exp
     found[position] = replace(found[position], initial=initial)
     changed: dict[str, Any] = {group: tuple(found)}
     return replace(declarations, **changed)
+
+
+def declared_values(starts: tuple[Start, ...], statement: Statement, parameters: Array) -> dict[str, Array]:
+    """Parameters for the initial values that are declared, for these values of what they may depend on.
+
+    Args:
+        starts: of a restartable problem.
+        statement: of the problem before.
+        parameters: of that statement.
+    """
+    states, _, matrices, _ = statement.boundary_values(parameters)
+    values = ((start, states if isinstance(start.of, State) else matrices) for start in starts)
+    return {start.parameter: found[start.place][list(start.known)] for start, found in values}
 
 
 def values_of(starts: tuple[Start, ...], initial: Given, covariance: Given) -> dict[str, Array]:
@@ -172,8 +199,18 @@ def _by_name(given: Given, argument: str, kind: str, starts: Mapping[str, Start]
             received=repr(given)[:100],
             remedy=f"write {argument}={{'name': value}}",
         )
-    known = tuple(start.of for start in starts.values())
-    return {find_name(getattr(key, "_stands_for", key), argument, list(known), known): v for key, v in given.items()}
+    known, result = tuple(start.of for start in starts.values()), dict[str, Any]()
+    for key, value in given.items():
+        name = find_name(getattr(key, "_stands_for", key), argument, list(known), known)
+        if name in result:
+            raise ProblemError(
+                f"{argument}= has two values of '{name}'.",
+                expected="one value for each",
+                received="one by its symbol and one by its name",
+                remedy="leave one of them out",
+            )
+        result[name] = value
+    return result
 
 
 def _state_value(start: Start, value: Given) -> Array:

@@ -136,7 +136,10 @@ class Solver:
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
         self._elsewhere = Elsewhere(
-            problem=problem, make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options)
+            declarations=problem.declarations,
+            statement=self.statement,
+            duration_read=problem.duration_read,
+            make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options),
         )
         count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
