@@ -14,6 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, pack
 from covocp.base.short_repr import short_repr
+from covocp.problem.attitude import as_quaternion
 from covocp.problem.checks import find_name
 from covocp.problem.declarations import Declarations, Matrix, Parameter, State
 from covocp.problem.estimation_covariance import with_estimation
@@ -220,6 +221,9 @@ def _state_value(start: Start, value: Given) -> Array:
         ProblemError: it does not fit.
     """
     name, size = start.of.name, start.of.size
+    if isinstance(start.of, State) and start.of.chart is not None:
+        numbers = np.asarray(ca.evalf(as_quaternion(name, value, "initial attitude")).full()).ravel()
+        return -numbers if numbers @ start.value < 0 else numbers  # of q and -q the one that the guess begins with
     numbers = np.atleast_1d(as_number(name, "initial value", value)).astype(float)
     if numbers.size != size or numbers.ndim > 2:
         raise _wrong(name, f"{size} numbers", f"shape {numbers.shape}")
@@ -233,9 +237,6 @@ def _state_value(start: Start, value: Given) -> Array:
     if not inside.all():
         limits = f"within the bounds {start.lower} to {start.upper}"
         raise _wrong(name, f"numbers {limits} of the state", str(numbers[known]))
-    chart = start.of.chart if isinstance(start.of, State) else None
-    if chart is not None and abs(float(numbers @ numbers) - 1.0) > 1e-9:
-        raise _wrong(name, "a unit quaternion", f"one of length {float(np.sqrt(numbers @ numbers)):.9g}")
     return numbers[known]
 
 
