@@ -41,8 +41,8 @@ from covocp.solution.solution import Solution as Solution
 from covocp.solving.elsewhere import movable as movable
 from covocp.solving.evaluation import evaluate as evaluate
 from covocp.solving.methods import methods as methods
+from covocp.solving.once import solve as solve
 from covocp.solving.solver import Solver as Solver
-from covocp.solving.solver import solve as solve
 
 __all__ = [
     "Problem",

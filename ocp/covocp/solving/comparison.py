@@ -23,7 +23,8 @@ from covocp.problem.phases import Phases
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, method_options
-from covocp.solving.solver import Solver, check_problem, solve
+from covocp.solving.once import solve
+from covocp.solving.solver import Solver, check_problem
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:

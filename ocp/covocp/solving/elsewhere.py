@@ -134,12 +134,12 @@ class Elsewhere:
             if given is not None and not isinstance(given, Mapping):
                 raise ProblemError(
                     f"The values of {argument}= are not given by name.",
-                    expected="a dict of name or symbol to value",
+                    expected="a dict of symbol or name to value",
                     received=repr(given)[:100],
                     remedy=f"write {argument}={{'name': value}}",
                 )
         result = dict(parameters or {})
-        for key, value in dict(means or {}).items():
+        for key, value in (means or {}).items():
             name = find_name(key, "means", list(own.unknowns), own.unknowns)
             if any(find_name_or_none(given, own.unknowns) == name for given in result):
                 raise ProblemError(

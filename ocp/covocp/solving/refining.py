@@ -178,7 +178,7 @@ def adapted(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[s
     share = float(np.clip(SOLVED * refine, STRICTEST, LOOSEST))
     if VIOLATION in known:
         return {VIOLATION: share, **own}
-    if own.get("plugin", "ipopt") != "ipopt":
+    if "plugin" not in known or own.get("plugin", "ipopt") != "ipopt":
         return own
     result = dict(own) if own.get("tolerance") is not None else {**own, "tolerance": share}
     given = dict(own.get("plugin_options") or {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -25,26 +25,25 @@ from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.threads import methods_one_at_a_time, one_at_a_time
+from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
-from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
-from covocp.solving.between_nodes import check_between, watched
+from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.decisions import bent_data, far_away
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
-from covocp.solving.methods import METHODS, check_method, method_options
+from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
@@ -54,7 +53,7 @@ from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Mesh, Options, with_substeps
 
 if TYPE_CHECKING:
-    from covocp.solution.phases import PhasesSolution
+    pass
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
@@ -145,7 +144,7 @@ class Solver:
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
-            asked = refining.first_options(self.statement, asked, nominal, points=method == "ipopt")
+            asked = refining.first_options(self.statement, asked, nominal, points=method != AT_NODES)
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
@@ -501,65 +500,3 @@ def is_roundoff(cost: float, statement: Statement, options: Options, parameters:
 
 def _noted(solution: Solution, **stats: Any) -> Solution:
     return replace(solution, stats={**solution.stats, **stats})
-
-
-@overload
-def solve(problem: Problem, method: str = "ipopt", **options: Any) -> Solution: ...
-
-
-@overload
-def solve(problem: Phases, method: str = "ipopt", **options: Any) -> PhasesSolution: ...
-
-
-@one_at_a_time
-@checked(method=text, nominal=text, progress=truth, allow_failure=truth)
-def solve(
-    problem: Problem | Phases,
-    method: str = "ipopt",
-    *,
-    intervals: Given = None,
-    guess: Given = None,
-    nominal: str = "combined",
-    progress: bool = True,
-    allow_failure: bool = False,
-    parameters: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> Solution | PhasesSolution:
-    """Solve a problem; `Solver` behind it solves again without rebuilding. Or several phases as one problem.
-
-    Args:
-        problem: what to solve.
-        method: a name in `methods()`.
-        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of
-            each, or a list of one for each.
-        guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
-            or a dict by name of the phase.
-        nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
-        progress: whether to show the iterations on a terminal.
-        allow_failure: return the last iterate of a run that did not converge instead of raising.
-        parameters: values of parameters other than the declared ones, by name.
-        options: of the mesh and of the method; see `Solver`.
-
-    Returns:
-        The solution; a `PhasesSolution` of phases.
-
-    Raises:
-        ProblemError: the statement or an option is wrong.
-        SolveError: the method did not converge (carries the last iterate).
-        Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
-    """
-    if isinstance(problem, Phases):
-        check_method(method)
-        run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
-        run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
-        return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
-    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
-    if extra and not isinstance(guess, str):
-        raise ProblemError(
-            "The options of multistart are given, but not multistart.",
-            expected="guess='multistart'",
-            received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
-            remedy="add guess='multistart', or remove them",
-        )
-    solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
-    return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)
