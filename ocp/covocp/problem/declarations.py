@@ -114,7 +114,7 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
-    """A known number."""
+    """A known number, vector or matrix; matrix: the symbol as such, its columns one below the other in `symbol`."""
 
     name: str
     symbol: ca.MX
@@ -122,6 +122,7 @@ class Parameter:
     where: str
     unit: str
     value: Array
+    matrix: ca.MX | None = None
 
     __repr__ = short_repr
 
