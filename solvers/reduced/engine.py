@@ -67,7 +67,8 @@ class Engine:
         memory = self._memory if lam_g0 is not None else None  # what was learnt at a plan helps near it
         if memory is not None and memory.curvature.matrix.shape[0] != layout.chosen.size:
             memory = None
-        ended = sequence.run(start, memory)
+        with np.errstate(all="ignore"):  # a step into numbers too large to be squared is one that is not taken
+            ended = sequence.run(start, memory)
         self._memory = ended.memory if ended.status is Status.SOLVED else None
         self._stats = {
             "success": ended.status is Status.SOLVED,

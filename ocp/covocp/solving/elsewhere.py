@@ -92,7 +92,7 @@ class Elsewhere:
         """The duration, None where it is that of the problem.
 
         Raises:
-            ProblemError: it is free, something is read at instants, or its number may be in the expressions.
+            ProblemError: it is free, something is read or holds at instants, or its number may be in the expressions.
         """
         own = self.declarations
         value = check_positive("duration", duration, unit="s")
@@ -103,10 +103,12 @@ class Elsewhere:
                 received=f"duration={value:g}, and {own.free_duration}",
                 remedy="leave duration= out, or state the problem with a number",
             )
-        if own.sampled:
+        held = [entry.name for entry in own.constraints if entry.instant is not None and not entry.relative]
+        if own.sampled or held:
+            what = f"'{own.sampled[0].name}' is read at instants" if own.sampled else f"'{held[0]}' holds at an instant"
             raise ProblemError(
-                f"'{own.sampled[0].name}' is read at instants, which another duration would have elsewhere.",
-                expected="continuous measurements",
+                f"{what}, which another duration would have elsewhere.",
+                expected="continuous measurements, and conditions at shares of the duration (relative=True)",
                 received=f"duration={value:g}",
                 remedy="state the problem anew, with the instants that are left",
             )

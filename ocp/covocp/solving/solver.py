@@ -50,6 +50,7 @@ from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
+from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Mesh, Options, with_substeps
 
 if TYPE_CHECKING:
@@ -148,7 +149,8 @@ class Solver:
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
-        self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
+        asked = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
+        self._options = with_instants(self.statement, asked)
         if refine is not None:
             self._options = refining.with_layers(self.statement, self._options, self.statement.values)
         self._own_steps = self._options.substeps == "auto" and refine is None

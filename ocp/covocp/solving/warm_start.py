@@ -116,8 +116,10 @@ def _from_solution(
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
         trajectory = _resampled(statement, mesh, parameters, solution, matched, elapsed)
-    constraints = (statement.path.size, statement.start.size, statement.end.size)
-    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+    st = statement
+    constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
+    own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
+    if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
     width = statement.nx + (0 if mesh.eliminated else statement.ne)
     same = elapsed is None and nodes and own.segments == mesh.segments
@@ -185,6 +187,8 @@ def _resampled(
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
         elif block.kind == "control":
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+            if mesh.control == "linear":  # which may jump at an instant
+                u[mesh.instants, block.span] = ahead[block.name].reshape(-1, block.size)
         else:
             e[:, block.span] = pack(sample[block.name])
             e[mesh.instants, block.span] = pack(ahead[block.name])
