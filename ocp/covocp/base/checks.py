@@ -111,18 +111,6 @@ def column(name: str, what: str, value: Given, size: int, *, nan: bool = False, 
     return numbers
 
 
-def stacked_columns(name: str, value: Given, shape: tuple[int, ...]) -> Array:
-    """A matrix of numbers, its columns one below the other.
-
-    Raises:
-        ProblemError: another shape, NaN or inf.
-    """
-    numbers = as_number(name, "value", value)
-    if numbers.shape != shape:
-        raise shape_error(name, "value", f"a matrix, {shape[0]} x {shape[1]}", f"shape {numbers.shape}")
-    return column(name, "value", numbers.ravel(order="F"), numbers.size)
-
-
 def one_number(name: str, what: str, value: Given) -> float:
     """The value as one number, which may be NaN or infinite."""
     return float(column(name, what, value, 1, nan=True, inf=True)[0])

@@ -17,7 +17,6 @@ from covocp.base.checks import (
     check_positive,
     column,
     density_matrix,
-    stacked_columns,
 )
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
@@ -269,28 +268,14 @@ class Problem:
 
     @checked(unit=text)
     def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
-        """Declare a known number, vector or matrix that may change from solve to solve without rebuilding.
-
-        Args:
-            name: unique name.
-            value: declared value, shape (), (n,) or (r, c).
-            unit: for printouts and files.
-
-        Returns:
-            The symbol, shape (n, 1) or (r, c). By its name a solution has the entries of a matrix column by column.
+        """Declare a known number (or vector) that may change from solve to solve without rebuilding.
 
         Raises:
             ProblemError: name used twice, NaN or inf.
         """
-        shape = np.shape(as_number(name, "value", value))
-        symbol = _symbol(name, self._declare(name, int(np.prod(shape))), unit)
-        if len(shape) != 2 or 1 in shape:
-            entry = Parameter(**symbol, value=column(name, "value", value, symbol["size"]))
-            return self._add("parameters", entry).symbol
-        matrix = cast(ca.MX, ca.reshape(symbol["symbol"], *shape))
-        entry = Parameter(**symbol, value=stacked_columns(name, value, shape), matrix=matrix)
-        self._add("parameters", entry)
-        return matrix
+        size = self._declare(name, int(np.size(as_number(name, "value", value))))
+        entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
+        return self._add("parameters", entry).symbol
 
     @checked(unit=text)
     def decision(

@@ -115,7 +115,7 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
-    """A known number, vector or matrix; matrix: the symbol as such, its columns one below the other in `symbol`."""
+    """A known number."""
 
     name: str
     symbol: ca.MX
@@ -123,7 +123,6 @@ class Parameter:
     where: str
     unit: str
     value: Array
-    matrix: ca.MX | None = None
 
     __repr__ = short_repr
 

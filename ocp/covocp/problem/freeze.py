@@ -93,7 +93,6 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
-        parameter_matrices={q.name: q.matrix for q in problem.parameters if q.matrix is not None},
         expression=_expression_builder(stacked),
     )
 

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import bound_columns, column, stacked_columns
+from covocp.base.checks import bound_columns, column
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.matrices import Array, half_length, unpack_indices
@@ -157,9 +157,7 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
             remedy="write parameters={'name': value}",
         )
     for key, value in given.items():
-        matrices = statement.parameter_matrices
-        own = next((n for n, matrix in matrices.items() if isinstance(key, ca.MX) and ca.is_equal(key, matrix)), "")
-        name = own or name_of(key, statement.symbols, tuple(blocks), missing_ok=True)
+        name = name_of(key, statement.symbols, tuple(blocks), missing_ok=True)
         if not name:
             raise ProblemError(
                 f"There is no parameter '{key}'.",
@@ -167,10 +165,7 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
                 received=repr(key)[:100],
                 remedy=spelling(key, blocks, _not_given(str(key), statement, bool(blocks))),
             )
-        if name in matrices:
-            values[blocks[name].span] = stacked_columns(name, value, matrices[name].shape)
-        else:
-            values[blocks[name].span] = column(name, "value", value, blocks[name].size)
+        values[blocks[name].span] = column(name, "value", value, blocks[name].size)
     return values
 
 

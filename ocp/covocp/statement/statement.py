@@ -210,7 +210,6 @@ class Statement:
         data: values over time that are in some of these functions.
         geometry: how the state moves where some of it is no vector.
         expression: a user's expression -> function of the six inputs.
-        parameter_matrices: symbols (r, c) of the parameters that are matrices, by name.
     """
 
     name: str
@@ -249,7 +248,6 @@ class Statement:
     geometry: Geometry
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
-    parameter_matrices: Mapping[str, Any] = field(repr=False, default_factory=dict)
 
     __repr__ = short_repr
 
