@@ -1,7 +1,8 @@
 """Inequalities as penalties d int c^2 1[c > 0] dt, with weights raised and shifts learnt (gradient method).
 
 Path conditions and bounds on states and matrices count at the nodes of the mesh, with the trapezoidal weights of the
-nodes; initial and final conditions count once. Each row lower <= c <= upper has its own weight d and its shift m/(2 d),
+nodes; initial and final conditions and those at instants count once. Each row lower <= c <= upper has its own weight d
+and its shift m/(2 d),
 
     d { c + m/(2d) - clip(c + m/(2d)) }^2,
 
@@ -32,6 +33,9 @@ from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import at_nodes
 
 Indices = NDArray[np.intp]
+
+# Kind of a group of conditions at one instant.
+INSTANT = "instant"
 
 # The first weight makes a violation by the typical magnitude of a row, everywhere, cost this many times the cost.
 FIRST_WEIGHT = 10.0
@@ -118,6 +122,19 @@ def penalty_groups(
     left = [i for i in range(statement.end.size) if i not in exact]
     path, end, start = statement.path, statement.end, statement.start
     own = start.size - (0 if statement.tied is None else len(statement.tied.states))  # the others hold by themselves
+    at_instants = [
+        _group(
+            statement,
+            INSTANT,
+            part.conditions.names,
+            every[k : k + 1],
+            once,
+            part.conditions.function,
+            part.conditions.lower,
+            part.conditions.upper,
+        )
+        for part, k in zip(statement.inside.parts, mesh.nodes_of(statement.inside), strict=True)
+    ]
     candidates = [
         _group(statement, "path", path.names, every, shares, path.function, path.lower, path.upper),
         _group(
@@ -150,6 +167,7 @@ def penalty_groups(
             lower[bounded],
             upper[bounded],
         ),
+        *at_instants,
     ]
     return tuple(group for group in candidates if group is not None)
 
@@ -231,7 +249,7 @@ def first_weights(
 
 def _evaluate(group: Group, mesh: Mesh, run: Run, parameters: Array, weights: Array, shifts: Array) -> list[Array]:
     count = group.nodes.size
-    controls = at_nodes(run.u, mesh.nodes.size)[group.nodes]
+    controls = at_nodes(mesh.acting(run.u.T).T, mesh.nodes.size)[group.nodes]
     outputs = group.function(
         run.z[group.nodes].T,
         controls.T,

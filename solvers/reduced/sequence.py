@@ -206,7 +206,7 @@ class Sequence:
         violation = float(self._violations(place.g).max(initial=0.0))
         if left > STUCK and violation > FEASIBLE:
             return Status.INFEASIBLE
-        if violation <= FEASIBLE and self._gain(place, step, curvature) <= self._tolerance**2:
+        if violation <= FEASIBLE and np.sqrt(self._gain(place, step, curvature)) <= self._tolerance:
             return Status.SOLVED
         return None
 
@@ -214,7 +214,7 @@ class Sequence:
         """What the subproblem promises, relative to the cost or to what controls spend of it."""
         z = place.w[self._layout.chosen]
         size = max(abs(place.cost), SPENT * float(z @ curvature.matrix @ z), float(np.finfo(float).tiny))
-        return float(step.change @ curvature.matrix @ step.change) / size
+        return max(float(step.change @ curvature.matrix @ step.change), 0.0) / size
 
     def _searched(
         self, place: Place, rows: Subproblem, step: Step, curvature: Curvature, weights: Array, left: float

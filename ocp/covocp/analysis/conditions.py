@@ -59,6 +59,8 @@ def _kind(statement: Statement) -> str:
         return "the nominal depends on the estimation covariance"
     if statement.samples is not None:
         return "measurements are taken at instants: " + ", ".join(block.name for block in statement.samples.blocks)
+    if statement.inside.size:
+        return "conditions hold at instants inside the horizon: " + ", ".join(statement.inside.names)
     if statement.measurement is None:
         return "nothing is measured"
     if not statement.nu:

@@ -553,17 +553,21 @@ class Problem:
         expected = expected_cost(own, running, terminal, terminal_weight, control_weight, gain)
         self._change(replace(own, expected=expected))
 
+    @checked(relative=truth)
     def subject_to(
         self,
         expression: Given,
         *,
         lower: Given = None,
         upper: Given = None,
-        at: Place | None = None,
+        equals: Given = None,
+        at: Place | float | None = None,
+        relative: bool = False,
+        side: Literal["before", "after"] | None = None,
         name: str | None = None,
         between: Literal["auto"] | None = None,
     ) -> None:
-        """Require lower <= expression <= upper.
+        """Require lower <= expression <= upper, or expression = equals.
 
         Path constraints hold at the nodes of the mesh, and at the ends of the integration steps where an interval has
         several (`points=` of `solve`); `Solution.check_path` looks between them. With constant controls a path
@@ -574,17 +578,23 @@ class Problem:
             expression: of states, controls, matrix states, decisions, integrals, time; a column or a scalar.
             lower: numbers, shape of the expression; None: no lower bound.
             upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
-            at: "path", "initial" or "final"; None: "path", and "final" for integrals and for decisions alone.
-                An instant inside the horizon is the end of a phase (`Phases`).
+            equals: numbers, shape of the expression, in place of both.
+            at: "path", "initial", "final", or an instant inside the horizon [s], at which the mesh gets a node; None:
+                "path", and "final" for integrals and for decisions alone.
+            relative: whether the instant is a share of the duration, as it must be where that is free.
+            side: of an instant: "after" what is measured then and with the control that goes on, as by default, or
+                "before" it and with the control that ends.
             name: appears in every diagnostic; "constraint k" by default.
             between: "auto": imposed at more and more points of each interval, until the largest violation between them
                 is below 1e-4 of the limit (with `refine`, its tolerance, where that is smaller, but for 2e-5).
 
         Raises:
-            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an instant in
-                place of one, an integral elsewhere than at the end.
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an instant that
+                is none or at an end, an integral elsewhere than at the end.
         """
-        self._change(with_constraint(self._declarations, expression, lower, upper, at, name, between))
+        limits = (lower, upper, equals)
+        given = (expression, limits, at, name, between, relative, side)
+        self._change(with_constraint(self._declarations, *given))
 
     @checked(joint=truth)
     def chance(

@@ -13,7 +13,7 @@ from covocp.base.normal import shown_probability
 from covocp.base.pages import Part, Section, Sentence, Table, number
 from covocp.problem.closed_loop_covariance import SPREAD, reasons
 from covocp.problem.decisions import decisions_of
-from covocp.problem.declarations import Chance
+from covocp.problem.declarations import Chance, Constraint
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entries_of, entry_names, half_names
@@ -366,13 +366,22 @@ def _constraints(problem: Problem, written: _Written) -> Section:
             right = f" = {number(high)}" if low == high else f" <= {number(high)}" if np.isfinite(high) else ""
             if not right:
                 left, right = "", f" >= {number(low)}"
-            place = places[q.at] + (", between the nodes too" if getattr(q, "between", False) else "")
+            place = _moment(problem, q) if isinstance(q, Constraint) and q.instant is not None else places[q.at]
+            place += ", between the nodes too" if getattr(q, "between", False) else ""
             own.append([name, place, f"{left}{text}{right}", ""])
             if isinstance(q, Chance):
                 together = ", together" if q.joint else ""
                 own[-1][3] = f"probability {shown_probability(q.probability)}{together}"
         rows += _shortened(own)
     return [*_table(["constraint", "", "", ""], rows, code=(2,)), *_chance_notes(problem)]
+
+
+def _moment(problem: Problem, constraint: Constraint) -> str:
+    """The instant at which a constraint holds, in a few words."""
+    assert constraint.instant is not None
+    free = problem.free_duration is not None
+    time = constraint.instant * (1.0 if free else float(problem.duration))
+    return f"at {number(time, 4)} {'T' if free else 's'}{'' if constraint.late else ', before'}"
 
 
 def _chance_notes(problem: Problem) -> Section:

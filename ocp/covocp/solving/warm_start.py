@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
 from covocp.base.quadrature import interpolated
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
@@ -22,6 +23,16 @@ from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import own_start, ranked
 from covocp.transcription.steering import quadrature_weights, resampled
 from covocp.transcription.trajectory import Multipliers, Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Later:
+    """A plan of which some time has passed [s]."""
+
+    plan: Solution
+    elapsed: float
+
+    __repr__ = short_repr
 
 
 def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Guess:
@@ -42,6 +53,8 @@ def make_guesses(
     """
     if isinstance(guess, Trajectory):
         yield Guess(trajectory=guess)
+    elif isinstance(guess, Later):
+        yield _shifted(statement, mesh, parameters, guess)
     elif isinstance(guess, Solution):
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
@@ -92,8 +105,10 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
         trajectory = _resampled(statement, mesh, parameters, solution, matched)
-    constraints = (statement.path.size, statement.start.size, statement.end.size)
-    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+    st = statement
+    constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
+    own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
+    if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
     width = statement.nx + (0 if mesh.eliminated else statement.ne)
     if nodes and own.segments == mesh.segments and m.gaps.shape == (len(mesh.segments), width) and not linked:
@@ -134,12 +149,41 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
         elif block.kind == "control":
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+            if mesh.control == "linear":  # which may jump at an instant
+                u[mesh.instants, block.span] = ahead[block.name].reshape(-1, block.size)
         else:
             e[:, block.span] = pack(sample[block.name])
             e[mesh.instants, block.span] = pack(ahead[block.name])
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:
         e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
     return Trajectory(x=x, u=u, e=e, duration=duration)
+
+
+def _shifted(statement: Statement, mesh: Mesh, parameters: Array, later: Later) -> Guess:
+    """What is left of a plan, primal and dual; where it ends its last values are kept."""
+    plan, elapsed = later.plan, later.elapsed
+    duration = max(plan.duration - elapsed, 0.0) if statement.duration.free else statement.duration.guess
+    duration = float(np.clip(duration, statement.duration.lower, statement.duration.upper))
+    whole = _from_solution(statement, mesh, parameters, plan, linked=False)
+    x, u, e = (values.copy() for values in (whole.trajectory.x, whole.trajectory.u, whole.trajectory.e))
+    at = np.minimum(mesh.nodes * duration + elapsed, plan.duration)
+    at_controls = np.minimum(control_places(mesh.nodes, mesh.control) * duration + elapsed, plan.duration)
+    sample, controls = plan.at(at), plan.at(at_controls)
+    known = {(b.name, b.kind, b.size) for b in plan.blocks}
+    for block in (*statement.states, *statement.controls, *statement.matrices):
+        if (block.name, block.kind, block.size) in known:
+            if block.kind == "state":
+                x[:, block.span] = sample[block.name].reshape(-1, block.size)
+            elif block.kind == "control":
+                u[:, block.span] = controls[block.name].reshape(-1, block.size)
+            else:
+                e[:, block.span] = pack(sample[block.name])
+    costates = whole.costates
+    if costates is not None:
+        found = np.hstack([plan.costates.state, plan.costates.matrices])
+        moved = interpolated(found, plan.t, at)
+        costates = moved[:, : statement.nx], moved[:, statement.nx :]
+    return replace(whole, trajectory=Trajectory(x=x, u=u, e=e, duration=duration), costates=costates)
 
 
 def _check_common(statement: Statement, solution: Solution) -> None:

@@ -15,6 +15,7 @@ from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
+from covocp.statement.conditions import Inside
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import StepKind
 
@@ -138,7 +139,7 @@ class Mesh:
         step: covariance step; "rodas": implicit steps of the nominal, gauss steps of the covariances.
         linear_solver: CasADi's linear solver of the covariance steps.
         readings: what each interval takes of each measurement at instants, (measurements, N): its node is there twice,
-            and the interval between has no length.
+            and the interval between has no length; nothing where only a condition holds there.
         points: equally spread points of an interval, its start among them, where path inequalities and bounds of
             states are imposed; they are ends of substeps. 1: at the nodes only.
     """
@@ -175,8 +176,22 @@ class Mesh:
 
     @cached
     def instants(self) -> list[int]:
-        """Intervals of no length, at which measurements are taken."""
+        """Intervals of no length, at which measurements are taken or conditions hold."""
         return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
+
+    def nodes_of(self, inside: Inside) -> list[int]:
+        """Node of each of the conditions at instants: the first there, or the one before the last.
+
+        Raises:
+            ValueError: an instant is not there twice.
+        """
+        found = []
+        for part in inside.parts:
+            at = np.flatnonzero(self.nodes == part.place)
+            if at.size < (3 if part.late and part.apart else 2):
+                raise ValueError("the nodes of the mesh are not those of the conditions at instants")
+            found.append(int(at[-2] if part.late else at[0]))
+        return found
 
     def placed(self, s: Array) -> Array:
         """Normalised times within [0, 1]; what rounding parts from a node is the node, more so from an instant."""
@@ -203,6 +218,10 @@ class Mesh:
             if self.nodes[last - 1] == self.nodes[last]:
                 end = int(np.flatnonzero(self.nodes == self.nodes[last])[0])
                 own[end:] = [end] * (last + 1 - end)
+        still = set(self.instants)
+        for k in reversed(self.instants):
+            if k - 1 in still and not self.readings[:, k].any():  # for a condition on what goes on
+                own[k] = own[k + 1]
         return own
 
     @cached

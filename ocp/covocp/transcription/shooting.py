@@ -417,7 +417,7 @@ def _reading_passage(
 
 def _reads(mesh: Mesh) -> list[int]:
     """The substeps, in the order of travel forward, at which something is read."""
-    return [k * mesh.substeps + j for k in mesh.instants for j in range(mesh.substeps)]
+    return [k * mesh.substeps + j for k in mesh.instants if mesh.readings[:, k].any() for j in range(mesh.substeps)]
 
 
 def _kicked(step: ca.Function) -> ca.Function:
