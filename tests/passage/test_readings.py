@@ -166,6 +166,28 @@ def test_a_step_depends_on_what_was_read_before_it():
         assert not block[:, sum(seen) * columns :].any()
 
 
+def test_an_instant_at_which_nothing_is_read_changes_nothing(monkeypatch):
+    """Conditions have instants too; what is read elsewhere is not read there, with the library and without it."""
+
+    def problem(pinned: bool) -> co.Problem:
+        ocp = co.Problem(2.0)
+        x = ocp.state("x", initial=0.0, variance=1.0)
+        u = ocp.control("u", guess=0.3)
+        ocp.dynamics(x, -x + u, noise=0.1 * (1 + u**2))
+        ocp.measurement("fix", x * (1 + x), 0.1, at=[0.5, 1.5])
+        if pinned:
+            ocp.subject_to(x, upper=5.0, at=1.0)  # never active
+        ocp.minimize(0.1 * (u - 1) ** 2, ocp.estimation_covariance()[x, x])
+        return ocp
+
+    options = {"intervals": 20, "progress": False}
+    costs = [co.solve(problem(pinned), **options).cost for pinned in (True, False)]
+    monkeypatch.setattr(shooting, "functions", lambda: None)
+    costs.append(co.solve(problem(True), **options).cost)
+    assert costs[0] == pytest.approx(costs[2], rel=1e-9)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-5)  # controls may jump at one more place
+
+
 @pytest.mark.parametrize("options", [{}, {"control": "constant", "substeps": 2}])
 @pytest.mark.parametrize("seed", [3, 8])
 def test_a_problem_without_the_library_has_the_same_solution(monkeypatch, seed, options):
