@@ -122,19 +122,6 @@ def penalty_groups(
     left = [i for i in range(statement.end.size) if i not in exact]
     path, end, start = statement.path, statement.end, statement.start
     own = start.size - (0 if statement.tied is None else len(statement.tied.states))  # the others hold by themselves
-    at_instants = [
-        _group(
-            statement,
-            INSTANT,
-            part.conditions.names,
-            every[k : k + 1],
-            once,
-            part.conditions.function,
-            part.conditions.lower,
-            part.conditions.upper,
-        )
-        for part, k in zip(statement.inside.parts, mesh.nodes_of(statement.inside), strict=True)
-    ]
     candidates = [
         _group(statement, "path", path.names, every, shares, path.function, path.lower, path.upper),
         _group(
@@ -167,9 +154,20 @@ def penalty_groups(
             lower[bounded],
             upper[bounded],
         ),
-        *at_instants,
+        *_at_instants(statement, mesh),
     ]
     return tuple(group for group in candidates if group is not None)
+
+
+def _at_instants(statement: Statement, mesh: Mesh) -> list[Group | None]:
+    """A group for the conditions at each instant."""
+    inside = statement.inside
+    result = []
+    for part, k in zip(inside.parts, inside.nodes_among(mesh.nodes), strict=True):
+        own = part.conditions
+        rows = (own.function, own.lower, own.upper)
+        result.append(_group(statement, INSTANT, own.names, np.array([k]), np.ones(1), *rows))
+    return result
 
 
 def _entries(x: Expr, e: Expr, chosen: list[int]) -> Any:

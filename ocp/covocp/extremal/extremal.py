@@ -96,7 +96,7 @@ class Extremal:
         if st.inside.size:
             values = [
                 np.asarray(part.conditions.function(*(column[:, k] for column in columns)).full()).ravel()
-                for part, k in zip(st.inside.parts, self.mesh.nodes_of(st.inside), strict=True)
+                for part, k in zip(st.inside.parts, st.inside.nodes_among(self.mesh.nodes), strict=True)
             ]
             yield st.inside, "instants", np.concatenate(values)[None, :]
 

@@ -18,7 +18,7 @@ def instant_jumps(extremal: Extremal) -> Array:
     """Slopes by x and e, stacked, of the conditions at instants times their multipliers, (N + 1, nx + ne)."""
     st = extremal.statement
     result = np.zeros((extremal.mesh.intervals + 1, st.nx + st.ne))
-    for number, k in enumerate(extremal.mesh.nodes_of(st.inside)):
+    for number, k in enumerate(st.inside.nodes_among(extremal.mesh.nodes)):
         by_x, _, by_e, *_ = _slopes_at(extremal, number, k)
         result[k] += np.concatenate([by_x, by_e])
     return result
@@ -28,7 +28,7 @@ def instant_control_slopes(extremal: Extremal) -> Array:
     """The same by the control values, (N + 1 or N, nu)."""
     st, mesh = extremal.statement, extremal.mesh
     result = np.zeros((mesh.control_nodes, st.nu))
-    for number, k in enumerate(mesh.nodes_of(st.inside)):
+    for number, k in enumerate(st.inside.nodes_among(mesh.nodes)):
         result[k] += _slopes_at(extremal, number, k)[1]
     return result
 
@@ -37,7 +37,7 @@ def instant_duration_slope(extremal: Extremal) -> float:
     """The same by the terminal time, with which the instants move."""
     st, mesh = extremal.statement, extremal.mesh
     total = 0.0
-    for number, (part, k) in enumerate(zip(st.inside.parts, mesh.nodes_of(st.inside), strict=True)):
+    for number, (part, k) in enumerate(zip(st.inside.parts, st.inside.nodes_among(mesh.nodes), strict=True)):
         *_, by_time, by_duration = _slopes_at(extremal, number, k)
         total += part.place * float(by_time[0]) + float(by_duration[0])
     return total
@@ -46,7 +46,7 @@ def instant_duration_slope(extremal: Extremal) -> float:
 def controlled_nodes(extremal: Extremal) -> list[int]:
     """Nodes at which a condition at an instant contains the control."""
     st, pairs = extremal.statement, []
-    for part, k in zip(st.inside.parts, extremal.mesh.nodes_of(st.inside), strict=True):
+    for part, k in zip(st.inside.parts, st.inside.nodes_among(extremal.mesh.nodes), strict=True):
         if part.conditions.function.jac_sparsity(0, 1).nnz():
             pairs += [k, k + 1] if part.late else [k]
     return sorted(set(pairs))
@@ -56,7 +56,7 @@ def instant_change(extremal: Extremal, states: Array, matrices: Array) -> float:
     """Change of the conditions at instants times their multipliers, with other states and half-vectors at the nodes."""
     st, (x, u, e, *rest) = extremal.statement, [np.asarray(column) for column in extremal.columns()]
     weights, total = st.inside.split(extremal.multipliers.instants), 0.0
-    for part, k, own in zip(st.inside.parts, extremal.mesh.nodes_of(st.inside), weights, strict=True):
+    for part, k, own in zip(st.inside.parts, st.inside.nodes_among(extremal.mesh.nodes), weights, strict=True):
         given = [column[:, k] for column in rest]
         before, after = (
             np.asarray(part.conditions.function(y, u[:, k], f, *given).full()).ravel()

@@ -102,7 +102,9 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
             value += ca.dot(weights, conditions.columns(places, duration, p))
             rows[kind] = conditions.columns(places._replace(matrices=seen[:, at]), duration, p)
     own_rows = []
-    for part, k, weights in zip(st.inside.parts, mesh.nodes_of(st.inside), st.inside.split(instants), strict=True):
+    for part, k, weights in zip(
+        st.inside.parts, st.inside.nodes_among(mesh.nodes), st.inside.split(instants), strict=True
+    ):
         places = Columns(x[:, k], at_nodes[:, k], e[:, k], time[:, k])
         value += ca.dot(weights, part.conditions.columns(places, duration, p))
         own_rows.append(part.conditions.columns(places._replace(matrices=seen[:, k]), duration, p))

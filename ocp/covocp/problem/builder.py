@@ -266,14 +266,29 @@ class Problem:
 
     @checked(unit=text)
     def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
-        """Declare a known number (or vector) that may change from solve to solve without rebuilding.
+        """Declare known numbers that may change from solve to solve without rebuilding.
+
+        Args:
+            name: unique name.
+            value: a number, a vector (n,) or a matrix (n, m).
+            unit: shown in printouts.
+
+        Returns:
+            Its symbol, in the shape of the value; columns of a matrix are stacked in `Solution.parameters`.
 
         Raises:
             ProblemError: name used twice, NaN or inf.
         """
-        size = self._declare(name, int(np.size(as_number(name, "value", value))))
-        entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
-        return self._add("parameters", entry).symbol
+        numbers = as_number(name, "value", value)
+        size = self._declare(name, int(np.size(numbers)))
+        if numbers.ndim != 2 or 1 in numbers.shape:
+            entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
+            return self._add("parameters", entry).symbol
+        stacked = column(name, "value", numbers.ravel(order="F"), size)
+        entry = self._add("parameters", Parameter(**_symbol(name, size, unit), value=stacked, columns=numbers.shape[1]))
+        matrix: Any = ca.reshape(entry.symbol, *numbers.shape)
+        matrix._stands_for = name  # as a key of new values
+        return cast(ca.MX, matrix)
 
     @checked(unit=text)
     def decision(

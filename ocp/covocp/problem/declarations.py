@@ -115,7 +115,10 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
-    """A known number."""
+    """A known number, vector, or matrix, whose columns are stacked.
+
+    columns: of a matrix; of others 1.
+    """
 
     name: str
     symbol: ca.MX
@@ -123,6 +126,7 @@ class Parameter:
     where: str
     unit: str
     value: Array
+    columns: int = 1
 
     __repr__ = short_repr
 

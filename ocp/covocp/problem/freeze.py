@@ -93,6 +93,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
+        matrix_parameters={e.name: (e.size // e.columns, e.columns) for e in problem.parameters if e.columns > 1},
         expression=_expression_builder(stacked),
     )
 

@@ -125,3 +125,17 @@ class Inside:
         """Values of all rows, an array or a column, shared out among the instants."""
         ends = np.cumsum([0, *(part.conditions.size for part in self.parts)]).tolist()
         return [values[i:j] for i, j in pairwise(ends)]
+
+    def nodes_among(self, nodes: Array) -> list[int]:
+        """Which of the nodes of a mesh is that of each instant: the first one there, or the one before the last.
+
+        Raises:
+            ValueError: an instant is not there twice.
+        """
+        found = []
+        for part in self.parts:
+            at = np.flatnonzero(nodes == part.place)
+            if at.size < (3 if part.late and part.apart else 2):
+                raise ValueError("the nodes of the mesh are not those of the conditions at instants")
+            found.append(int(at[-2] if part.late else at[0]))
+        return found

@@ -250,6 +250,7 @@ class Statement:
     geometry: Geometry
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
+    matrix_parameters: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     __repr__ = short_repr
 

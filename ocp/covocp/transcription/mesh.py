@@ -15,7 +15,6 @@ from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
-from covocp.statement.conditions import Inside
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import StepKind
 
@@ -178,20 +177,6 @@ class Mesh:
     def instants(self) -> list[int]:
         """Intervals of no length, at which measurements are taken or conditions hold."""
         return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
-
-    def nodes_of(self, inside: Inside) -> list[int]:
-        """Node of each of the conditions at instants: the first there, or the one before the last.
-
-        Raises:
-            ValueError: an instant is not there twice.
-        """
-        found = []
-        for part in inside.parts:
-            at = np.flatnonzero(self.nodes == part.place)
-            if at.size < (3 if part.late and part.apart else 2):
-                raise ValueError("the nodes of the mesh are not those of the conditions at instants")
-            found.append(int(at[-2] if part.late else at[0]))
-        return found
 
     def placed(self, s: Array) -> Array:
         """Normalised times within [0, 1]; what rounding parts from a node is the node, more so from an instant."""

@@ -123,7 +123,7 @@ def _constraints(
             x, u, e, t = (v[:, columns] for v in arguments)
             value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
             rows.append(_condition_rows(kind, conditions, value, k, mesh))
-    for i, (part, k) in enumerate(zip(statement.inside.parts, mesh.nodes_of(statement.inside), strict=True)):
+    for i, (part, k) in enumerate(zip(statement.inside.parts, statement.inside.nodes_among(mesh.nodes), strict=True)):
         at = Columns(*(v[:, k] for v in arguments))
         value = part.conditions.columns(at, variables.duration, variables.parameters)
         rows.append(_condition_rows(inside_kind(i), part.conditions, value, 1, mesh))
