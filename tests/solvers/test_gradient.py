@@ -343,7 +343,7 @@ class Stop:
 
     def update(self, iteration: int, cost: float, violation: float) -> None:
         self.reports.append((iteration, cost, violation))
-        self.asked = len(self.reports) >= 3
+        self.stop = len(self.reports) >= 3
 
 
 def test_interruption_returns_the_last_iterate() -> None:

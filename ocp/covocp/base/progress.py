@@ -68,6 +68,17 @@ class Progress:
         return ""
 
     @property
+    def left(self) -> tuple[float | None, int | None]:
+        """Seconds, above zero, and iterations that are left to the limits; None: no limit."""
+        past = time.perf_counter() - self._begin
+        seconds = None if self._seconds is None else max(self._seconds - past, sys.float_info.min)
+        return seconds, None if self._iterations is None else max(self._iterations - self._seen, 0)
+
+    def count(self, iterations: int) -> None:
+        """Iterations of another run that the limit is meant for too."""
+        self._seen += iterations
+
+    @property
     def stop(self) -> bool:
         """Whether the method should end."""
         return self.asked or bool(self.spent)

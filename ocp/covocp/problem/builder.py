@@ -71,6 +71,7 @@ class Problem:
 
     Attributes:
         doubts_told: whether it was said what is probably forgotten in it, since the last change.
+        duration_read: whether the number of a fixed duration was asked for, and may be in what is declared.
 
     Raises:
         ProblemError: where the duration is not positive.
@@ -86,7 +87,7 @@ class Problem:
         self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
         self._statement: Statement | None = None
         self._expanded: Declarations | None = None
-        self.doubts_told = False
+        self.doubts_told = self.duration_read = False
 
     @classmethod
     def of(cls, declarations: Declarations) -> Problem:
@@ -149,6 +150,7 @@ class Problem:
     @property
     def duration(self) -> Any:
         """Symbol of the terminal time [s], or its number where it is fixed."""
+        self.duration_read = self.duration_read or self.free_duration is None
         return self._declarations.duration
 
     @checked(unit=text)

@@ -80,7 +80,7 @@ class _Written:
             symbols, names = [*symbols, spread.symbol], [*names, half_names(spread.name, spread.labels)]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
-            symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
+            symbols, names = [*symbols, problem.declarations.duration], [*names, ["duration"]]
         data = problem.declarations.data
         called, plain = in_words((entry.course for entry in data), list(expressions.values()))
         found = formulas(called, [*symbols, *plain], [*names, *(entry_names((entry,)) for entry in data)])
@@ -173,7 +173,7 @@ def _ranges(lower: Array, upper: Array) -> list[str]:
 
 def _head(problem: Problem) -> Section:
     free = problem.free_duration
-    duration = f"{number(problem.duration)} s" if free is None else f"free, {_ranges_of(free)}"
+    duration = f"{number(problem.declarations.duration)} s" if free is None else f"free, {_ranges_of(free)}"
     return [Sentence(f"{problem.name or 'problem without a name'}: duration {duration}")]
 
 
@@ -315,7 +315,7 @@ def _instants(problem: Problem, instants: tuple[float, ...]) -> str:
     if not instants:
         return ""
     free = problem.free_duration is not None
-    times = np.array(instants) * (1.0 if free else float(problem.duration))
+    times = np.array(instants) * (1.0 if free else float(problem.declarations.duration))
     unit = "T" if free else "s"
     if times.size > 1 and np.allclose(np.diff(times), times[0], rtol=1e-9):
         return f"every {times[0]:.4g} {unit}"

@@ -14,6 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, pack
 from covocp.base.short_repr import short_repr
+from covocp.problem.attitude import as_quaternion
 from covocp.problem.checks import find_name
 from covocp.problem.declarations import Declarations, Matrix, Parameter, State
 from covocp.problem.estimation_covariance import with_estimation
@@ -27,6 +28,7 @@ class Start:
     Args:
         of: the state or the matrix.
         parameter: name of the parameter: known entries of the state, half-vector of the matrix.
+        place: its rows among all initial states, or among all half-vectors.
         value: as declared, of the parameter.
         known: which entries of a state are no free ones; of a matrix all.
         lower, upper: bounds of these entries.
@@ -34,6 +36,7 @@ class Start:
 
     of: State | Matrix
     parameter: str
+    place: slice
     value: Array
     known: tuple[int, ...]
     lower: Array
@@ -69,9 +72,15 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
     for position, state in enumerate(declarations.states):
         if state.role == "moving":
             span = next(b for b in statement.states if b.name == state.name).span
-            declarations = _with_start(declarations, position, start[span], starts)
+            declarations = _with_start(declarations, position, span, start[span], starts)
+    estimated = next((position for position, matrix in enumerate(declarations.matrices) if matrix.estimation), None)
+    spreads = {c.chance.spread for c in declarations.constraints if c.chance is not None} - {None}
+    followers = [] if estimated is None else [i for i, m in enumerate(declarations.matrices) if m.name in spreads]
     for position, matrix in enumerate(declarations.matrices):
-        half = matrices[next(b for b in statement.matrices if b.name == matrix.name).span]
+        if position in followers and position != estimated:
+            continue  # the actual system starts where its filter does
+        place = next(b for b in statement.matrices if b.name == matrix.name).span
+        half = matrices[place]
         if matrix.backward is None and matrix.role == "moving" and not np.isnan(half).any():
             own = _parameter(declarations, matrix, half)
             limits = np.full(half.size, np.inf)
@@ -79,17 +88,22 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
                 Start(
                     of=matrix,
                     parameter=own.name,
+                    place=place,
                     value=half,
                     known=tuple(range(half.size)),
                     lower=-limits,
                     upper=limits,
                 )
             )
-            declarations = _started(declarations.adding(parameters=own), "matrices", position, own.symbol)
+            declarations = declarations.adding(parameters=own)
+            for one in {position, *followers} if position == estimated else {position}:
+                declarations = _started(declarations, "matrices", one, own.symbol)
     return Restartable(declarations=declarations, starts=tuple(starts))
 
 
-def _with_start(declarations: Declarations, position: int, start: Array, starts: list[Start]) -> Declarations:
+def _with_start(
+    declarations: Declarations, position: int, place: slice, start: Array, starts: list[Start]
+) -> Declarations:
     """The declarations with the known initial values of a state as a parameter."""
     state, known = declarations.states[position], np.flatnonzero(~np.isnan(start)).tolist()
     if not known:
@@ -100,6 +114,7 @@ def _with_start(declarations: Declarations, position: int, start: Array, starts:
         Start(
             of=state,
             parameter=own.name,
+            place=place,
             value=start[known],
             known=tuple(known),
             lower=state.lower[known],
@@ -124,6 +139,19 @@ def _started(declarations: Declarations, group: str, position: int, initial: Exp
     found[position] = replace(found[position], initial=initial)
     changed: dict[str, Any] = {group: tuple(found)}
     return replace(declarations, **changed)
+
+
+def declared_values(starts: tuple[Start, ...], statement: Statement, parameters: Array) -> dict[str, Array]:
+    """Parameters for the initial values that are declared, for these values of what they may depend on.
+
+    Args:
+        starts: of a restartable problem.
+        statement: of the problem before.
+        parameters: of that statement.
+    """
+    states, _, matrices, _ = statement.boundary_values(parameters)
+    values = ((start, states if isinstance(start.of, State) else matrices) for start in starts)
+    return {start.parameter: found[start.place][list(start.known)] for start, found in values}
 
 
 def values_of(starts: tuple[Start, ...], initial: Given, covariance: Given) -> dict[str, Array]:
@@ -172,8 +200,18 @@ def _by_name(given: Given, argument: str, kind: str, starts: Mapping[str, Start]
             received=repr(given)[:100],
             remedy=f"write {argument}={{'name': value}}",
         )
-    known = tuple(start.of for start in starts.values())
-    return {find_name(getattr(key, "_stands_for", key), argument, list(known), known): v for key, v in given.items()}
+    known, result = tuple(start.of for start in starts.values()), dict[str, Any]()
+    for key, value in given.items():
+        name = find_name(getattr(key, "_stands_for", key), argument, list(known), known)
+        if name in result:
+            raise ProblemError(
+                f"{argument}= has two values of '{name}'.",
+                expected="one value for each",
+                received="one by its symbol and one by its name",
+                remedy="leave one of them out",
+            )
+        result[name] = value
+    return result
 
 
 def _state_value(start: Start, value: Given) -> Array:
@@ -183,6 +221,9 @@ def _state_value(start: Start, value: Given) -> Array:
         ProblemError: it does not fit.
     """
     name, size = start.of.name, start.of.size
+    if isinstance(start.of, State) and start.of.chart is not None:
+        numbers = np.asarray(ca.evalf(as_quaternion(name, value, "initial attitude")).full()).ravel()
+        return -numbers if numbers @ start.value < 0 else numbers  # of q and -q the one that the guess begins with
     numbers = np.atleast_1d(as_number(name, "initial value", value)).astype(float)
     if numbers.size != size or numbers.ndim > 2:
         raise _wrong(name, f"{size} numbers", f"shape {numbers.shape}")
@@ -196,9 +237,6 @@ def _state_value(start: Start, value: Given) -> Array:
     if not inside.all():
         limits = f"within the bounds {start.lower} to {start.upper}"
         raise _wrong(name, f"numbers {limits} of the state", str(numbers[known]))
-    chart = start.of.chart if isinstance(start.of, State) else None
-    if chart is not None and abs(float(numbers @ numbers) - 1.0) > 1e-9:
-        raise _wrong(name, "a unit quaternion", f"one of length {float(np.sqrt(numbers @ numbers)):.9g}")
     return numbers[known]
 
 

@@ -8,15 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from covocp.base.arguments import is_number
 from covocp.base.checks import check_positive
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
 from covocp.problem.builder import Problem
 from covocp.problem.checks import find_name
-from covocp.problem.restart import Start, restartable, values_of
+from covocp.problem.data import check_data_cover
+from covocp.problem.declarations import Declarations
+from covocp.problem.restart import Start, declared_values, restartable, values_of
 from covocp.solution.solution import Solution
 from covocp.solving.warm_start import Later
+from covocp.statement.names import stacked_parameters
+from covocp.statement.statement import Statement
 
 if TYPE_CHECKING:
     from covocp.solving.solver import Solver
@@ -28,7 +33,7 @@ KEPT = 4
 def movable(problem: Problem) -> Problem:
     """The same problem with its start as parameters, "initial_<name>": what `Solver.solve(initial=)` solves.
 
-    Files of such solutions are loaded with it.
+    Files of such solutions are loaded with it. A start that depends on other parameters has its declared value here.
 
     Args:
         problem: whose known initial values of states and matrices become parameters.
@@ -47,11 +52,15 @@ class Elsewhere:
     """What solves a problem from elsewhere.
 
     Args:
-        problem: as it was stated.
+        declarations: of the problem, as it was stated.
+        statement: of the same.
+        duration_read: whether the number of its duration may be in the expressions.
         make: the solver of another problem with the same method and options.
     """
 
-    problem: Problem
+    declarations: Declarations
+    statement: Statement
+    duration_read: bool
     make: Callable[[Problem], Solver]
     _kept: dict[float | None, tuple[Solver, tuple[Start, ...]]] = field(default_factory=dict)
 
@@ -66,23 +75,26 @@ class Elsewhere:
         if duration is not None:
             duration = self._checked(duration)
         if duration not in self._kept:
-            own = (
-                self.problem.declarations if duration is None else replace(self.problem.declarations, duration=duration)
-            )
-            statement = self.problem.statement() if duration is None else Problem.of(own).statement()
+            own, statement = self.declarations, self.statement
+            if duration is not None:
+                own = replace(own, duration=duration)
+                check_data_cover(own)
+                statement = Problem.of(own).statement()
             found = restartable(own, statement)
+            problem = Problem.of(found.declarations)
+            problem.doubts_told = True  # when this solver was made
             while len(self._kept) >= KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[duration] = self.make(Problem.of(found.declarations)), found.starts
+            self._kept[duration] = self.make(problem), found.starts
         return self._kept[duration]
 
     def _checked(self, duration: float) -> float | None:
         """The duration, None where it is that of the problem.
 
         Raises:
-            ProblemError: it is free, or something is read or holds at instants.
+            ProblemError: it is free, something is read or holds at instants, or its number may be in the expressions.
         """
-        own = self.problem.declarations
+        own = self.declarations
         value = check_positive("duration", duration, unit="s")
         if own.free_duration is not None:
             raise ProblemError(
@@ -100,7 +112,16 @@ class Elsewhere:
                 received=f"duration={value:g}",
                 remedy="state the problem anew, with the instants that are left",
             )
-        return None if value == float(own.duration) else value
+        if value == float(own.duration):
+            return None
+        if self.duration_read:
+            raise ProblemError(
+                "Problem.duration was read where the problem is stated: its number may be in the expressions.",
+                expected="expressions without the number of the duration",
+                received=f"duration={value:g}, and a problem stated with {float(own.duration):g} s",
+                remedy="state the problem anew with this duration; or make what depends on it a parameter()",
+            )
+        return value
 
     def values(
         self, starts: tuple[Start, ...], parameters: Given, initial: Given, means: Given, covariance: Given
@@ -110,7 +131,7 @@ class Elsewhere:
         Raises:
             ProblemError: one of them is wrong.
         """
-        own = self.problem.declarations
+        own = self.declarations
         for argument, given in (("parameters", parameters), ("means", means)):
             if given is not None and not isinstance(given, Mapping):
                 raise ProblemError(
@@ -130,7 +151,9 @@ class Elsewhere:
                     remedy="leave one of them out",
                 )
             result[name] = value
-        return result | values_of(starts, initial, covariance)
+        given = values_of(starts, initial, covariance)
+        follow = declared_values(starts, self.statement, stacked_parameters(self.statement, result))
+        return follow | result | given
 
 
 def find_name_or_none(key: Given, entries: tuple[Any, ...]) -> str:
@@ -153,7 +176,7 @@ def later(guess: Given, elapsed: Given) -> Given:
             received=f"guess={guess!r}"[:100],
             remedy="give the plan as guess=, or leave elapsed= out",
         )
-    number = float(elapsed) if isinstance(elapsed, int | float | np.floating | np.integer) else np.nan
+    number = float(elapsed) if is_number(elapsed) else np.nan
     if not 0.0 <= number <= guess.duration:
         raise ProblemError(
             "The time that has passed is not within the plan.",

@@ -46,7 +46,7 @@ from covocp.solving.gain_start import meeting_conditions, with_best_gain_problem
 from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
-from covocp.solving.warm_start import make_guess, make_guesses
+from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
@@ -136,7 +136,10 @@ class Solver:
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
         self._elsewhere = Elsewhere(
-            problem=problem, make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options)
+            declarations=problem.declarations,
+            statement=self.statement,
+            duration_read=problem.duration_read,
+            make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options),
         )
         count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
@@ -212,7 +215,7 @@ class Solver:
             assess: False in a loop that solves again and again: what is looked at after a run is left out (error of the
                 mesh and steps that are too long, curvature where a run ends as it began, cost of the classical design,
                 warnings). `mesh_error` is then nan; the residuals that a converged run must meet are the same.
-            time_limit: of the iterations [s], looked at after each of them.
+            time_limit: of all runs together [s], looked at after each iteration; building and assessing take theirs.
             iteration_limit: of all runs together.
 
         Returns:
@@ -242,14 +245,16 @@ class Solver:
             self._keep(*self._first)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
-        first = self._best_gain(parameters, guess)
-        guess = guess if first is None else meeting_conditions(self._problem, first, parameters or {})
-        if isinstance(guess, Solution):
-            self._take_steps(guess.mesh)
         guess = later_of(guess, elapsed)
         title = self.statement.name or "solving"
         with evaluating(self.statement.name):
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
+                first = self._best_gain(parameters, guess, reporter)
+                if first is not None:
+                    near = not reporter.stop
+                    guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
+                if isinstance(guess, Later | Solution):
+                    self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
@@ -272,16 +277,22 @@ class Solver:
             solution = self._finish(outcome, allow_failure, assess)
             return self._beside_classical(solution, values) if assess else solution
 
-    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
+    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress) -> Solution | None:
         """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
         named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
         for solver in self._best if guess is None or named else ():
+            if reporter.stop:
+                break
+            seconds, iterations = reporter.left
+            run = {"guess": guess, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
             try:
                 with without_warnings():  # they concern another solution
-                    best: Solution = solver.solve(parameters, guess=guess, progress=False)
+                    best: Solution = solver.solve(parameters, progress=False, **run)
             except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
                 continue
-            return best
+            reporter.count(int(best.stats["iterations"]))
+            if best.converged:
+                return best
         return None
 
     def _closed(self, outcome: Outcome) -> Outcome:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def make_guesses(
     if isinstance(guess, Trajectory):
         yield Guess(trajectory=guess)
     elif isinstance(guess, Later):
-        yield _shifted(statement, mesh, parameters, guess)
+        yield _from_solution(statement, mesh, parameters, guess.plan, linked, guess.elapsed)
     elif isinstance(guess, Solution):
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
@@ -89,8 +89,19 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
     return replace(statement, guesses=guesses) if given else statement
 
 
-def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, linked: bool) -> Guess:
-    """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
+def _from_solution(
+    statement: Statement,
+    mesh: Mesh,
+    parameters: Array,
+    solution: Solution,
+    linked: bool,
+    elapsed: float | None = None,
+) -> Guess:
+    """A solution resampled on a mesh, primal and dual where the problems have the same symbols.
+
+    `elapsed`: what is left of it after this time [s], its last values held after its end; None: the whole, stretched
+    to this duration.
+    """
     _check_common(statement, solution)
     own = solution.mesh
     t, m = solution.trajectory, solution.multipliers
@@ -100,38 +111,64 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
     matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, there, strict=True))
     nodes = np.array_equal(own.nodes, mesh.nodes) and np.array_equal(own.instants, mesh.instants)
-    duration = solution.duration if statement.duration.free else statement.duration.guess
-    if matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
+    duration = _duration(statement, solution, elapsed)
+    if elapsed is None and matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
-        trajectory = _resampled(statement, mesh, parameters, solution, matched)
+        trajectory = _resampled(statement, mesh, parameters, solution, matched, elapsed)
     st = statement
     constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
     own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
     if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
     width = statement.nx + (0 if mesh.eliminated else statement.ne)
-    if nodes and own.segments == mesh.segments and m.gaps.shape == (len(mesh.segments), width) and not linked:
+    same = elapsed is None and nodes and own.segments == mesh.segments
+    if same and m.gaps.shape == (len(mesh.segments), width) and not linked:
         costates = np.zeros((mesh.nodes.size, statement.nx + statement.ne))  # read where segments meet and nowhere else
         costates[list(mesh.starts[1:]), :width] = m.gaps
     else:
         found = np.hstack([solution.costates.state, solution.costates.matrices])
-        costates = interpolated(found, own.nodes, mesh.nodes)
+        costates = interpolated(found, own.nodes, _places(mesh.nodes, duration, solution, elapsed))
     return Guess(
         trajectory=trajectory,
-        multipliers=_multipliers(m, own, mesh),
+        multipliers=_multipliers(m, own, mesh) if elapsed is None else _left(m, mesh, duration, solution, elapsed),
         costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
         warm=True,
     )
 
 
-def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, matched: bool) -> Trajectory:
+def _duration(statement: Statement, solution: Solution, elapsed: float | None) -> float:
+    """The duration to start from [s]."""
+    if not statement.duration.free:
+        return float(statement.duration.guess)
+    left = solution.duration - (elapsed or 0.0)
+    return float(left if elapsed is None else np.clip(left, statement.duration.lower, statement.duration.upper))
+
+
+def _places(nodes: Array, duration: float, solution: Solution, elapsed: float | None) -> Array:
+    """Where in a solution, as shares of its duration, these shares of a duration are."""
+    if elapsed is None:
+        return nodes
+    return np.asarray(np.minimum((elapsed + nodes * duration) / solution.duration, 1.0))
+
+
+def _resampled(
+    statement: Statement,
+    mesh: Mesh,
+    parameters: Array,
+    solution: Solution,
+    matched: bool,
+    elapsed: float | None = None,
+) -> Trajectory:
     """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
-    duration = solution.duration if statement.duration.free else statement.duration.guess
+    duration = _duration(statement, solution, elapsed)
+
+    def at(nodes: Array, side: Literal["before", "after"] = "after") -> Any:
+        return solution.at(_places(nodes, duration, solution, elapsed) * solution.duration, side=side)
+
     sizes, t = mesh.nodes.size, solution.trajectory
-    sample = solution.at(mesh.nodes * solution.duration)
-    at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
-    ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
+    sample, ahead = at(mesh.nodes), at(mesh.nodes[mesh.instants], "before")
+    at_controls = at(control_places(mesh.nodes, mesh.control))
     gain = free_gain_block(statement) if solution.loop is not None else None
     others = {(b.name, b.kind, b.size) for b in solution.blocks}
     if matched:  # nothing of it stays
@@ -142,8 +179,9 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
     for block in (*statement.states, *statement.controls, *statement.matrices):
         if (block.name, block.kind, block.size) not in others:
             if block == gain:
-                at = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
-                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, at)
+                nodes = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
+                places = _places(nodes, duration, solution, elapsed)
+                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, places)
             continue
         if block.kind == "state":
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
@@ -157,33 +195,6 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:
         e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
     return Trajectory(x=x, u=u, e=e, duration=duration)
-
-
-def _shifted(statement: Statement, mesh: Mesh, parameters: Array, later: Later) -> Guess:
-    """What is left of a plan, primal and dual; where it ends its last values are kept."""
-    plan, elapsed = later.plan, later.elapsed
-    duration = max(plan.duration - elapsed, 0.0) if statement.duration.free else statement.duration.guess
-    duration = float(np.clip(duration, statement.duration.lower, statement.duration.upper))
-    whole = _from_solution(statement, mesh, parameters, plan, linked=False)
-    x, u, e = (values.copy() for values in (whole.trajectory.x, whole.trajectory.u, whole.trajectory.e))
-    at = np.minimum(mesh.nodes * duration + elapsed, plan.duration)
-    at_controls = np.minimum(control_places(mesh.nodes, mesh.control) * duration + elapsed, plan.duration)
-    sample, controls = plan.at(at), plan.at(at_controls)
-    known = {(b.name, b.kind, b.size) for b in plan.blocks}
-    for block in (*statement.states, *statement.controls, *statement.matrices):
-        if (block.name, block.kind, block.size) in known:
-            if block.kind == "state":
-                x[:, block.span] = sample[block.name].reshape(-1, block.size)
-            elif block.kind == "control":
-                u[:, block.span] = controls[block.name].reshape(-1, block.size)
-            else:
-                e[:, block.span] = pack(sample[block.name])
-    costates = whole.costates
-    if costates is not None:
-        found = np.hstack([plan.costates.state, plan.costates.matrices])
-        moved = interpolated(found, plan.t, at)
-        costates = moved[:, : statement.nx], moved[:, statement.nx :]
-    return replace(whole, trajectory=Trajectory(x=x, u=u, e=e, duration=duration), costates=costates)
 
 
 def _check_common(statement: Statement, solution: Solution) -> None:
@@ -225,4 +236,34 @@ def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
         inside_states=np.zeros((new.intervals, new.points - 1, multipliers.states.shape[1])),
         matrices=at_nodes(multipliers.matrices),
         controls=controls * quadrature_weights(new)[:, None],
+    )
+
+
+def _left(multipliers: Multipliers, mesh: Mesh, duration: float, solution: Solution, elapsed: float) -> Multipliers:
+    """Multipliers of what is left of a solution: those at nodes are densities times the weights of the nodes.
+
+    Densities in time keep their values; nothing binds after its end, and where it was met between its nodes.
+    """
+    old, kept = solution.mesh, duration / solution.duration
+    before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, mesh))
+    inside = (mesh.intervals, mesh.points - 1)
+
+    def moved(values: Array, places: Array, nodes: Array) -> Array:
+        wanted = elapsed + nodes * duration
+        found = interpolated(values, places, _places(nodes, duration, solution, elapsed))
+        return np.asarray(np.where((wanted <= solution.duration)[:, None], found, 0.0)) * kept
+
+    def at_nodes(values: Array) -> Array:
+        return moved(values / before, old.nodes, mesh.nodes) * after
+
+    weights = (quadrature_weights(m)[:, None] for m in (old, mesh))
+    own, new = (control_places(m.nodes, m.control) for m in (old, mesh))
+    return replace(
+        multipliers,
+        path=at_nodes(multipliers.path_at_nodes),
+        states=at_nodes(multipliers.states_at_nodes),
+        inside_path=np.zeros((*inside, multipliers.path.shape[1])),
+        inside_states=np.zeros((*inside, multipliers.states.shape[1])),
+        matrices=at_nodes(multipliers.matrices),
+        controls=moved(multipliers.controls / next(weights), own, new) * next(weights),
     )

@@ -126,6 +126,7 @@ def _without(statement: Statement, kept: list[list[int]], entries: list[int], bl
             blocks=samples.blocks,
             places=samples.places,
             measurement=cut.of(samples.measurement, (None, (None, rows), None)),
+            groups=samples.groups,
             update=cut.of(samples.update, ((entries, None), None)),
         )
     forms = tuple(

@@ -152,6 +152,7 @@ class Samples:
     places: the instants of each, rising fractions of the terminal time.
     measurement: (state, control, time, duration, parameters) -> values (m), H = their Jacobian by the augmented state
         (m, n), variance R of the noise (m, m).
+    groups: rows that are read together, the others one after the other: their noises are correlated.
     update: (all six, reading) -> half-vectors after it [E+ = (I - K H) E (I - K H)' + K R K'], what it adds to the
         running cost: tr S (E - E+)/2 in a closed loop with the best gain, else nothing.
     """
@@ -159,6 +160,7 @@ class Samples:
     blocks: tuple[Block, ...]
     places: tuple[tuple[float, ...], ...]
     measurement: ca.Function
+    groups: tuple[tuple[int, ...], ...]
     update: ca.Function
 
     __repr__ = short_repr
