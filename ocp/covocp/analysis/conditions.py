@@ -58,7 +58,8 @@ def _kind(statement: Statement) -> str:
     if statement.coupled:
         return "the nominal depends on the estimation covariance"
     if statement.samples is not None:
-        return "measurements are taken at instants: " + ", ".join(block.name for block in statement.samples.blocks)
+        names = ", ".join(block.name for block in statement.samples.blocks)
+        return f"measurements are taken at instants, and the bound counts information as a density along the way: {names}"
     if statement.measurement is None:
         return "nothing is measured"
     if not statement.nu:
