@@ -185,8 +185,7 @@ def _gain_kind(statement: Statement) -> str:
     """Which of the settings of closed loops: by whether X, the covariance of the loop, is in costs or conditions."""
     if statement.behind:
         return "best gain"
-    conditions = (statement.path, statement.start, statement.end)
-    asked = any(entry.realised is not None for entry in conditions)
+    asked = any(entry.realised is not None for entry in statement.conditions)
     asked = asked or (statement.loop is not None and statement.loop.spread is not None)
     return "asked gain" if asked else "free gain"
 

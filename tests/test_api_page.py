@@ -17,7 +17,8 @@ import pytest
 
 import covocp as co
 from covocp.plot.figure import plot_solutions
-from covocp.solving.solver import Solver, method_options
+from covocp.solving.methods import method_options
+from covocp.solving.solver import Solver
 from covocp.transcription.mesh import Options
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "api.md").read_text(encoding="utf-8")

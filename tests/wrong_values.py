@@ -19,7 +19,7 @@ import numpy as np
 import covocp as co
 from covocp.blocks import attitude_seeking, kalman, peak_seeking, riccati, so3, theta_d
 from covocp.simulation.laws import extended_filter, gain_filter
-from covocp.solving.solver import method_options
+from covocp.solving.methods import method_options
 from covocp.transcription.mesh import Options
 
 SMALL: dict[str, Any] = {"intervals": 2, "substeps": 2, "progress": False}
@@ -243,11 +243,20 @@ def solving() -> Iterator[tuple[str, str, Call]]:
         yield "solve", name, lambda v, n=name, e=extra: co.solve(**({"problem": ocp, **few, **e} | {n: v}))
     for name in method_options("gradient"):
         yield "solve gradient", name, lambda v, n=name: co.solve(ocp, "gradient", **(few | {n: v}))
+    for method in ("reduced", "auto"):
+        for name in method_options(method):
+            yield f"solve {method}", name, lambda v, m=method, n=name: co.solve(ocp, m, **(few | {n: v}))
     for argument, call in called(solver.solve, progress=False, allow_failure=True):
         if argument not in ("starts", "seed"):
             yield "Solver.solve", argument, call
     yield "Solver.solve", "parameters, values", lambda v: solver.solve({"a": v}, progress=False, allow_failure=True)
     yield "Solver.solve", "guess, values", lambda v: solver.solve(guess={"u": v}, progress=False, allow_failure=True)
+    yield (
+        "Solver.solve",
+        "initial, values",
+        lambda v: solver.solve(initial={"x": v}, progress=False, allow_failure=True),
+    )
+    yield "Solver.solve", "means, values", lambda v: solver.solve(means={"b": v}, progress=False, allow_failure=True)
     yield "Solver.solve", "guess, states", lambda v: solver.solve(guess={"x": v}, progress=False, allow_failure=True)
     for argument, call in called(co.compare, problem=ocp, methods=["ipopt"], **SMALL):
         yield "compare", argument, call

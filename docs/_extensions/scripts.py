@@ -58,6 +58,7 @@ GALLERY = (
             "incorrect_statistics",
             "monte_carlo",
             "own_law",
+            "receding_horizon",
             "tracking_in_the_wind",
             "mars_entry",
         ),

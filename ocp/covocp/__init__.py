@@ -12,7 +12,8 @@
 
 To state a problem: `Problem`, `Free` (its terminal time), `Gain` (constraints on its feedback), `Phases` (problems
 one after the other), `table` (numbers over one to three variables); expressions are CasADi's. To solve it: `solve`,
-`Solver` (again and again), `compare` (several methods), `evaluate` (a given control), `methods`. To judge a solution:
+`Solver` (again and again, from anywhere: `movable`), `compare` (several methods), `evaluate` (a given control),
+`methods`. To judge a solution:
 `certify` (is it the global minimum?), `worth` (does the combined design pay?), `simulate` (Monte Carlo of the actual
 system), `simulate_law`, `simulate_sampled`. To keep and to fly it: `Solution.save`, `load`, `export_c`. Filters and
 laws by themselves: `blocks`. What this installation has: `build_info`. What is wrong is said by `ProblemError`,
@@ -37,10 +38,11 @@ from covocp.problem.declarations import Free as Free
 from covocp.problem.declarations import Gain as Gain
 from covocp.problem.phases import Phases as Phases
 from covocp.solution.solution import Solution as Solution
+from covocp.solving.elsewhere import movable as movable
 from covocp.solving.evaluation import evaluate as evaluate
 from covocp.solving.methods import methods as methods
+from covocp.solving.once import solve as solve
 from covocp.solving.solver import Solver as Solver
-from covocp.solving.solver import solve as solve
 
 __all__ = [
     "Problem",
@@ -49,6 +51,7 @@ __all__ = [
     "Phases",
     "solve",
     "Solver",
+    "movable",
     "Solution",
     "PhasesSolution",
     "methods",

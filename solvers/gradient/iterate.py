@@ -29,6 +29,7 @@ from covocp.solvers.gradient.influence import (
 )
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import (
+    INSTANT,
     Group,
     Indices,
     Penalty,
@@ -175,11 +176,12 @@ class Space(Unknowns):
 
     def _fold(self, nodal: Array) -> Array:
         """Values at the N + 1 nodes as values of the controls: with constant controls the last node has the last."""
-        if self.sweeps.mesh.control == "linear":
-            return nodal
+        mesh = self.sweeps.mesh
+        if mesh.control == "linear":
+            return mesh.gathered(nodal)
         folded = nodal[:-1].copy()
         folded[-1] += nodal[-1]
-        return folded
+        return mesh.gathered(folded)
 
     def cost_size(self, iterate: Iterate) -> float:
         """Sum of the absolute terms of the cost."""
@@ -291,10 +293,12 @@ class Space(Unknowns):
         final[list(terminal.fixed)] += ell[: len(terminal.fixed)]
         end, bounds = zero.end.copy(), np.zeros((mesh.intervals + 1, st.nx + st.ne))
         end[list(terminal.rows)] = ell[len(terminal.fixed) :]
-        path, start = zero.path, zero.start
+        path, start, instants = zero.path, zero.start, [np.zeros(0)]
         for group, values in zip(self.groups, iterate.penalty.multipliers, strict=True):
             if group.kind == "path":
                 path = values
+            elif group.kind == INSTANT:
+                instants.append(values[0])
             elif group.kind == "start":
                 start = start.copy()
                 start[: values[0].size] = values[0]
@@ -314,6 +318,7 @@ class Space(Unknowns):
             final_matrices=final[st.nx :],
             end=end,
             start=start,
+            instants=np.concatenate(instants),
             path=path,
             states=bounds[:, : st.nx],
             matrices=bounds[:, st.nx :],

@@ -1,7 +1,8 @@
 """Inequalities as penalties d int c^2 1[c > 0] dt, with weights raised and shifts learnt (gradient method).
 
 Path conditions and bounds on states and matrices count at the nodes of the mesh, with the trapezoidal weights of the
-nodes; initial and final conditions count once. Each row lower <= c <= upper has its own weight d and its shift m/(2 d),
+nodes; initial and final conditions and those at instants count once. Each row lower <= c <= upper has its own weight d
+and its shift m/(2 d),
 
     d { c + m/(2d) - clip(c + m/(2d)) }^2,
 
@@ -32,6 +33,9 @@ from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import at_nodes
 
 Indices = NDArray[np.intp]
+
+# Kind of a group of conditions at one instant.
+INSTANT = "instant"
 
 # The first weight makes a violation by the typical magnitude of a row, everywhere, cost this many times the cost.
 FIRST_WEIGHT = 10.0
@@ -150,8 +154,20 @@ def penalty_groups(
             lower[bounded],
             upper[bounded],
         ),
+        *_at_instants(statement, mesh),
     ]
     return tuple(group for group in candidates if group is not None)
+
+
+def _at_instants(statement: Statement, mesh: Mesh) -> list[Group | None]:
+    """A group for the conditions at each instant."""
+    inside = statement.inside
+    result = []
+    for part, k in zip(inside.parts, inside.nodes_among(mesh.nodes), strict=True):
+        own = part.conditions
+        rows = (own.function, own.lower, own.upper)
+        result.append(_group(statement, INSTANT, own.names, np.array([k]), np.ones(1), *rows))
+    return result
 
 
 def _entries(x: Expr, e: Expr, chosen: list[int]) -> Any:
@@ -231,7 +247,7 @@ def first_weights(
 
 def _evaluate(group: Group, mesh: Mesh, run: Run, parameters: Array, weights: Array, shifts: Array) -> list[Array]:
     count = group.nodes.size
-    controls = at_nodes(run.u, mesh.nodes.size)[group.nodes]
+    controls = at_nodes(mesh.acting(run.u.T).T, mesh.nodes.size)[group.nodes]
     outputs = group.function(
         run.z[group.nodes].T,
         controls.T,

@@ -41,6 +41,7 @@ class Engine:
         self._value = Buffered(ca.Function("value", [w, p], outputs[:1] + outputs[2:3]))
         self._memory: Memory | None = None
         self._last: tuple[bytes, tuple[Array, ...] | None] | None = None
+        self._layout: tuple[bytes, Layout] | None = None
         self._stats: dict[str, Any] = {}
 
     def __call__(
@@ -48,7 +49,7 @@ class Engine:
     ) -> dict[str, Any]:
         """Solve; arguments and results by the names of CasADi's solvers. Multipliers to start from are not needed."""
         bounds = Bounds(**{name: np.asarray(value, dtype=float) for name, value in limits.items()})
-        layout = layout_of(self._program, bounds, self._pattern)
+        layout = self._layout_of(bounds)
         start = self._at(layout, p)(x0)
         if start is None:
             self._program.check_finite(x0, (p[:-1],))
@@ -66,7 +67,8 @@ class Engine:
         memory = self._memory if lam_g0 is not None else None  # what was learnt at a plan helps near it
         if memory is not None and memory.curvature.matrix.shape[0] != layout.chosen.size:
             memory = None
-        ended = sequence.run(start, memory)
+        with np.errstate(all="ignore"):  # a step into numbers too large to be squared is one that is not taken
+            ended = sequence.run(start, memory)
         self._memory = ended.memory if ended.status is Status.SOLVED else None
         self._stats = {
             "success": ended.status is Status.SOLVED,
@@ -74,6 +76,14 @@ class Engine:
             "iter_count": ended.iterations,
         }
         return {"x": ca.DM(ended.place.w), "lam_x": ca.DM(ended.lam_x), "lam_g": ca.DM(ended.lam_g)}
+
+    def _layout_of(self, bounds: Bounds) -> Layout:
+        """The layout for these bounds; that of the last call where the same are fixed or infinite."""
+        limited = np.isfinite(bounds.lbx) | np.isfinite(bounds.ubx)
+        key = np.concatenate([bounds.ubx > bounds.lbx, limited]).tobytes()
+        if self._layout is None or self._layout[0] != key:
+            self._layout = key, layout_of(self._program, bounds, self._pattern)
+        return self._layout[1]
 
     def stats(self) -> dict[str, Any]:
         """How the last call ended."""

@@ -98,7 +98,7 @@ class Functions:
 
 
 class Sequence:
-    """One run."""
+    """One run: a quadratic subproblem, a step, what the step tells of the curvature, and so on."""
 
     def __init__(
         self,
@@ -173,6 +173,7 @@ class Sequence:
             rows = self._condensed(place)
 
     def _condensed(self, place: Place) -> Subproblem:
+        """The problem linearised at a point."""
         return condensed(self._layout, self._bounds, place.w, place.slope, place.g, place.jacobian)
 
     def _step(
@@ -196,9 +197,11 @@ class Sequence:
         return eased(problem, *active, PRICE * max(size, 1e-8))
 
     def _multipliers(self, place: Place, rows: Subproblem, step: Step) -> tuple[Array, Array]:
+        """Multipliers of all bounds and rows from those of a subproblem."""
         return all_multipliers(self._layout, rows, place.slope, place.jacobian, step.of_rows, step.of_bounds)
 
     def _violations(self, g: Array) -> Array:
+        """By how much the rows pass their limits."""
         return np.asarray(np.maximum(np.maximum(self._bounds.lbg - g, g - self._bounds.ubg), 0.0))
 
     def _met(self, place: Place, step: Step, curvature: Curvature, left: float) -> Status | None:
@@ -206,7 +209,7 @@ class Sequence:
         violation = float(self._violations(place.g).max(initial=0.0))
         if left > STUCK and violation > FEASIBLE:
             return Status.INFEASIBLE
-        if violation <= FEASIBLE and self._gain(place, step, curvature) <= self._tolerance**2:
+        if violation <= FEASIBLE and np.sqrt(self._gain(place, step, curvature)) <= self._tolerance:
             return Status.SOLVED
         return None
 
@@ -214,7 +217,7 @@ class Sequence:
         """What the subproblem promises, relative to the cost or to what controls spend of it."""
         z = place.w[self._layout.chosen]
         size = max(abs(place.cost), SPENT * float(z @ curvature.matrix @ z), float(np.finfo(float).tiny))
-        return float(step.change @ curvature.matrix @ step.change) / size
+        return max(float(step.change @ curvature.matrix @ step.change), 0.0) / size
 
     def _searched(
         self, place: Place, rows: Subproblem, step: Step, curvature: Curvature, weights: Array, left: float
@@ -265,6 +268,7 @@ class Sequence:
         return self._inside(place.w + moved(self._layout, again, found[0].change, place.w.size))
 
     def _inside(self, w: Array) -> Array:
+        """A point within the bounds: roundoff alone takes it out of them."""
         return np.asarray(np.clip(w, self._bounds.lbx, self._bounds.ubx))
 
     def _difference(self, place: Place, following: Place, rows: Subproblem, lam_g: Array) -> Array:
@@ -291,6 +295,7 @@ class Sequence:
         iterations: int,
         memory: Memory | None,
     ) -> Ended:
+        """The end of a run; without a subproblem that was solved its multipliers are zero, but for the costates."""
         if multipliers is None:
             zero = np.zeros(rows.places.size)
             multipliers = all_multipliers(

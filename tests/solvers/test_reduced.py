@@ -113,6 +113,27 @@ def test_what_contradicts_is_said_and_the_last_iterate_kept():
     assert error.value.violations
 
 
+def held_below() -> co.Problem:
+    """Bryson and Denham's problem; its limit must hold between the nodes too. Cost 4 / (9 l) (1975, 3.11)."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=[0.0, 1.0], final=[0.0, -1.0]), ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], u))
+    ocp.subject_to(x[0], upper=1 / 9, between="auto")
+    ocp.minimize(running=0.5 * u**2)
+    return ocp
+
+
+def test_meshes_are_refined_and_limits_hold_between_the_nodes():
+    solution = co.solve(held_below(), "reduced", refine=1e-5)
+    assert solution.cost == pytest.approx(4.0, rel=2e-5)
+    fine = solution.at(np.linspace(0, 1, 5000))["x"]
+    assert fine[:, 0].max() < 1 / 9 + 1e-5
+    for method in ("reduced", "auto"):
+        found = co.solve(measured(2, 0), method, refine=1e-5)
+        assert found.cost == pytest.approx(co.solve(measured(2, 0), intervals=200).cost, rel=3e-5)
+        assert found.mesh_error < 1e-5
+
+
 def unstable() -> co.Problem:
     """A plant that grows by e^60, steered to rest while its gain is estimated."""
     ocp = co.Problem(6.0)

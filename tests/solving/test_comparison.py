@@ -11,7 +11,8 @@ import pytest
 import covocp as co
 from covocp.base.progress import Progress
 from covocp.models import noisy_integrator, unknown_lag
-from covocp.solving.solver import METHODS, Solver
+from covocp.solving.methods import METHODS
+from covocp.solving.solver import Solver
 
 FORMULATIONS = [
     ("ipopt", "ipopt", {"substeps": 2}),

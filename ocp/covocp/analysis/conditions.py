@@ -59,7 +59,9 @@ def _kind(statement: Statement) -> str:
         return "the nominal depends on the estimation covariance"
     if statement.samples is not None:
         names = ", ".join(block.name for block in statement.samples.blocks)
-        return f"measurements are taken at instants, and the bound counts information as a density along the way: {names}"
+        return f"measurements are taken at instants, where information is no density along the way: {names}"
+    if statement.inside.size:
+        return "conditions hold at instants inside the horizon: " + ", ".join(statement.inside.names)
     if statement.measurement is None:
         return "nothing is measured"
     if not statement.nu:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -12,17 +13,23 @@ from typing import Any
 class Progress:
     """A status line while a method iterates, and a flag that Ctrl-C sets.
 
-    Used as a context manager around the iterations; `stop` tells the method to end after the present one. The second
-    Ctrl-C interrupts at once.
+    Used as a context manager around the iterations; `stop` tells the method to end after the present one, because the
+    user asked for it (`asked`) or because a limit is reached (`spent`). The second Ctrl-C interrupts at once.
 
     Args:
         title: what is being solved.
         show: whether to show the line; only ever shown when the standard error is a terminal.
+        seconds: that may pass from entering the context on; None: no limit.
+        iterations: that may be reported, beside that of the start; None: no limit.
     """
 
-    def __init__(self, title: str, show: bool = True) -> None:
+    def __init__(
+        self, title: str, show: bool = True, *, seconds: float | None = None, iterations: int | None = None
+    ) -> None:
         """Nothing is shown before the context is entered."""
-        self.stop = False
+        self.asked = False
+        self._seconds, self._iterations = seconds, iterations
+        self._begin, self._seen = time.perf_counter(), 0
         self._title = title
         self._show = show and sys.stderr.isatty()
         self._status: Any = None
@@ -30,6 +37,7 @@ class Progress:
 
     def __enter__(self) -> Progress:
         """Show the line and listen to Ctrl-C (in the main thread)."""
+        self._begin = time.perf_counter()
         if self._show:
             from rich.console import Console
 
@@ -51,12 +59,38 @@ class Progress:
             self._previous = None
 
     @property
+    def spent(self) -> str:
+        """The limit that is reached, in words; "" where none is."""
+        if self._iterations is not None and self._seen > self._iterations:
+            return f"the limit of {self._iterations} iterations"
+        if self._seconds is not None and time.perf_counter() - self._begin >= self._seconds:
+            return f"the limit of {self._seconds:g} s"
+        return ""
+
+    @property
+    def left(self) -> tuple[float | None, int | None]:
+        """Seconds, above zero, and iterations that are left to the limits; None: no limit."""
+        past = time.perf_counter() - self._begin
+        seconds = None if self._seconds is None else max(self._seconds - past, sys.float_info.min)
+        return seconds, None if self._iterations is None else max(self._iterations - self._seen, 0)
+
+    def count(self, iterations: int) -> None:
+        """Iterations of another run that the limit is meant for too."""
+        self._seen += iterations
+
+    @property
+    def stop(self) -> bool:
+        """Whether the method should end."""
+        return self.asked or bool(self.spent)
+
+    @property
     def shown(self) -> bool:
         """Whether somebody watches."""
         return self._show
 
     def update(self, iteration: int, cost: float, violation: float) -> None:
         """Report an iteration: its number, its cost, the largest violation of a constraint (scaled)."""
+        self._seen += 1
         if self._status is not None:
             self._status.update(f"{self._title}: iteration {iteration}, cost {cost:.8g}, violation {violation:.1e}")
 
@@ -66,12 +100,12 @@ class Progress:
         Raises:
             KeyboardInterrupt: it was pressed.
         """
-        if self.stop:
+        if self.asked:
             raise KeyboardInterrupt
         if self._status is not None:
             self._status.update(f"{self._title}: {what}")
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        if self.stop:
+        if self.asked:
             raise KeyboardInterrupt
-        self.stop = True
+        self.asked = True

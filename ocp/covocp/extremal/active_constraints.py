@@ -28,8 +28,8 @@ class Held:
     """Rows that hold a solution, besides the controls at their bounds.
 
     Attributes:
-        entries: for each kind ("final", "final_matrices", "states", "matrices", "path", "start", "end") the positions
-            of its rows, nodes first.
+        entries: for each kind ("final", "final_matrices", "states", "matrices", "path", "start", "end", "instants") the
+            positions of its rows, nodes first.
         side: of all rows in this order, 0 for an equality, 1 at the upper bound, -1 at the lower one.
         strict: whether the row is an equality or has a multiplier; the others only just hold.
         controls: side of the control values at a bound with a multiplier, 0 elsewhere, (N + 1 or N, nu).

@@ -19,6 +19,7 @@ from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, state_slope
+from covocp.extremal.inside import instant_jumps
 from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -41,12 +42,13 @@ def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
 
 
 def impulses(extremal: Extremal) -> Array:
-    """Jumps of the costates at the nodes, (N + 1, nx + ne): multipliers of path constraints and bounds that act there.
+    """Jumps of the costates at the nodes, (N + 1, nx + ne), by the multipliers of what acts there.
 
-    The row of the last node is zero: what acts there is part of the terminal costates.
+    That are path constraints, bounds, and conditions at instants: costates at a node are those before them. The row of
+    the last node is zero: what acts there is part of the terminal costates.
     """
     statement, multipliers = extremal.statement, extremal.multipliers
-    jumps = np.hstack([multipliers.states, multipliers.matrices])
+    jumps = np.hstack([multipliers.states, multipliers.matrices]) + instant_jumps(extremal)
     if statement.path.size:
         symbolic: Any = statement.symbolic
         symbols = model_symbols(statement)

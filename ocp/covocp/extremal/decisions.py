@@ -14,6 +14,7 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.hamiltonian import Costates
+from covocp.extremal.inside import instant_jumps
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.steps import KEPT
@@ -111,7 +112,8 @@ def _sizes(extremal: Extremal, costates: Costates) -> Array:
     along = np.trapezoid(np.asarray(values.full())[rows], extremal.time, axis=1)
     matrices_alone = Costates(state=np.zeros_like(costates.state), matrices=costates.matrices)
     first = np.abs(start_slopes(extremal, matrices_alone))[rows]
-    return np.asarray(along + np.abs(costates.state[-1, rows]) + first)
+    at_instants = np.abs(instant_jumps(extremal)[:, rows]).sum(axis=0)
+    return np.asarray(along + np.abs(costates.state[-1, rows]) + first + at_instants)
 
 
 @lru_cache(maxsize=KEPT)

@@ -14,6 +14,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
+from covocp.statement.conditions import Inside
 from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
@@ -84,7 +85,7 @@ class Extremal:
             *repeated(self.trajectory.duration, self.parameters, self.mesh.nodes.size),
         )
 
-    def inequalities(self) -> Iterator[tuple[Conditions, str, Array]]:
+    def inequalities(self) -> Iterator[tuple[Conditions | Inside, str, Array]]:
         """Those of the statement that are there, their place, and their values at the nodes of it, (nodes, rows)."""
         st, columns = self.statement, [np.asarray(column) for column in self.columns()]
         for place, nodes in (("path", slice(None)), ("start", slice(1)), ("end", slice(-1, None))):
@@ -92,6 +93,12 @@ class Extremal:
             if conditions.size:
                 chosen = [column[:, nodes] for column in columns]
                 yield conditions, place, np.asarray(conditions.function.map(chosen[0].shape[1])(*chosen).full()).T
+        if st.inside.size:
+            values = [
+                np.asarray(part.conditions.function(*(column[:, k] for column in columns)).full()).ravel()
+                for part, k in zip(st.inside.parts, st.inside.nodes_among(self.mesh.nodes), strict=True)
+            ]
+            yield st.inside, "instants", np.concatenate(values)[None, :]
 
     @property
     def intervals(self) -> Interval:

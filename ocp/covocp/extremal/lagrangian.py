@@ -16,7 +16,8 @@ from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
-from covocp.statement.statement import Columns, Statement
+from covocp.statement.conditions import Columns, Conditions, Inside
+from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
 from covocp.transcription.steps import KEPT, full_interval, moving_interval, nominal_interval
@@ -40,13 +41,15 @@ def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
     final_matrices[st.entries(st.behind)] = 0.0  # they start there: nothing holds them
     return (
         *(np.concatenate([z.ravel(), t.u.ravel()]), t.e[0], t.duration, extremal.parameters, costate.T),
-        *(m.final, final_matrices, m.start, m.end, m.path.T, m.states.T, m.matrices.T),
+        *(m.final, final_matrices, m.start, m.end, m.instants, m.path.T, m.states.T, m.matrices.T),
     )
 
 
 def _sees_matrices(statement: Statement, held: Entries) -> bool:
     """Whether some of the rows that are held contain entries of matrices."""
-    conditions = {"path": statement.path, "start": statement.start, "end": statement.end}
+    st = statement
+    conditions: dict[str, Conditions | Inside] = {"path": st.path, "start": st.start, "end": st.end}
+    conditions["instants"] = st.inside
     named = [kind for kind, positions in held if positions]
     return any(kind not in conditions or conditions[kind].uses_matrices for kind in named if kind not in OF_STATES)
 
@@ -67,8 +70,8 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     lengths = {"e0": st.ne, "T": 1, "p": st.np}
     e0, duration, p = (ca.MX.sym(name, length) for name, length in lengths.items())
     costate = ca.MX.sym("costate", size, n + 1)
-    lengths = {"final": st.nx, "final_e": st.ne, "start": st.start.size, "end": st.end.size}
-    final, final_e, start, end = (ca.MX.sym(name, length) for name, length in lengths.items())
+    lengths = {"final": st.nx, "final_e": st.ne, "start": st.start.size, "end": st.end.size, "instants": st.inside.size}
+    final, final_e, start, end, instants = (ca.MX.sym(name, length) for name, length in lengths.items())
     lengths = {"path": st.path.size, "states": st.nx, "matrices": st.ne}
     path, states, matrices = (ca.MX.sym(name, length, n + 1) for name, length in lengths.items())
     common = interval_columns(mesh, u, duration, p)
@@ -98,8 +101,16 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
             places = Columns(x[:, at], at_nodes[:, at], e[:, at], time[:, at])
             value += ca.dot(weights, conditions.columns(places, duration, p))
             rows[kind] = conditions.columns(places._replace(matrices=seen[:, at]), duration, p)
+    own_rows = []
+    for part, k, weights in zip(
+        st.inside.parts, st.inside.nodes_among(mesh.nodes), st.inside.split(instants), strict=True
+    ):
+        places = Columns(x[:, k], at_nodes[:, k], e[:, k], time[:, k])
+        value += ca.dot(weights, part.conditions.columns(places, duration, p))
+        own_rows.append(part.conditions.columns(places._replace(matrices=seen[:, k]), duration, p))
+    rows["instants"] = ca.vertcat(ca.MX(0, 1), *own_rows)
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
-    inputs = [w, e0, duration, p, costate, final, final_e, start, end, path, states, matrices]
+    inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices]
     direction = ca.MX.sym("direction", w.shape[0])
     product = ca.densify(ca.jtimes(ca.gradient(value, w), w, direction))
     jacobian = ca.jacobian(ca.vertcat(ca.MX(0, 1), *kept), w)

@@ -50,7 +50,9 @@ def _of_controls(coarse: Extremal, fine: Extremal) -> tuple[Array, Array]:
     mesh, t = fine.mesh, fine.trajectory
     places = control_places(mesh.nodes, mesh.control)
     own = coarse.mesh.nodes
-    k = np.clip(np.searchsorted(own, places, side="right") - 1, 0, own.size - 2)
+    early = np.append(places[1:] == places[:-1], False)  # before an instant, where controls may jump
+    k = np.where(early, np.searchsorted(own, places), np.searchsorted(own, places, side="right")) - 1
+    k = np.clip(k, 0, own.size - 2)
     length = own[k + 1] - own[k]
     share = np.where(length > 0, (places - own[k]) / np.where(length > 0, length, 1.0), 0.0)
     given = coarse.control(k, share)

@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_end, refined_run
@@ -80,6 +81,7 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
         weights = np.hstack([costates.state, costates.matrices])[list(mesh.starts[1:]), : jumps.shape[1]]
     change = float(np.sum(weights * jumps)) + finer.running - running
     change += _at_the_end(extremal, finer.matrices[-1]) - _at_the_end(extremal, t.e[-1])
+    change += instant_change(extremal, finer.states, finer.matrices)
     if st.behind:  # what the phases before a link cost by what runs backward, at the start
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])

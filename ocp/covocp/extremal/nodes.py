@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
+import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
@@ -9,6 +12,8 @@ from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import one_sided
+from covocp.statement.statement import Statement
+from covocp.transcription.steps import KEPT
 
 
 def rates_along(extremal: Extremal) -> tuple[Array, Array]:
@@ -16,7 +21,7 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
 
     Each with the control of its interval and the limit of the time from inside it.
     """
-    function = extremal.statement.rates.map(extremal.mesh.intervals + 1)
+    function = _mapped(extremal.statement, "rates", extremal.mesh.intervals + 1)
 
     def stacked(u: Expr, time: Array) -> Array:
         state, matrices, _ = function(x, u, e, time[None, :], *rest)
@@ -40,9 +45,16 @@ def filter_gains(extremal: Extremal) -> Array | None:
     block = st.estimation
     x, u, _, t, duration, p = extremal.columns()
     count = extremal.mesh.intervals + 1
-    _, M, U = (stacked(v, count) for v in st.measurement.map(count)(x, u, t, duration, p))
+    _, M, U = (stacked(v, count) for v in _mapped(st, "measurement", count)(x, u, t, duration, p))
     E = unpack(extremal.trajectory.e[:, block.span], block.size)
     try:
         return np.asarray(kalman_gain(E, M, U))
     except np.linalg.LinAlgError:  # a density that is singular somewhere: the iterate is kept, without its gain
         return None
+
+
+@lru_cache(maxsize=2 * KEPT)
+def _mapped(statement: Statement, function: str, count: int) -> ca.Function:
+    """A function of the statement for so many points."""
+    made: ca.Function = getattr(statement, function).map(count)
+    return made

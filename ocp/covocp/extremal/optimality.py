@@ -19,6 +19,7 @@ from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
+from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.readings import stretches
@@ -128,13 +129,13 @@ def assess(
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
     residual = (
-        (slopes + _path_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
+        (slopes + _limit_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
     )
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     control_slope, control_error = 0.0, 0.0
     if st.nu and free is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
-        free = free & ~_read_through(extremal)[:, None]
+        free = free & ~_beside(extremal)[:, None]
         if not st.path.size:
             control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
             others = 0.0 if within is None else within.size
@@ -247,14 +248,14 @@ def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     return _AtNodes(slope, curvature, np.column_stack([h[:, 0], terms]), sizes)
 
 
-def _path_slopes(extremal: Extremal) -> Array:
-    """Slopes by the control values of the path constraints times their multipliers."""
+def _limit_slopes(extremal: Extremal) -> Array:
+    """Slopes by the control values of path constraints and conditions at instants times their multipliers."""
     st, mesh = extremal.statement, extremal.mesh
     if mesh.points > 1:
-        return np.asarray(prolongation(mesh).T @ _path_slopes(refined(extremal)))
-    result = np.zeros((mesh.control_nodes, st.nu))
+        return np.asarray(prolongation(mesh).T @ _limit_slopes(refined(extremal)))
+    result = instant_control_slopes(extremal)
     if not st.path.size:
-        return result
+        return mesh.gathered(result)
     symbols = model_symbols(st)
     weights = symbols[0].sym("mu", st.path.size)
     slope = ca.gradient(ca.dot(weights, st.path.function(*symbols)), symbols[1])
@@ -264,7 +265,7 @@ def _path_slopes(extremal: Extremal) -> Array:
     result += values[: mesh.control_nodes]
     if mesh.control == "constant":
         result[-1] += values[-1]
-    return result
+    return mesh.gathered(result)
 
 
 def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_], others: float) -> float:
@@ -348,14 +349,15 @@ def _explicit_pairs(extremal: Extremal) -> int | None:
 
 
 def _variation(extremal: Extremal, values: Array) -> float:
-    """Variation of H relative to its terms; where something is read at an instant it may jump."""
+    """Variation of H relative to its terms; where something is read or holds at an instant it may jump."""
     largest = max(float(np.ptp(values[part, 0])) for part in stretches(extremal))
     return largest / max(float(values[:, 1].max()), np.finfo(float).tiny)
 
 
-def _read_through(extremal: Extremal) -> NDArray[np.bool_]:
-    """Nodes whose control acts through what is read there at an instant, beside H_u."""
+def _beside(extremal: Extremal) -> NDArray[np.bool_]:
+    """Nodes whose control acts beside H_u: through what is read there at an instant, or in a condition there."""
     result = np.zeros(extremal.mesh.intervals + 1, dtype=bool)
+    result[controlled_nodes(extremal)] = True
     samples = extremal.statement.samples
     if samples is not None and any(samples.measurement.jac_sparsity(i, 1).nnz() for i in (1, 2)):
         result[extremal.mesh.instants] = True
@@ -374,12 +376,13 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
         arguments = (trajectory.x[-1], trajectory.u[-1], trajectory.e[-1], duration, duration, extremal.parameters)
         value += ca.dot(ca.DM(extremal.multipliers.end), st.end.function(*arguments))
     slope = float(ca.Function("slope", [duration], [ca.gradient(value, duration)])(trajectory.duration))
+    slope += instant_duration_slope(extremal)
     behind = st.entries(st.behind)
     slope += passage_end(extremal, costates.matrices[-1, behind])[1]
     (explicit,) = along(duration_slope(st), extremal, costates)
     slope += float(np.trapezoid(explicit[:, 0], extremal.time))
     slope += 0.0 if within is None else within.by_duration
-    jumps = extremal.mesh.instants  # H jumps where something is read, and the instant moves with T
+    jumps = extremal.mesh.instants  # H jumps where something is read or holds, and the instant moves with T
     moved = extremal.mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
     residual = slope + float(values[-1, 0]) - float(moved)
     at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)

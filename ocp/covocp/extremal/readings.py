@@ -47,9 +47,9 @@ class Readings:
 def readings_along(extremal: Extremal) -> list[Readings]:
     """What is read along a trajectory, instant by instant; none where nothing is estimated."""
     st, mesh = extremal.statement, extremal.mesh
-    if st.samples is None or not st.estimated or not mesh.instants:
+    if st.samples is None or not st.estimated or not mesh.readings.any():
         return []
-    block, at = st.estimation, mesh.instants
+    block, at = st.estimation, [k for k in mesh.instants if mesh.readings[:, k].any()]
     columns = [np.asarray(column)[:, at] for column in extremal.columns()]
     x, u, _, *rest = columns
     _, H, R = (stacked(v, len(at)) for v in st.samples.measurement.map(len(at))(x, u, *rest))
@@ -71,7 +71,7 @@ def read_rows(extremal: Extremal, interval: int) -> list[int]:
 
 
 def stretches(extremal: Extremal) -> list[slice]:
-    """The nodes between the instants: what is constant along a trajectory may jump where something is read."""
+    """The nodes between the instants: what is constant along a trajectory may jump where something is read or holds."""
     ends = [-1, *extremal.mesh.instants, extremal.mesh.intervals]
     found = [slice(begin + 1, end + 1) for begin, end in pairwise(ends)]
     return [part for part in found if part.stop - part.start > 1] or found[:1]

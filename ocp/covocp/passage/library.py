@@ -13,11 +13,11 @@ MODULE = "covocp.passage._passage"
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE)),
+    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE, _ADDRESS)),
     "passage_free": (None, (_ADDRESS,)),
-    "passage_forward": (None, (_ADDRESS,) * 6),
-    "passage_reverse": (None, (_ADDRESS,) * 10),
-    "passage_tangent": (_WHOLE, (_ADDRESS,) * 16),
+    "passage_forward": (None, (_ADDRESS,) * 7),
+    "passage_reverse": (None, (_ADDRESS,) * 12),
+    "passage_tangent": (_WHOLE, (_ADDRESS,) * 19),
 }
 
 

@@ -16,8 +16,17 @@
  * How these slopes change along a direction (products with second derivatives) needs one more system a step, that of the
  * tangent of Y1. It holds, as the slopes do, where H and its direction have this form: Q and W symmetric.
  *
+ * Some of the steps have no length: there something is read, r values M x with noise of variance R,
+ *
+ *     K = E M' (M E M' + R)^-1,   A = I - K M,   E+ = A E A' + K R K',   P = A' P+ A,
+ *     slope by M = -2 K' P+ E+,   slope by R = K' P+ K,
+ *
+ * which needs no inverse of R and stays semidefinite however small it is. What is read at once is read one after the
+ * other, a step each, r rows at most; rows without entries, of variance 1, read nothing.
+ *
  * Half-vectors hold the lower triangle column by column. Slopes by a half-vector are those of its entries: both places
- * of a symmetric matrix move with one entry. The nonzeros of H come column by column, step after step.
+ * of a symmetric matrix move with one entry. The nonzeros of H come column by column, step after step; what is read
+ * comes as the rows of M, then the half-vector of R, reading after reading.
  *
  * Nothing here is shared: each `Passage` is used by one thread at a time. It keeps the last point, so that slopes there
  * do not run the passage again.
@@ -61,6 +70,7 @@ static const double MUCH = 100.0;
 
 typedef struct {
     int n, nnz, count, known;
+    int r, moves, reads, *place; /* of each step among those that move, or -1 - that among those that read */
     int *row, *col;              /* nonzeros of H, column by column */
     int *begin, *across, *which; /* the same row by row: places, columns, positions among them */
     double *first, *h1, *h2;     /* the last point */
@@ -71,33 +81,53 @@ typedef struct {
     int *swaps, *exchanged;
     double *work;
     double *moved; /* tangents of the stages and of X, of every step; NULL until they are asked for */
+    double *told;  /* the last point */
+    double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */
+    double *turned; /* tangents of K, A, E+, of every reading, as `moved` */
 } Passage;
 
 EXPORT void passage_free(Passage *p) {
     if (!p) return;
     void *owned[] = {p->row,   p->col,    p->begin,  p->across, p->which, p->first, p->h1,  p->h2,
                      p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->exchanged,
-                     p->work,  p->moved};
+                     p->work,  p->moved,  p->place,  p->told,   p->gain,  p->keep,  p->inverse, p->reached,
+                     p->turned};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(p);
 }
 
 static void *room(size_t count, size_t size) { return count > SIZE_MAX / size ? NULL : malloc(count ? count * size : 1); }
 
-/* A passage of `count` steps of an n x n covariance, with the pattern of H; NULL where there is no memory. */
-EXPORT Passage *passage_new(int n, int nnz, const int *row, const int *col, int count) {
+/* Numbers that tell of one reading. */
+static size_t telling(const Passage *p) { return (size_t)p->r * p->n + (size_t)p->r * (p->r + 1) / 2; }
+
+/* A passage of `count` steps of an n x n covariance, with the pattern of H; NULL where there is no memory.
+ *
+ * Steps with `read` read up to r rows, the others move; read is NULL where all of them do.
+ */
+EXPORT Passage *passage_new(int n, int nnz, const int *row, const int *col, int count, int r, const int *read) {
     Passage *p = calloc(1, sizeof *p);
     if (!p) return NULL;
-    const size_t d = sizeof(double), steps = (size_t)count, square = (size_t)n * n, half = square / 2 + n / 2 + 1;
-    p->n = n, p->nnz = nnz, p->count = count;
+    p->n = n, p->nnz = nnz, p->count = count, p->r = r;
+    p->place = room(count, sizeof(int));
+    if (!p->place) {
+        passage_free(p);
+        return NULL;
+    }
+    for (int k = 0; k < count; ++k) p->place[k] = read && read[k] ? -1 - p->reads++ : p->moves++;
+    const size_t d = sizeof(double), all = (size_t)count, steps = (size_t)p->moves, reads = (size_t)p->reads;
+    const size_t square = (size_t)n * n, half = square / 2 + n / 2 + 1, tall = (size_t)r * n, wide = (size_t)r * r;
     p->row = room(nnz, sizeof(int)), p->col = room(nnz, sizeof(int)), p->begin = room(2 * n + 1, sizeof(int));
     p->across = room(nnz, sizeof(int)), p->which = room(nnz, sizeof(int)), p->swaps = room(steps * n, sizeof(int));
     p->first = room(half, d), p->h1 = room(steps * nnz, d), p->h2 = room(steps * nnz, d);
-    p->kicks = room(steps * half, d), p->after = room(steps * half, d), p->factor = room(steps * square, d);
-    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(17 * square + nnz, d);
-    p->exchanged = room(2 * n, sizeof(int));
+    p->kicks = room(all * half, d), p->after = room(all * half, d), p->factor = room(steps * square, d);
+    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(17 * square + nnz + 4 * (wide + tall), d);
+    p->told = room(reads * telling(p), d), p->gain = room(reads * tall, d), p->keep = room(reads * square, d);
+    p->inverse = room(reads * wide, d), p->reached = room(reads * square, d);
+    p->exchanged = room(2 * n + r, sizeof(int));
     if (!p->row || !p->col || !p->begin || !p->across || !p->which || !p->swaps || !p->first || !p->h1 || !p->h2 ||
-        !p->kicks || !p->after || !p->factor || !p->stage1 || !p->stage2 || !p->work || !p->exchanged) {
+        !p->kicks || !p->after || !p->factor || !p->stage1 || !p->stage2 || !p->work || !p->exchanged || !p->told ||
+        !p->gain || !p->keep || !p->inverse || !p->reached) {
         passage_free(p);
         return NULL;
     }
@@ -254,25 +284,105 @@ INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
         for (int j = 0; j < n; ++j) E[i * n + j] = 0.5 * (b[i * m + n + j] + b[j * m + n + i]);
 }
 
+/* A B, (rows x inner) (inner x columns). */
+INLINE void product(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    memset(result, 0, sizeof(double) * rows * columns);
+    for (int i = 0; i < rows; ++i)
+        for (int j = 0; j < inner; ++j) {
+            const double share = A[i * inner + j];
+            for (int c = 0; c < columns; ++c) result[i * columns + c] += share * B[j * columns + c];
+        }
+}
+
+/* A B', (rows x inner) (columns x inner)'. */
+INLINE void product_turned(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    for (int i = 0; i < rows; ++i)
+        for (int c = 0; c < columns; ++c) {
+            double sum = 0.0;
+            for (int j = 0; j < inner; ++j) sum += A[i * inner + j] * B[c * inner + j];
+            result[i * columns + c] = sum;
+        }
+}
+
+/* A' B, (inner x rows)' (inner x columns). */
+INLINE void turned_product(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    memset(result, 0, sizeof(double) * rows * columns);
+    for (int j = 0; j < inner; ++j)
+        for (int i = 0; i < rows; ++i) {
+            const double share = A[j * rows + i];
+            for (int c = 0; c < columns; ++c) result[i * columns + c] += share * B[j * columns + c];
+        }
+}
+
+/* Where readings compute: past what steps use. */
+static double *aside(const Passage *p) { return p->work + 17 * (size_t)p->n * p->n + p->nnz; }
+
+/* What reading j does: E (n x n) becomes the one after it; what slopes need is kept. */
+INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
+    const int r = p->r, w = 2 * r + n;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *M = p->told + j * telling(p), *half = M + tall;
+    double *K = p->gain + j * tall, *A = p->keep + j * square, *S = p->inverse + j * wide, *after = p->reached + j * square;
+    double *a = aside(p), *seen = a + (size_t)r * w, *R = seen + tall, *spare = p->work;
+    product(M, E, r, n, n, seen); /* M E */
+    product_turned(seen, M, r, n, r, S);
+    spread(half, r, R);
+    for (int i = 0; i < r; ++i) {
+        for (int c = 0; c < r; ++c) a[i * w + c] = S[i * r + c] + R[i * r + c], a[i * w + r + c] = i == c;
+        memcpy(a + i * w + 2 * r, seen + i * n, sizeof(double) * n);
+    }
+    eliminate(a, r, w, p->exchanged);
+    for (int i = 0; i < r; ++i) {
+        memcpy(S + i * r, a + i * w + r, sizeof(double) * r);
+        for (int c = 0; c < n; ++c) K[c * r + i] = a[i * w + 2 * r + c];
+    }
+    product(K, M, n, r, n, A);
+    for (size_t i = 0; i < square; ++i) A[i] = (i % (n + 1) == 0) - A[i];
+    product(A, E, n, n, n, spare);
+    product_turned(spare, A, n, n, n, after);
+    product(K, R, n, r, r, seen);
+    product_turned(seen, K, n, r, n, spare);
+    for (size_t i = 0; i < square; ++i) after[i] += spare[i];
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) E[i * n + c] = 0.5 * (after[i * n + c] + after[c * n + i]);
+    memcpy(after, E, sizeof(double) * square);
+}
+
 /* Whether the passage at this point is known. */
-static int here(const Passage *p, const double *first, const double *h1, const double *h2, const double *kicks) {
-    const size_t half = sizeof(double) * p->n * (p->n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->count;
+static int here(
+    const Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
+) {
+    const size_t half = sizeof(double) * p->n * (p->n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
     if (!p->known || memcmp(p->first, first, half) || memcmp(p->h1, h1, all) || memcmp(p->h2, h2, all)) return 0;
+    if (p->reads && memcmp(p->told, told, sizeof(double) * telling(p) * p->reads)) return 0;
     return kicks ? !memcmp(p->kicks, kicks, half * p->count) : p->known == 1;
 }
 
-INLINE void run(Passage *p, int n, const double *first, const double *h1, const double *h2, const double *kicks) {
-    const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->count;
-    if (here(p, first, h1, h2, kicks)) return;
+INLINE void run(
+    Passage *p, int n, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
+    if (here(p, first, h1, h2, told, kicks)) return;
     p->known = 0;
     memcpy(p->first, first, sizeof(double) * half);
     memcpy(p->h1, h1, all);
     memcpy(p->h2, h2, all);
+    if (p->reads) memcpy(p->told, told, sizeof(double) * telling(p) * p->reads);
     if (kicks) memcpy(p->kicks, kicks, sizeof(double) * half * p->count);
     double *E = p->work + 14 * n * n;
     spread(first, n, E);
     for (int k = 0; k < p->count; ++k) {
-        step(p, n, k, E);
+        const int place = p->place[k];
+        if (place < 0)
+            reading(p, n, -1 - place, E);
+        else
+            step(p, n, place, E);
         double *after = p->after + k * half;
         for (int j = 0, t = 0; j < n; ++j)
             for (int i = j; i < n; ++i, ++t) after[t] = E[i * n + j];
@@ -446,16 +556,56 @@ INLINE void back_all(Passage *p, int n, int k, Slopes *s, double *RESTRICT spare
     }
 }
 
+/* Half-vector of slopes by a symmetric (r x r) matrix: both places move with one entry. */
+INLINE void pack_noise(const double *RESTRICT slope, int r, double *RESTRICT half) {
+    for (int j = 0, t = 0; j < r; ++j)
+        for (int i = j; i < r; ++i, ++t) half[t] = i == j ? slope[i * r + j] : slope[i * r + j] + slope[j * r + i];
+}
+
+/* Slopes before a reading and by what tells of it: few columns, or all of P. */
+INLINE void back_reading(Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
+    const int r = p->r, few = s->few;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n;
+    const double *K = p->gain + j * tall, *A = p->keep + j * square;
+    if (by_told) {
+        double *fed = aside(p), *seen = fed + tall;
+        double *P = s->P;
+        if (few) write_out(s, n, P = spare);
+        turned_product(K, P, r, n, n, fed); /* K' P+ */
+        product(fed, p->reached + j * square, r, n, n, by_told);
+        for (size_t i = 0; i < tall; ++i) by_told[i] *= -2.0;
+        product(fed, K, r, n, r, seen);
+        pack_noise(seen, r, by_told + tall);
+    }
+    if (few) {
+        turned_product(A, s->M, n, n, few, spare);
+        memcpy(s->M, spare, sizeof(double) * n * few);
+        return;
+    }
+    turned_product(A, s->P, n, n, n, spare);
+    product(spare, A, n, n, n, s->P);
+}
+
 INLINE void back(
-    Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_kicks
+    Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
+    double *by_kicks
 ) {
-    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p);
     double *spare = p->work + 5 * n * n;
     Slopes s = {0, 0, p->work, p->work + n * n, p->work + 2 * n * n};
-    for (int k = p->count - 1; k >= 0; --k) {
+    for (int at = p->count - 1; at >= 0; --at) {
+        const int k = p->place[at];
+        join(&s, n, seed + at * half);
+        if (by_kicks) pack_slopes(&s, n, spare, by_kicks + at * half);
+        if (k < 0) {
+            double *own = by_told ? by_told + (-1 - k) * tells : NULL;
+            if (s.any)
+                back_reading(p, n, -1 - k, &s, spare, own);
+            else if (own)
+                memset(own, 0, sizeof(double) * tells);
+            continue;
+        }
         double *s1 = by_h1 ? by_h1 + k * nnz : NULL, *s2 = by_h2 ? by_h2 + k * nnz : NULL;
-        join(&s, n, seed + k * half);
-        if (by_kicks) pack_slopes(&s, n, spare, by_kicks + k * half);
         if (!s.any) {
             if (s1) memset(s1, 0, sizeof(double) * nnz);
             if (s2) memset(s2, 0, sizeof(double) * nnz);
@@ -558,10 +708,45 @@ INLINE void tangent_step(
         for (int j = 0; j < n; ++j) dE[i * n + j] = 0.5 * (right[i * n + j] + right[j * n + i]);
 }
 
+/* The tangent of what reading j does: dE becomes that after it; those of K, A and E+ are kept. */
+INLINE void tangent_reading(Passage *p, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
+    const int r = p->r;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *M = p->told + j * telling(p), *dM = d_told, *K = p->gain + j * tall, *A = p->keep + j * square;
+    const double *after = p->reached + j * square, *S = p->inverse + j * wide;
+    double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    double *one = aside(p), *two = one + tall, *three = two + tall, *noise = three + tall, *other = noise + wide;
+    double *spare = p->work, *more = spare + square;
+    spread(d_told + tall, r, noise); /* dR */
+    product(A, dE, n, n, n, spare);
+    product_turned(spare, A, n, n, n, dAfter); /* A dE A' */
+    product_turned(spare, M, n, n, r, one);    /* dK S = A dE M' + E+ dM' - K (dM E M' + dR) */
+    product_turned(after, dM, n, n, r, two);
+    for (size_t i = 0; i < tall; ++i) one[i] += two[i];
+    product(dM, E, r, n, n, three);
+    product_turned(three, M, r, n, r, other);
+    for (size_t i = 0; i < wide; ++i) other[i] += noise[i];
+    product(K, other, n, r, r, three);
+    for (size_t i = 0; i < tall; ++i) one[i] -= three[i];
+    product(one, S, n, r, r, dK);
+    product(K, noise, n, r, r, one); /* K dR K' - K dM E+ and its transpose */
+    product_turned(one, K, n, r, n, spare);
+    product_turned(K, two, n, r, n, more);
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c)
+            dAfter[i * n + c] += spare[i * n + c] - more[i * n + c] - more[c * n + i];
+    product(dK, M, n, r, n, dA);
+    product(K, dM, n, r, n, spare);
+    for (size_t i = 0; i < square; ++i) dA[i] = -dA[i] - spare[i];
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) dE[i * n + c] = 0.5 * (dAfter[i * n + c] + dAfter[c * n + i]);
+    memcpy(dAfter, dE, sizeof(double) * square);
+}
+
 /* Tangents along the passage, of the half-vectors after each step where they are wanted. */
 INLINE void tangents(
-    Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_kicks,
-    double *d_after
+    Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
+    const double *d_kicks, double *d_after
 ) {
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
     double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
@@ -573,7 +758,11 @@ INLINE void tangents(
         if (p->known == 2)
             for (int j = 0, t = 0; j < n; ++j)
                 for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - p->kicks[k * half + t];
-        tangent_step(p, n, k, E, next, d1 + k * nnz, d2 + k * nnz, dE, spare);
+        const int place = p->place[k];
+        if (place < 0)
+            tangent_reading(p, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
+        else
+            tangent_step(p, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
         spread(after, n, E);
         if (d_kicks)
             for (int j = 0, t = 0; j < n; ++j)
@@ -587,21 +776,58 @@ INLINE void tangents(
     }
 }
 
+/* How the slopes at reading j move: P and dP become those before it. */
+INLINE void back_reading_tangent(
+    Passage *p, int n, int j, double *RESTRICT P, double *RESTRICT dP, double *RESTRICT spare, double *d_by_told
+) {
+    const int r = p->r;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *K = p->gain + j * tall, *A = p->keep + j * square, *after = p->reached + j * square;
+    const double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    double *more = spare + square;
+    if (d_by_told) {
+        double *fed = aside(p), *moved = fed + tall, *other = moved + tall, *noise = other + tall, *part = noise + wide;
+        turned_product(K, P, r, n, n, fed); /* K' P+, and its tangent dK' P+ + K' dP+ */
+        turned_product(dK, P, r, n, n, moved);
+        turned_product(K, dP, r, n, n, other);
+        for (size_t i = 0; i < tall; ++i) moved[i] += other[i];
+        product(moved, K, r, n, r, noise);
+        product(fed, dK, r, n, r, part);
+        for (size_t i = 0; i < wide; ++i) noise[i] += part[i];
+        pack_noise(noise, r, d_by_told + tall);
+        product(moved, after, r, n, n, d_by_told);
+        product(fed, dAfter, r, n, n, other);
+        for (size_t i = 0; i < tall; ++i) d_by_told[i] = -2.0 * (d_by_told[i] + other[i]);
+    }
+    turned_product(A, dP, n, n, n, spare); /* A' dP+ A + A' P+ dA + its transpose */
+    product(spare, A, n, n, n, dP);
+    turned_product(A, P, n, n, n, spare);
+    product(spare, dA, n, n, n, more);
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) dP[i * n + c] += more[i * n + c] + more[c * n + i];
+    product(spare, A, n, n, n, P);
+}
+
 /* How the slopes of `back` move along the tangents. */
 INLINE void back_tangents(
     Passage *p, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
-    double *d_by_kicks
+    double *d_by_told, double *d_by_kicks
 ) {
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
     const int m = 2 * n;
     double *P = p->work, *dP = P + n * n, *K = dP + n * n, *spare = K + n * n, *left = spare + m * n, *other = left + m * n;
     memset(P, 0, sizeof(double) * 2 * n * n);
-    for (int k = p->count - 1; k >= 0; --k) {
-        const double *moved = p->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
-        add_seed(n, seed + k * half, P);
-        if (d_seed) add_seed(n, d_seed + k * half, dP);
+    for (int at = p->count - 1; at >= 0; --at) {
+        const int k = p->place[at];
+        add_seed(n, seed + at * half, P);
+        if (d_seed) add_seed(n, d_seed + at * half, dP);
         Slopes s = {0, 1, dP, NULL, NULL};
-        if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + k * half);
+        if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + at * half);
+        if (k < 0) {
+            back_reading_tangent(p, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
+            continue;
+        }
+        const double *moved = p->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
         congruent(p, n, k, P, spare);
         congruent(p, n, k, dP, spare);
         memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
@@ -633,19 +859,20 @@ INLINE void back_tangents(
 
 /* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT VERSIONS void passage_forward(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, double *after
+    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    double *after
 ) {
-    run(p, p->n, first, h1, h2, kicks);
+    run(p, p->n, first, h1, h2, told, kicks);
     if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
 }
 
 /* Slopes of seed . after by the arguments; those that are NULL are left out. */
 EXPORT VERSIONS void passage_reverse(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, const double *seed,
-    double *by_first, double *by_h1, double *by_h2, double *by_kicks
+    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told, double *by_kicks
 ) {
-    run(p, p->n, first, h1, h2, kicks);
-    back(p, p->n, seed, by_first, by_h1, by_h2, by_kicks);
+    run(p, p->n, first, h1, h2, told, kicks);
+    back(p, p->n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
 }
 
 /* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
@@ -654,15 +881,18 @@ EXPORT VERSIONS void passage_reverse(
  * are zero.
  */
 EXPORT VERSIONS int passage_tangent(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *kicks, const double *seed,
-    const double *d_first, const double *d_h1, const double *d_h2, const double *d_kicks, const double *d_seed,
-    double *d_after, double *d_by_first, double *d_by_h1, double *d_by_h2, double *d_by_kicks
+    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    const double *seed, const double *d_first, const double *d_h1, const double *d_h2, const double *d_told,
+    const double *d_kicks, const double *d_seed, double *d_after, double *d_by_first, double *d_by_h1,
+    double *d_by_h2, double *d_by_told, double *d_by_kicks
 ) {
-    if (!p->moved) p->moved = room((size_t)p->count * 5 * p->n * p->n, sizeof(double));
-    if (!p->moved) return 1;
-    run(p, p->n, first, h1, h2, kicks);
-    tangents(p, p->n, d_first, d_h1, d_h2, d_kicks, d_after);
-    if (seed) back_tangents(p, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_kicks);
+    const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
+    if (!p->moved) p->moved = room((size_t)p->moves * 5 * square, sizeof(double));
+    if (!p->turned) p->turned = room((size_t)p->reads * turned, sizeof(double));
+    if (!p->moved || !p->turned) return 1;
+    run(p, p->n, first, h1, h2, told, kicks);
+    tangents(p, p->n, d_first, d_h1, d_h2, d_told, d_kicks, d_after);
+    if (seed) back_tangents(p, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
     return 0;
 }
 

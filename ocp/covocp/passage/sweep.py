@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -22,32 +23,52 @@ Buffers = tuple[memoryview | None, ...]
 Given = Mapping[str, Any]
 
 
-def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None) -> Any:
-    """Half-vectors of a covariance after each Gauss step.
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What steps of a passage read that have no length.
+
+    steps: their places among all steps, rising. rows: of each, r. columns: the rows of M (r, n), then the half-vector
+    of the variance R, a column for each reading; rows of zeros, of variance 1, read nothing.
+    """
+
+    steps: tuple[int, ...]
+    rows: int
+    columns: Any
+
+
+def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None) -> Any:
+    """Half-vectors of a covariance after each step: Gauss steps, and readings between them.
 
     Args:
         first: half-vector at the start.
-        points: h H of all steps side by side, at the first and at the second Gauss point, of one sparsity each step.
+        points: h H of all Gauss steps side by side, at the first and at the second point, of one sparsity each step.
         size: of the covariance.
         kicks: added to the half-vectors as they pass, a column for each step; None: nothing.
+        told: what is read; None: nothing.
 
     Returns:
         A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps),
         but its sparsity is not seen: no Jacobians of it.
     """
     rows, columns = _pattern(points, size)
-    count = points[0].shape[1] // (2 * size)
-    shape = ca.Sparsity.dense(len(rows), count)
-    wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, count)
+    moves = points[0].shape[1] // (2 * size)
+    shape = ca.Sparsity.dense(len(rows), moves)
+    wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, moves)
     entries = [ca.sparsity_cast(ca.project(point, wide), shape) for point in points]
-    sweep = _sweep(size, (tuple(rows), tuple(columns)), count, kicks is not None)
-    return sweep(first, *entries, *([] if kicks is None else [kicks]))
+    steps, height = ((), 0) if told is None else (told.steps, told.rows)
+    sweep = _sweep(size, (tuple(rows), tuple(columns)), moves + len(steps), kicks is not None, steps, height)
+    others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
+    return sweep(first, *entries, *others)
 
 
-def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None) -> Any:
+def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None) -> Any:
     """Something that depends on what `passed_by` depends on, by operations whose sparsity CasADi sees."""
-    count = points[0].shape[1] // (2 * size)
-    each: Any = sum(ca.sum1(ca.reshape(ca.sum1(point), 2 * size, count)) for point in points)
+    moves = points[0].shape[1] // (2 * size)
+    each: Any = sum(ca.sum1(ca.reshape(ca.sum1(point), 2 * size, moves)) for point in points)
+    if told is not None:
+        both = ca.horzcat(each, ca.sum1(told.columns))
+        order = np.argsort([*(k for k in range(both.shape[1]) if k not in set(told.steps)), *told.steps])
+        each = both[:, order.tolist()]
     if kicks is not None:
         each = each + ca.sum1(kicks)
     return ca.repmat(ca.sum1(first) + ca.cumsum(each, 1), half_length(size), 1)
@@ -97,29 +118,37 @@ def _library() -> dict[str, Callable[..., Any]]:
 
 
 @cache
-def _sweep(size: int, pattern: Pattern, count: int, kicked: bool) -> _Sweep:
+def _sweep(size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int) -> _Sweep:
     """A sweep; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
-    return _Sweep(size, pattern, count, kicked)
+    return _Sweep(size, pattern, count, kicked, reads, height)
 
 
 class _Sweep(ca.Callback):
-    """(half-vector at the start, entries of h H at both points[, kicks]) -> half-vectors after the steps."""
+    """(half-vector at the start, entries of h H at both points[, what is read][, kicks]) -> half-vectors."""
 
-    def __init__(self, size: int, pattern: Pattern, count: int, kicked: bool) -> None:
+    def __init__(
+        self, size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int
+    ) -> None:
         ca.Callback.__init__(self)
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
-        self._size = size
+        self._size, self._height = size, height
+        self._read = np.zeros(count, dtype=np.intc)
+        self._read[list(reads)] = 1
+        self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
         self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
-        steps = count * (10 * size * size + 2 * self.entries + 2 * self.half)
-        self.bytes = 8 * (steps + 17 * size * size)
+        steps = self.moves * (10 * size * size + 2 * self.entries) + 2 * count * self.half
+        readings = self.reads * (4 * size * size + 2 * height * (size + height) + self.telling)
+        self.bytes = 8 * (steps + readings + 17 * size * size)
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
         self.construct("passage", {})
+        self._lengths = [8 * shape.nnz() for shape in self.shapes]
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
         rows, columns = self._rows.ctypes.data, self._columns.ctypes.data
-        memory = _library()["passage_new"](self._size, self.entries, rows, columns, self.count)
+        read = self._read.ctypes.data
+        memory = _library()["passage_new"](self._size, self.entries, rows, columns, self.count, self._height, read)
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
@@ -130,13 +159,13 @@ class _Sweep(ca.Callback):
         return [self.get_sparsity_in(i) for i in range(self.get_n_in())]
 
     def padded(self, addresses: list[int | None]) -> list[int | None]:
-        """With a place for the kicks, which the library has always."""
-        return addresses if self.kicked else [*addresses, None]
+        """With places for what is read and for the kicks, which the library has always."""
+        known = addresses if self.reads else [*addresses[:3], None, *addresses[3:]]
+        return known if self.kicked else [*known, None]
 
     def direction(self, addresses: list[int | None], k: int) -> list[int | None]:
         """Where the part of direction k begins, of all arguments."""
-        lengths = (8 * shape.nnz() for shape in self.shapes)
-        return [None if at is None else at + k * length for at, length in zip(addresses, lengths, strict=True)]
+        return [None if at is None else at + k * length for at, length in zip(addresses, self._lengths, strict=True)]
 
     def seed(self, address: int | None, k: int) -> int | None:
         """The same of results."""
@@ -152,17 +181,18 @@ class _Sweep(ca.Callback):
         slopes: list[int | None],
     ) -> None:
         """One direction: tangents of the arguments -> of the result, of its slopes, where there is a place for them."""
-        zero = np.zeros(max(self.half, self.entries * self.count))  # what CasADi leaves out is zero
-        moved = [zero.ctypes.data if at is None and i < 3 else at for i, at in enumerate(moved)]
+        longest = max(self.half, self.entries * self.moves, self.telling * self.reads)
+        zero = np.zeros(longest)  # what CasADi leaves out is zero
+        whole = [zero.ctypes.data if at is None and i < 4 else at for i, at in enumerate(self.padded(moved))]
         memory = _WORKSPACES.take(self)
-        failed = _library()["passage_tangent"](memory, *given, seed, *self.padded(moved), moved_seed, after, *slopes)
+        failed = _library()["passage_tangent"](memory, *given, seed, *whole, moved_seed, after, *slopes)
         _WORKSPACES.give(self, memory)
         if failed:
             raise MemoryError(f"no memory for the tangents of {self.count} steps")
 
     def get_n_in(self) -> int:
         """Of CasADi."""
-        return 4 if self.kicked else 3
+        return 3 + (self.reads > 0) + self.kicked
 
     def get_n_out(self) -> int:
         """Of CasADi."""
@@ -170,8 +200,9 @@ class _Sweep(ca.Callback):
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         """Of CasADi."""
-        shapes = ((self.half, 1), (self.entries, self.count), (self.entries, self.count), (self.half, self.count))
-        return ca.Sparsity.dense(*shapes[i])
+        shapes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
+        shapes += [(self.telling, self.reads)] if self.reads else []
+        return ca.Sparsity.dense(*[*shapes, (self.half, self.count)][i])
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         """Of CasADi."""
@@ -294,7 +325,7 @@ class _Tangents(_Derived):
         moved = [_address(argument) for argument in arguments[count + 1 :]]
         for k in range(self._tangents):
             after = sweep.seed(_address(results[0]), k)
-            sweep.tangent(given, None, sweep.direction(moved, k), None, after, [None] * 4)
+            sweep.tangent(given, None, sweep.direction(moved, k), None, after, [None] * 5)
         return 0
 
 

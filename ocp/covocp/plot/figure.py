@@ -20,6 +20,7 @@ from covocp.plot.curves import Panel
 from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.plot.paths import outline
+from covocp.solution.instants import instant_times
 from covocp.solution.origin import Origin
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def plot_solutions(
     title: str | None = None,
     path: str | Path | None = None,
 ) -> Figure:
-    """Draw solutions over time, a panel a quantity.
+    """Draw solutions over time, a panel a quantity, with a line at the instants of conditions.
 
     Args:
         solutions: one or more, of the same problem or of problems with the same names.
@@ -143,7 +144,9 @@ def plot_solutions(
     words = known | dict(units or {})
     panels = choose_panels(given, names, costates=costates, gains=gains, over=over, units=words)
     abscissa = "time [s]" if over is None else abscissa_label(given, over, words)
-    return drawn_figure(given, legend, panels, abscissa=abscissa, sigmas=tuple(sigmas), title=title, path=path)
+    marks = {time: None for solution in given for time in instant_times(solution)} if over is None else {}
+    drawing: dict[str, Any] = {"sigmas": tuple(sigmas), "title": title, "path": path, "marks": tuple(marks)}
+    return drawn_figure(given, legend, panels, abscissa=abscissa, **drawing)
 
 
 def drawn_figure(

@@ -1,4 +1,4 @@
-"""Figures of several phases over the whole time, with a line where one ends and the next begins."""
+"""Figures of several phases over the whole time, with a line where one ends and the next begins, and at instants."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from covocp.base.matrices import Array
 from covocp.plot.curves import Panel
 from covocp.plot.figure import SUFFIXES, drawn_figure
 from covocp.plot.panels import abscissa_label, choose_panels
+from covocp.solution.instants import instant_times
 from covocp.solution.phases import PhasesSolution
 
 if TYPE_CHECKING:
@@ -73,9 +74,16 @@ def plot_phases(
         sigmas=tuple(sigmas),
         title=title,
         path=path,
-        marks=tuple(solution.starts[1:].tolist()) if over is None else (),
+        marks=_marks(solution) if over is None else (),
         span=(0.0, solution.duration) if over is None else None,
     )
+
+
+def _marks(solution: PhasesSolution) -> tuple[float, ...]:
+    """Where phases meet, and the instants of conditions in them [s]."""
+    pairs = zip(solution.starts.tolist(), solution.phases, strict=True)
+    inside = [start + time for start, phase in pairs for time in instant_times(phase)]
+    return (*solution.starts[1:].tolist(), *inside)
 
 
 def _joined(panel: Panel, shifts: Array) -> Panel:

@@ -71,6 +71,7 @@ class Problem:
 
     Attributes:
         doubts_told: whether it was said what is probably forgotten in it, since the last change.
+        duration_read: whether the number of a fixed duration was asked for, and may be in what is declared.
 
     Raises:
         ProblemError: where the duration is not positive.
@@ -86,7 +87,7 @@ class Problem:
         self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
         self._statement: Statement | None = None
         self._expanded: Declarations | None = None
-        self.doubts_told = False
+        self.doubts_told = self.duration_read = False
 
     @classmethod
     def of(cls, declarations: Declarations) -> Problem:
@@ -149,6 +150,7 @@ class Problem:
     @property
     def duration(self) -> Any:
         """Symbol of the terminal time [s], or its number where it is fixed."""
+        self.duration_read = self.duration_read or self.free_duration is None
         return self._declarations.duration
 
     @checked(unit=text)
@@ -266,14 +268,29 @@ class Problem:
 
     @checked(unit=text)
     def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
-        """Declare a known number (or vector) that may change from solve to solve without rebuilding.
+        """Declare known numbers that may change from solve to solve without rebuilding.
+
+        Args:
+            name: unique name.
+            value: a number, a vector (n,) or a matrix (n, m).
+            unit: shown in printouts.
+
+        Returns:
+            Its symbol, in the shape of the value; columns of a matrix are stacked in `Solution.parameters`.
 
         Raises:
             ProblemError: name used twice, NaN or inf.
         """
-        size = self._declare(name, int(np.size(as_number(name, "value", value))))
-        entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
-        return self._add("parameters", entry).symbol
+        numbers = as_number(name, "value", value)
+        size = self._declare(name, int(np.size(numbers)))
+        if numbers.ndim != 2 or 1 in numbers.shape:
+            entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
+            return self._add("parameters", entry).symbol
+        stacked = column(name, "value", numbers.ravel(order="F"), size)
+        entry = self._add("parameters", Parameter(**_symbol(name, size, unit), value=stacked, columns=numbers.shape[1]))
+        matrix: Any = ca.reshape(entry.symbol, *numbers.shape)
+        matrix._stands_for = name  # as a key of new values
+        return cast(ca.MX, matrix)
 
     @checked(unit=text)
     def decision(
@@ -553,17 +570,21 @@ class Problem:
         expected = expected_cost(own, running, terminal, terminal_weight, control_weight, gain)
         self._change(replace(own, expected=expected))
 
+    @checked(relative=truth)
     def subject_to(
         self,
         expression: Given,
         *,
         lower: Given = None,
         upper: Given = None,
-        at: Place | None = None,
+        equals: Given = None,
+        at: Place | float | None = None,
+        relative: bool = False,
+        side: Literal["before", "after"] | None = None,
         name: str | None = None,
         between: Literal["auto"] | None = None,
     ) -> None:
-        """Require lower <= expression <= upper.
+        """Require lower <= expression <= upper, or expression = equals.
 
         Path constraints hold at the nodes of the mesh, and at the ends of the integration steps where an interval has
         several (`points=` of `solve`); `Solution.check_path` looks between them. With constant controls a path
@@ -574,17 +595,23 @@ class Problem:
             expression: of states, controls, matrix states, decisions, integrals, time; a column or a scalar.
             lower: numbers, shape of the expression; None: no lower bound.
             upper: numbers, shape of the expression; None: 0 where no lower bound is given either, else no upper bound.
-            at: "path", "initial" or "final"; None: "path", and "final" for integrals and for decisions alone.
-                An instant inside the horizon is the end of a phase (`Phases`).
+            equals: numbers, shape of the expression, in place of both.
+            at: "path", "initial", "final", or an instant inside the horizon [s], at which the mesh gets a node; None:
+                "path", and "final" for integrals and for decisions alone.
+            relative: whether the instant is a share of the duration, as it must be where that is free.
+            side: of an instant: "after" what is measured then and with the control that goes on, as by default, or
+                "before" it and with the control that ends.
             name: appears in every diagnostic; "constraint k" by default.
             between: "auto": imposed at more and more points of each interval, until the largest violation between them
                 is below 1e-4 of the limit (with `refine`, its tolerance, where that is smaller, but for 2e-5).
 
         Raises:
-            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an instant in
-                place of one, an integral elsewhere than at the end.
+            ProblemError: no variable in the expression, bounds crossed or both infinite, unknown place, an instant that
+                is none or at an end, an integral elsewhere than at the end.
         """
-        self._change(with_constraint(self._declarations, expression, lower, upper, at, name, between))
+        limits = (lower, upper, equals)
+        given = (expression, limits, at, name, between, relative, side)
+        self._change(with_constraint(self._declarations, *given))
 
     @checked(joint=truth)
     def chance(

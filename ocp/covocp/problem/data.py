@@ -77,6 +77,16 @@ def _columns(name: str, times: Given, values: Given) -> Array:
     return np.array(numbers, dtype=float).reshape(count[0], -1)
 
 
+def check_data_cover(own: Declarations) -> None:
+    """All data must reach to the terminal time, which may be another one than when they were declared.
+
+    Raises:
+        ProblemError: one of them ends before.
+    """
+    for entry in own.data:
+        _check_covered(own, entry.course.name, entry.course.times)
+
+
 def _check_covered(own: Declarations, name: str, times: Array) -> None:
     """The times must reach from 0 to the largest terminal time."""
     free = own.free_duration

@@ -31,6 +31,7 @@ from covocp.statement.time_data import TimeData
 
 Guess = float | Array | Callable[[Array], Any] | None
 Place = Literal["path", "initial", "final"]
+Where = Literal[Place, "inside"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +115,10 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameter:
-    """A known number."""
+    """A known number, vector, or matrix, whose columns are stacked.
+
+    columns: of a matrix; of others 1.
+    """
 
     name: str
     symbol: ca.MX
@@ -122,6 +126,7 @@ class Parameter:
     where: str
     unit: str
     value: Array
+    columns: int = 1
 
     __repr__ = short_repr
 
@@ -363,9 +368,10 @@ class Data:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint:
-    """lower <= expression <= upper along the path, at the start or at the end.
+    """lower <= expression <= upper along the path, at the start, at the end or at an instant of the horizon.
 
-    between: not at the nodes alone.
+    between: not at the nodes alone. instant: share of T of one that holds inside; late: after what happens then;
+    relative: whether it was stated as a share.
     chance: the condition on probabilities that it stands for, with this name; else None.
     """
 
@@ -373,9 +379,12 @@ class Constraint:
     expression: ca.MX
     lower: Array
     upper: Array
-    at: Place
+    at: Where
     where: str
     between: bool = False
+    instant: float | None = None
+    late: bool = True
+    relative: bool = False
     chance: Chance | None = None
 
     __repr__ = short_repr

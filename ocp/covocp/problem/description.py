@@ -13,7 +13,7 @@ from covocp.base.normal import shown_probability
 from covocp.base.pages import Part, Section, Sentence, Table, number
 from covocp.problem.closed_loop_covariance import SPREAD, reasons
 from covocp.problem.decisions import decisions_of
-from covocp.problem.declarations import Chance
+from covocp.problem.declarations import Chance, Constraint
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
 from covocp.statement.statement import entries_of, entry_names, half_names
@@ -80,7 +80,7 @@ class _Written:
             symbols, names = [*symbols, spread.symbol], [*names, half_names(spread.name, spread.labels)]
         symbols, names = [*symbols, problem.time], [*names, ["time"]]
         if problem.free_duration is not None:
-            symbols, names = [*symbols, problem.duration], [*names, ["duration"]]
+            symbols, names = [*symbols, problem.declarations.duration], [*names, ["duration"]]
         data = problem.declarations.data
         called, plain = in_words((entry.course for entry in data), list(expressions.values()))
         found = formulas(called, [*symbols, *plain], [*names, *(entry_names((entry,)) for entry in data)])
@@ -173,7 +173,7 @@ def _ranges(lower: Array, upper: Array) -> list[str]:
 
 def _head(problem: Problem) -> Section:
     free = problem.free_duration
-    duration = f"{number(problem.duration)} s" if free is None else f"free, {_ranges_of(free)}"
+    duration = f"{number(problem.declarations.duration)} s" if free is None else f"free, {_ranges_of(free)}"
     return [Sentence(f"{problem.name or 'problem without a name'}: duration {duration}")]
 
 
@@ -315,7 +315,7 @@ def _instants(problem: Problem, instants: tuple[float, ...]) -> str:
     if not instants:
         return ""
     free = problem.free_duration is not None
-    times = np.array(instants) * (1.0 if free else float(problem.duration))
+    times = np.array(instants) * (1.0 if free else float(problem.declarations.duration))
     unit = "T" if free else "s"
     if times.size > 1 and np.allclose(np.diff(times), times[0], rtol=1e-9):
         return f"every {times[0]:.4g} {unit}"
@@ -366,13 +366,22 @@ def _constraints(problem: Problem, written: _Written) -> Section:
             right = f" = {number(high)}" if low == high else f" <= {number(high)}" if np.isfinite(high) else ""
             if not right:
                 left, right = "", f" >= {number(low)}"
-            place = places[q.at] + (", between the nodes too" if getattr(q, "between", False) else "")
+            place = _moment(problem, q) if isinstance(q, Constraint) and q.instant is not None else places[q.at]
+            place += ", between the nodes too" if getattr(q, "between", False) else ""
             own.append([name, place, f"{left}{text}{right}", ""])
             if isinstance(q, Chance):
                 together = ", together" if q.joint else ""
                 own[-1][3] = f"probability {shown_probability(q.probability)}{together}"
         rows += _shortened(own)
     return [*_table(["constraint", "", "", ""], rows, code=(2,)), *_chance_notes(problem)]
+
+
+def _moment(problem: Problem, constraint: Constraint) -> str:
+    """The instant at which a constraint holds, in a few words."""
+    assert constraint.instant is not None
+    free = problem.free_duration is not None
+    time = constraint.instant * (1.0 if free else float(problem.duration))
+    return f"at {number(time, 4)} {'T' if free else 's'}{'' if constraint.late else ', before'}"
 
 
 def _chance_notes(problem: Problem) -> Section:

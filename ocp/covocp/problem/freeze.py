@@ -15,18 +15,18 @@ from covocp.base.geometry import Geometry
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
 from covocp.problem.checks import check_dynamics
-from covocp.problem.closed_loop_covariance import floored, used_in
 from covocp.problem.data import used_data
 from covocp.problem.decisions import check_decisions
-from covocp.problem.declarations import Constraint, Declarations, Matrix, Place
+from covocp.problem.declarations import Declarations, Matrix
 from covocp.problem.ends import boundary, tied_values, with_end_conditions
+from covocp.problem.inequalities import conditions_at, conditions_inside, row_names
 from covocp.problem.integrals import check_integrals
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.problem.rates import process_noise
 from covocp.problem.samples import measured_blocks, samples
 from covocp.problem.stacked import Stacked, stack
 from covocp.statement.chances import ChanceLimits
-from covocp.statement.statement import Block, Conditions, Duration, Loop, Statement, error_names, error_size
+from covocp.statement.statement import Block, Duration, Loop, Statement, error_names, error_size
 
 
 def freeze(problem: Declarations, *, part: bool = False) -> Statement:
@@ -75,9 +75,10 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         information=_information(problem, stacked),
         samples=samples(problem, stacked),
         data=used_data(problem),
-        path=_conditions(problem, stacked, "path"),
-        start=_conditions(problem, stacked, "initial"),
-        end=_conditions(problem, stacked, "final"),
+        path=conditions_at(problem, stacked, "path"),
+        start=conditions_at(problem, stacked, "initial"),
+        end=conditions_at(problem, stacked, "final"),
+        inside=conditions_inside(problem, stacked),
         chances=_chances(problem, stacked),
         state_bounds=_bounds(problem.states),
         control_bounds=_bounds(problem.controls),
@@ -92,6 +93,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         noise_varies=_noise_varies(problem),
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
+        matrix_parameters={e.name: (e.size // e.columns, e.columns) for e in problem.parameters if e.columns > 1},
         expression=_expression_builder(stacked),
     )
 
@@ -370,33 +372,6 @@ def _spread_costs(problem: Declarations, stacked: Stacked) -> tuple[ca.Function 
     )
 
 
-def _conditions(problem: Declarations, stacked: Stacked, at: Place) -> Conditions:
-    """The inequalities of one place as one function."""
-    chosen: list[Constraint] = [c for c in problem.constraints if c.at == at]
-    values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
-    names = [name for c in chosen for name in _row_names(c)]
-    realised, spread = None, problem.spread
-    if spread is not None and any(used_in(problem, c.expression) for c in chosen):
-        none: Any = floored(stacked.symbolic.zeros(spread.symbol.shape[0]), spread.size)  # type: ignore[attr-defined]
-        own = stacked.substitute(*(c.expression for c in chosen), spread=none)
-        realised = stacked.function(f"{at}_realised", [ca.vertcat(*own)])
-    return Conditions(
-        function=stacked.function(f"{at}_conditions", [values]),
-        realised=realised,
-        names=tuple(names),
-        between=tuple(c.between for c in chosen for _ in range(c.lower.size)),
-        lower=np.concatenate([np.zeros(0), *(c.lower for c in chosen)]),
-        upper=np.concatenate([np.zeros(0), *(c.upper for c in chosen)]),
-        uses_matrices=bool(chosen and problem.matrices and ca.depends_on(values, stacked.inputs[2])),
-    )
-
-
-def _row_names(constraint: Constraint) -> list[str]:
-    """Names of the rows of a constraint."""
-    size = constraint.lower.size
-    return [constraint.name] if size == 1 else [f"{constraint.name}[{i}]" for i in range(size)]
-
-
 def _chances(problem: Declarations, stacked: Stacked) -> tuple[ChanceLimits, ...]:
     """The conditions on probabilities, as functions of the nominal."""
     result = []
@@ -409,7 +384,7 @@ def _chances(problem: Declarations, stacked: Stacked) -> tuple[ChanceLimits, ...
         result.append(
             ChanceLimits(
                 name=chance.name,
-                names=tuple(_row_names(constraint)),
+                names=tuple(row_names(constraint)),
                 place=chance.at,
                 lower=chance.lower,
                 upper=chance.upper,

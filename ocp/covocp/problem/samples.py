@@ -44,6 +44,11 @@ def samples(problem: Declarations, stacked: Stacked) -> Samples | None:
         blocks=blocks,
         places=tuple(entry.instants for entry in taken),
         measurement=stacked.function("sampled", [value, slope, ca.diagcat(*variances)], without=("matrices",)),
+        groups=tuple(
+            tuple(block.offset + row for row in rows)
+            for block, variance in zip(blocks, variances, strict=True)
+            for rows, _ in _uncorrelated(variance)
+        ),
         update=ca.Function("update", [*stacked.inputs, reading], outputs, names, ["after", "cost"]),
     )
 

@@ -152,6 +152,7 @@ class _Simulation:
         self.flags = np.zeros((times, plan.fed_back + len(plan.watched)))
         self.kept = np.zeros((self._flagged.stop - self._flagged.start, width), dtype=bool)
         self.seen = np.zeros((2, len(plan.watched), width), dtype=bool)
+        self.then = np.zeros((len(plan.watched), width), dtype=bool)
         self.count = np.zeros((groups, times))
         self.sums = [np.zeros((groups, times, rows)) for _ in range(3)]
         self.products = np.zeros((groups, times, rows, rows))
@@ -212,8 +213,8 @@ class _Simulation:
         before[:] = self.observe.outputs[0][: 2 * plan.size]
         last = plan.steps.shape[0]
         for k, noise in self._noises(last, stop):
-            if self.read is not None and plan.reads[k]:
-                moved[:] = self._read(noise, k)
+            if plan.reads[k]:
+                moved[:] = before if self.read is None else self._read(noise, k)
             else:
                 w[:] = noise
                 coefficients[:] = plan.steps[k]
@@ -299,6 +300,8 @@ class _Simulation:
         self.flags[place] = np.count_nonzero(np.where(counted, flags, 0.0), axis=1)
         if place in (0, self.flags.shape[0] - 1):
             self.seen[int(place > 0)] = flags[self.plan.fed_back :] > 0
+        for i in np.flatnonzero(self.plan.once == place).tolist():
+            self.then[i] = (flags[self.plan.fed_back + i] > 0) | ~counted
         grouped = np.where(counted, y, 0.0).reshape(rows, -1, LANES)
         square = grouped * grouped
         self.count[:, place] = counted.reshape(-1, LANES).sum(axis=1)
@@ -352,7 +355,8 @@ class _Simulation:
             if place == "path":
                 violated[:, i] = on_the_way[:, next(path)] | (last[:, i] & stayed)
             else:
-                violated[:, i] = first[:, i] if place == "initial" else at_end[:, i]
+                once = {"initial": first, "inside": self.then[:, : self.runs].T}.get(place, at_end)
+                violated[:, i] = once[:, i]
         return violated, at_end
 
     def _cost(self) -> Any:

@@ -29,9 +29,11 @@ from covocp.solution.solution import Solution
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Conditions, Statement, entry_names
 
-Place = Literal["path", "initial", "final"]
+Place = Literal["path", "initial", "final", "inside"]
 # Limits count as kept within this share of their size.
 MARGIN = 1e-9
+# Share of the duration by which a time may miss an instant and be it.
+SAME = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +43,7 @@ class Row:
     bound: whether it is the bound of a state or of a control, whose name it has.
     chance: whether it is of a condition on a probability. parts: of rows that hold together the positions of these;
         it is kept where all of them are. integral: whether integrals are in it, of which covariances promise nothing.
+    instant: of one that holds inside the horizon, as a share of T; late: whether after what happens there.
     """
 
     name: str
@@ -51,11 +54,20 @@ class Row:
     chance: bool = False
     parts: tuple[int, ...] = ()
     integral: bool = False
+    instant: float | None = None
+    late: bool = True
+
+    def among(self, t: Array) -> int | None:
+        """Where the time of what is looked at once lies among some times from 0 to T; None: not, or along the path."""
+        if self.instant is None:
+            return {"initial": 0, "final": t.size - 1}.get(self.place)
+        at = np.flatnonzero(np.abs(t - self.instant * t[-1]) <= SAME * t[-1])
+        return int(at[-1 if self.late else 0]) if at.size else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rows:
-    """The inequalities that runs can violate, in their order: those of the path, of the start, of the end.
+    """The inequalities that runs can violate, in their order: of the path, the start, the end, the instants.
 
     function: (state, control, matrices, time, duration, parameters) -> their values.
     left_out: names of the constraints that are not counted, and why. chances: conditions on probabilities in `rows`.
@@ -96,8 +108,10 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
     for name, value, low, high in _bounds(st, a, (states, fed_back)):
         rows.append(Row(name=name, place="path", lower=low, upper=high, bound=True))
         values.append(value)
-    places: tuple[tuple[Place, Conditions], ...] = (("path", st.path), ("initial", st.start), ("final", st.end))
-    for place, conditions in places:
+    places: list[tuple[Place, Conditions]] = [("path", st.path), ("initial", st.start), ("final", st.end)]
+    instants: list[dict[str, Any]] = [{"instant": part.place, "late": part.late} for part in st.inside.parts]
+    places += [("inside", part.conditions) for part in st.inside.parts]
+    for (place, conditions), instant in zip(places, [{}, {}, {}, *instants], strict=True):
         function = conditions.function if conditions.realised is None else conditions.realised
         column = function(*a)
         for i, name in enumerate(conditions.names):
@@ -112,7 +126,7 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
                 left_out[name] = "the same in all runs"
             else:
                 whole = bool(ca.depends_on(column[i], varying))
-                rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False, integral=whole))
+                rows.append(Row(name=name, place=place, lower=low, upper=high, bound=False, integral=whole, **instant))
                 values.append(column[i])
                 needed |= whole
     for limits in st.chances:

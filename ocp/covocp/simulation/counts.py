@@ -16,13 +16,14 @@ from covocp.simulation.sampling import share_band
 class Count:
     """How many runs violate one constraint, or a bound, of the problem.
 
-    name: of the constraint, or of the state or control whose bound it is. place: "path", "initial" or "final". bound:
-    whether it is a bound. chance: whether it is of a condition on a probability. joint: of several rows that hold
-    together; what is promised is then an upper bound. What contains an integral is promised nothing (NaN).
+    name: of the constraint, or of the state or control whose bound it is. place: "path", "initial", "final" or
+    "inside", at an instant. bound: whether it is a bound. chance: whether it is of a condition on a probability. joint:
+    of several rows that hold together; what is promised is then an upper bound. What contains an integral is promised
+    nothing (NaN).
     runs: that violate it, at any instant of the path; share: of all runs.
     at_end: runs that violate it at the end, those that left the domain among them, and end_share; promised_end: what
     the covariances promise for normal deviations, (low, high): the confidence band of the probability that the runs
-    have. For "initial" all of these are those of the start.
+    have. For "initial" and "inside" all of these are those of the start and of the instant, most_time.
     most: largest share at one stored time, most_time [s]; promised_most: what is promised there.
     """
 
@@ -66,8 +67,8 @@ def count(
     """
     result, runs = [], violated.shape[0]
     for i, row in enumerate(rows):
-        once = {"initial": 0, "final": t.size - 1}.get(row.place)
-        hits = int(np.count_nonzero((violated if row.place == "initial" else at_end)[:, i]))
+        once = row.among(t)
+        hits = int(np.count_nonzero((violated if row.place in ("initial", "inside") else at_end)[:, i]))
         k = int(np.argmax(violating[:, i])) if once is None else once
         low, high = share_band(hits, runs, level)
         result.append(

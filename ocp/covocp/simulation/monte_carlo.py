@@ -74,8 +74,8 @@ class MonteCarlo:
         limits: what counts as all the control there is, (lower, upper), (m,) each; limited: whether the actual control
             stays within them.
         inequalities: those that runs can violate, bounds of states and controls among them.
-        violated: whether a run violates each at some instant (of the start or end: there), (R, rows); at_end: whether
-            it does at the end, which a run that left the domain counts for, (R, rows).
+        violated: whether a run violates each at some time (of the start, the end, an instant: then), (R, rows); at_end:
+            whether it does at the end, which a run that left the domain counts for, (R, rows).
         violating: share of the runs that do at each stored time, (K, rows); promised: probability of it by the
             predicted covariances, for normal deviations, (K, rows).
         paths: deviation, estimate and deviation of the control of the first runs, (runs, K, 2n + m).

@@ -129,7 +129,7 @@ def _leg(
         limits=limits_of(design, None),
         domain=domain_of(solution, expected),
     )
-    stored = stored_times(base, request.store, sample_indices(None, base))
+    stored = stored_times(base, request.store, sample_indices(None, base), design.statement.inside.places)
     chosen = chosen_step(setting, base, expected, request, reporter, pilot)
     plan = make_plan(setting, chosen.grid, stored[0], seed=int(request.seed), paths=request.paths)
     kept = expected.at(indices(base, stored[0]))

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.simulation.constraints import Place, counted_rows
+from covocp.simulation.constraints import Place, Row, counted_rows
 from covocp.simulation.flown import Flown, sample_indices
 from covocp.simulation.run_parts import Setting, factor, run_symbols
 from covocp.simulation.run_step import finish_function, observe_function, read_function, start_of, step_function
@@ -27,7 +27,8 @@ class Plan:
     read: the same of steps of no length, at which something is read; None where nothing is.
     observe: (state, unknowns, coefficients at a time) -> deviation, its estimate, deviation of the control, flags.
     finish: (state, unknowns) -> terminal cost of the run; None without an expected cost.
-    steps: coefficients, a row for each step; reads: which of them have no length; times: at which they start [s].
+    steps: coefficients, a row for each step; reads: which of them have no length: nothing moves; times: at which they
+        start [s].
     stored: indices of the times at which moments are kept; stored_coefficients: a row for each of them.
     start: state of a run that starts at its mean; unknowns: their mean; motion: how x moves.
     spread: factor of the covariance of the start, (n, n).
@@ -38,7 +39,7 @@ class Plan:
     pairing: of which two noises of its halves each noise of a step is the sum, (noises, 2); None: it is none.
     paths: number of runs whose histories are kept.
     flown: the law of the user; samples: indices of the times at which it is stepped.
-    watched: the place of each inequality.
+    watched: the place of each inequality; once: of those at an instant which of `stored` it is, else -1.
     """
 
     step: ca.Function
@@ -66,6 +67,7 @@ class Plan:
     flown: Flown | None
     samples: Any
     watched: tuple[Place, ...]
+    once: Any
 
     __repr__ = short_repr
 
@@ -135,4 +137,11 @@ def make_plan(
         flown=setting.flown,
         samples=sample_indices(setting.flown, grid),
         watched=tuple(row.place for row in watched.rows),
+        once=np.array([_once(row, grid.t[at]) for row in watched.rows], dtype=int),
     )
+
+
+def _once(row: Row, stored: Array) -> int:
+    """Which of the stored times an inequality at an instant is looked at; -1 where it is none of them."""
+    found = row.among(stored) if row.place == "inside" else None
+    return -1 if found is None else found

@@ -121,14 +121,19 @@ def _violations(sample: MonteCarlo) -> Section:
     columns = ["runs that violate", "at", "at any time", "at T", "promised", "most at once", "at t [s]", "promised", ""]
     rows = []
     for entry in shown:
-        kind = "bounds" if entry.bound else {"initial": "start", "final": "end"}.get(entry.place, entry.place)
-        end = ["-", "-"] if entry.place == "initial" else [_share(entry.end_share), _share(entry.promised_end)]
+        kind = (
+            "bounds"
+            if entry.bound
+            else {"initial": "start", "final": "end", "inside": "instant"}.get(entry.place, "path")
+        )
+        once = entry.place in ("initial", "inside")
+        end = ["-", "-"] if once else [_share(entry.end_share), _share(entry.promised_end)]
         rows.append([entry.name, kind, _share(entry.share), *end, _share(entry.most), number(entry.most_time, 4)])
         rows[-1] += [_share(entry.promised_most), "" if entry.as_promised else "OUTSIDE"]
     table = Table(columns=columns, rows=rows, words=(0, 1, len(columns) - 1))
     note = (
         "Promised: by the predicted covariances, for normal deviations and to first order; OUTSIDE: beyond the band of "
-        f"{100 * sample.level:.4g} % about the share of the runs at the end (at the start)."
+        f"{100 * sample.level:.4g} % about the share of the runs at the end (at the start, at the instant)."
     )
     return [table, Sentence(note, ""), *text]
 

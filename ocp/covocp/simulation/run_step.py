@@ -130,7 +130,7 @@ def observe_function(run: Run) -> ca.Function:
     c = run.coefficients.split(column)
     _, applied = control_of(run, run.z, c)
     moved = applied - part(c["u"], 0, run.setting.design.fed_back)
-    y = ca.vertcat(deviations(run, run.z, c), moved, _flags(run, c, ("path", "initial", "final")))
+    y = ca.vertcat(deviations(run, run.z, c), moved, _flags(run, c, ("path", "initial", "final", "inside")))
     return ca.Function("observe", [run.z, run.own, column], [ca.densify(y)])
 
 

@@ -145,7 +145,7 @@ def simulate(
         domain=domain_of(solution, expected),
         flown=flown,
     )
-    t, intervals = stored_times(base, store, sample_indices(flown, base))
+    t, intervals = stored_times(base, store, sample_indices(flown, base), design.statement.inside.places)
     with Progress(f"simulating {solution.name}", progress) as reporter:
         chosen = chosen_step(setting, base, true, request, reporter)
         plan = make_plan(setting, chosen.grid, t, seed=int(seed), paths=paths)

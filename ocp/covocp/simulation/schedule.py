@@ -36,7 +36,7 @@ class Grid:
     """Steps within the intervals of a mesh.
 
     t: times, (N + 1,); interval: of the mesh, for each step, (N,). share: what a step of no length takes of what is
-        read at its instant, (N,); of the others zero.
+        read at its instant, if anything is, (N,); of the others zero.
     """
 
     t: Array
@@ -87,16 +87,18 @@ def base_grid(solution: Solution, points: int, step: float | None = None, sample
         new = np.abs(samples[:, None] - nodes).min(axis=1) > WHOLE * solution.duration
         t = np.sort(np.concatenate([nodes, samples[new]]))
     read = np.diff(t) == 0.0
-    interval = np.searchsorted(nodes, t[:-1], side="right") - 1 - read
+    follow = np.searchsorted(t, t[:-1], side="right") - 1 - np.arange(t.size - 1)  # at the same time
+    interval = np.searchsorted(nodes, t[:-1], side="right") - 1 - follow
     mesh = Grid(t=t, interval=interval, share=read.astype(float))
     parts = mesh.parts(solution.duration / max(1, points - 1))
     return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 
 
-def stored_times(grid: Grid, points: int, samples: Given) -> tuple[Array, Any]:
+def stored_times(grid: Grid, points: int, samples: Given, instants: tuple[float, ...] = ()) -> tuple[Array, Any]:
     """The grid's nearest times to `points` equally spread ones, and the intervals of the mesh that begin there.
 
-    The first and the last are among them; where there are samples (indices of the grid), only these else.
+    The first and the last are among them, and some instants, shares of T; where there are samples (indices of the
+    grid), only these else.
     """
     among = np.arange(grid.steps + 1) if not samples.size else np.union1d(samples, [0, grid.steps])
     t = grid.t[among]
@@ -104,17 +106,20 @@ def stored_times(grid: Grid, points: int, samples: Given) -> tuple[Array, Any]:
     after = np.clip(np.searchsorted(t, wanted), 1, t.size - 1)
     nearer = wanted - t[after - 1] < t[after] - wanted
     at = among[np.unique(after - nearer)]
+    held = [np.flatnonzero(np.abs(grid.t - place * grid.t[-1]) <= WHOLE * grid.t[-1]) for place in instants]
+    at = np.unique(np.concatenate([at, *held]))
     read = np.flatnonzero(grid.share)  # before and after what is read there
     at = np.unique(np.concatenate([at, read[np.isin(read + 1, at)], read[np.isin(read, at)] + 1]))
+    at = at[~(np.isin(at, read) & np.isin(at - 1, read) & (grid.t[at] == grid.t[at - 1]))]  # of three the outer ones
     return grid.t[at], grid.interval[np.minimum(at, grid.steps - 1)]
 
 
 def indices(grid: Grid, times: Array) -> Any:
-    """Where some times lie in a grid; of two that are the same the second is after what is read there."""
-    at = np.searchsorted(grid.t, times)
-    again = np.append(False, times[1:] == times[:-1])
-    last = np.searchsorted(grid.t, times, side="right") - 1
-    return np.where(again, last, at)
+    """Where some times lie in a grid; of those that are the same the last is after what happens there."""
+    first, own = np.searchsorted(grid.t, times), np.searchsorted(times, times)
+    others = np.searchsorted(grid.t, times, side="right") - 1 - first
+    count = np.searchsorted(times, times, side="right") - 1 - own
+    return first + (np.arange(times.size) - own) * others // np.maximum(count, 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,7 +214,7 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
         "t": t,
         "x": x,
         "u": u,
-        "e": e if any(c.uses_matrices for c in (st.path, st.start, st.end)) else symbolic.zeros(0, 1),
+        "e": e if any(c.uses_matrices for c in st.conditions) else symbolic.zeros(0, 1),
         "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
     }

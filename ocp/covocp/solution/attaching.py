@@ -77,7 +77,8 @@ def _differences(solution: Solution, statement: Statement) -> list[Difference]:
 def _contradictions(solution: Solution, statement: Statement) -> list[Difference]:
     """What the solution itself says otherwise than the problem; all that there is where no fingerprint was kept."""
     names = {"path": statement.path.names, "start": statement.start.names, "end": statement.end.names}
-    for place, kept in solution.constraints.items():
+    names["instants"] = statement.inside.names
+    for place, kept in {"instants": (), **solution.constraints}.items():
         if kept != names[place]:
             what = f"the constraints ({place})"
             return [Difference(what=what, stored=", ".join(kept) or "none", given=", ".join(names[place]) or "none")]
@@ -119,7 +120,7 @@ def _sizes(extremal: Extremal) -> dict[str, float]:
     st = extremal.statement
     columns = [np.asarray(c, dtype=float) for c in extremal.columns()]
     sizes: dict[str, float] = {}
-    for place in (st.path, st.start, st.end):
+    for place in st.conditions:
         if not place.size:
             continue
         function = place.function.map(columns[0].shape[1])

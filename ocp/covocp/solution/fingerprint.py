@@ -231,9 +231,12 @@ def _numbers(statement: Statement) -> Iterator[tuple[str, Array]]:
         for side, limits in zip(("lower", "upper"), bounds, strict=True):
             for name, value in zip(names, limits, strict=True):
                 yield f"the {side} bound of '{name}'", np.array([value])
-    for place in (statement.path, statement.start, statement.end):
+    for place in statement.conditions:
         for name, lower, upper in zip(place.names, place.lower, place.upper, strict=True):
             yield f"the limits of '{name}'", np.array([lower, upper])
+    for part in statement.inside.parts:
+        for name in part.conditions.names:
+            yield f"the instant of '{name}'", np.array([part.place, float(part.late)])
     for block in _constants(statement):
         yield _declared(block), statement.values[block.span]
     for data in statement.data:
@@ -293,7 +296,7 @@ def _functions(statement: Statement) -> Iterator[tuple[ca.Function, dict[str, tu
     )
     if st.matrix_end is not None:
         yield st.matrix_end, {"the values at the end of the matrices that run backward": (0, slice(None))}
-    for place in (st.path, st.start, st.end):
+    for place in st.conditions:
         yield place.function, {f"the constraint '{name}'": (0, slice(i, i + 1)) for i, name in enumerate(place.names)}
 
 
@@ -333,7 +336,7 @@ def _noise_parts(st: Statement) -> dict[str, tuple[int, Any]]:
 def _switching(statement: Statement) -> list[ca.Function]:
     """The functions in which the user's own pieces are."""
     st = statement
-    chosen = [st.rates, st.terminal, *(place.function for place in (st.path, st.start, st.end))]
+    chosen = [st.rates, st.terminal, *(place.function for place in st.conditions)]
     chosen += [] if st.measurement is None else [st.measurement]
     return chosen + ([] if st.loop is None else [st.loop.running, st.loop.terminal])
 

@@ -13,6 +13,7 @@ from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.chances import chance_section
+from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical
 from covocp.statement.statement import Block, Role, entry_names, error_names
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from covocp.solution.solution import Solution
+    from covocp.transcription.mesh import Mesh
 
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 LARGEST_MATRIX = 6
@@ -114,6 +116,7 @@ def sections(solution: Solution) -> list[Section]:
         _costs(solution),
         _numbers(solution, "decision"),
         _states(solution),
+        instant_section(solution),
         _numbers(solution, "integral"),
         _unknowns(solution),
         _deviations(solution),
@@ -428,7 +431,7 @@ def _effort(solution: Solution) -> Section:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
-        _intervals(mesh.intervals, len(mesh.instants), stats),
+        _intervals(mesh, stats),
         f"controls piecewise {mesh.control}",
         _counted(mesh.substeps, "integration step") + " an interval",
         _counted(len(mesh.segments), "shooting segment"),
@@ -446,16 +449,19 @@ def _effort(solution: Solution) -> Section:
     return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
-def _intervals(count: int, instants: int, stats: Mapping[str, Any]) -> str:
-    """The number of intervals, how the mesh that was asked for was graded, where measurements are taken."""
-    asked, added, count = stats.get("intervals_asked"), stats.get("nodes_added"), count - instants
+def _intervals(mesh: Mesh, stats: Mapping[str, Any]) -> str:
+    """The number of intervals, how the mesh that was asked for was graded, at how many instants something happens."""
+    asked, added, count = stats.get("intervals_asked"), stats.get("nodes_added"), mesh.intervals - len(mesh.instants)
+    read = [k for k in mesh.instants if mesh.readings[:, k].any()]
+    held = np.unique(mesh.nodes[[k for k in mesh.instants if k not in read]]).size
     words = _counted(count, "interval")
     if asked is not None and added is not None and any(added):
         places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
         words = f"{_counted(asked, 'interval')}, graded to {count} {places}"
     elif asked is not None and asked != count:
         words = f"{_counted(asked, 'interval')} asked for, {count} between the instants"
-    return words + (f", measurements taken at {_counted(instants, 'instant')}" if instants else "")
+    words += f", measurements taken at {_counted(len(read), 'instant')}" if read else ""
+    return words + (f", a node for conditions at {_counted(held, 'instant')}" if held else "")
 
 
 def _refinement(stats: Mapping[str, Any]) -> list[Sentence]:

@@ -75,7 +75,7 @@ class Solution:
         blocks: where each symbol lies.
         augmented: names of the rows of the estimation covariance.
         targets: final values of the states, NaN where they are free.
-        constraints: names of the rows of the inequalities, by place: "path", "start", "end".
+        constraints: names of the rows of the inequalities, by place: "path", "start", "end", "instants".
         chances: what is reached of the conditions on probabilities, by the linearised spread.
         stored_problem: of a solution read from a file, what its problem was, to tell it from others.
         within: of one of several phases, what the others say of it.
@@ -141,7 +141,12 @@ class Solution:
             blocks=st.blocks,
             augmented=st.augmented,
             targets=st.boundary_values(extremal.parameters)[1],
-            constraints={"path": st.path.names, "start": st.start.names, "end": st.end.names},
+            constraints={
+                "path": st.path.names,
+                "start": st.start.names,
+                "end": st.end.names,
+                "instants": st.inside.names,
+            },
             loop=loop,
             within=within,
         )
@@ -412,8 +417,8 @@ class Solution:
 
         Returns:
             Of a path constraint (K,) or (K, rows), multipliers of the discretised problem at the nodes (what acts
-            between two nodes is shared between them); of terminal and initial ones () or (rows,); of a state () or
-            (n,); of a matrix (n, n).
+            between two nodes is shared between them); of terminal and initial ones and of those at an instant () or
+            (rows,); of a state () or (n,); of a matrix (n, n).
 
         Raises:
             ProblemError: where there is no such constraint or symbol.

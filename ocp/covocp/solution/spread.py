@@ -19,8 +19,9 @@ def mention_spread(solution: Solution) -> None:
     if statement is None or loop is None:
         return
     block = next(b for b in solution.blocks if b.estimation)
-    places = ((statement.path, slice(None)), (statement.start, slice(0, 1)), (statement.end, slice(-1, None)))
-    for conditions, at in places:
+    ends = ((statement.path, slice(None)), (statement.start, slice(0, 1)), (statement.end, slice(-1, None)))
+    inside = zip(statement.inside.parts, statement.inside.nodes_among(solution.mesh.nodes), strict=True)
+    for conditions, at in (*ends, *((part.conditions, slice(k, k + 1)) for part, k in inside)):
         names, used = _rows_with(conditions, block.span)
         if not names:
             continue

@@ -400,16 +400,17 @@ def _check_mesh(solution: Solution) -> None:
     if nodes.ndim != 1 or nodes.size < 2 or not (np.diff(nodes) >= 0).all() or nodes[0] != 0 or nodes[-1] != 1:
         raise DamagedFileError("the nodes of its mesh do not rise from 0 to 1")
     read = mesh.readings.any(axis=0) if mesh.readings.shape[-1] == mesh.intervals else np.zeros(mesh.intervals, bool)
-    if not np.array_equal(read, np.diff(nodes) == 0):
+    still, held = np.diff(nodes) == 0, bool(solution.constraints.get("instants"))
+    if (read & ~still).any() or (not held and (still & ~read).any()):
         raise DamagedFileError("the nodes of its mesh are not those at which something is read")
-    held = mesh.control in ("linear", "constant") and mesh.linear_solver.isalnum()
+    known = mesh.control in ("linear", "constant") and mesh.linear_solver.isalnum()
     least = min(*mesh.segments, mesh.substeps, mesh.points)
-    if not held or sum(mesh.segments) != mesh.intervals or least < 1:
+    if not known or sum(mesh.segments) != mesh.intervals or least < 1:
         raise DamagedFileError("its mesh contradicts itself")
     if knots.ndim != 1 or not (np.diff(knots) >= 0).all() or not np.isin(nodes, knots).all() or knots[-1] != 1:
         raise DamagedFileError("the knots between the nodes of its mesh contradict it")
-    if set(solution.constraints) != {"path", "start", "end"}:
-        raise DamagedFileError("its constraints are not those of the path, the start and the end")
+    if set(solution.constraints) - {"instants"} != {"path", "start", "end"}:  # earlier files have no instants
+        raise DamagedFileError("its constraints are not those of the path, the ends and the instants")
 
 
 def _lengths(solution: Solution) -> dict[str, int]:
@@ -426,7 +427,12 @@ def _lengths(solution: Solution) -> dict[str, int]:
     points |= {"inside": mesh.points - 1, "knots": knots, "pieces": knots - 1}
     points["points"] = kept.points.shape[0] if kept is not None and kept.points.ndim else 0
     entries = {"x": nx, "u": nu, "e": ne, "xe": nx + ne, "p": constants, "augmented": len(solution.augmented)}
-    return {**points, **entries, **{place: len(names) for place, names in solution.constraints.items()}}
+    return {
+        **points,
+        **entries,
+        **{"instants": 0},
+        **{place: len(names) for place, names in solution.constraints.items()},
+    }
 
 
 def _misfits(hint: Any, value: Any, place: str, lengths: Mapping[str, int]) -> Iterator[str]:

@@ -2,5 +2,5 @@
 
 from covocp.solving.evaluation import evaluate as evaluate
 from covocp.solving.methods import methods as methods
+from covocp.solving.once import solve as solve
 from covocp.solving.solver import Solver as Solver
-from covocp.solving.solver import solve as solve

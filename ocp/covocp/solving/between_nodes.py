@@ -24,6 +24,10 @@ def watched(statement: Statement) -> tuple[str, ...]:
     return tuple(name for name, between in zip(path.names, path.between, strict=False) if between)
 
 
+# The method whose penalties act at the nodes.
+AT_NODES = "gradient"
+
+
 def check_between(statement: Statement, method: str) -> None:
     """Refuse a method that imposes limits at the nodes alone.
 
@@ -31,12 +35,12 @@ def check_between(statement: Statement, method: str) -> None:
         ProblemError: some constraint must hold between them.
     """
     names = watched(statement)
-    if names and method != "ipopt":
+    if names and method == AT_NODES:
         raise ProblemError(
             f"The method '{method}' cannot keep '{names[0]}' between the nodes.",
-            expected="method='ipopt', which imposes limits at points inside the intervals",
+            expected="method='ipopt' or 'reduced', which impose limits at points inside the intervals",
             received=f"method='{method}', and between='auto' for {', '.join(names)}",
-            remedy="use 'ipopt', or leave between= out and take more intervals",
+            remedy="use one of these, or leave between= out and take more intervals",
         )
 
 

@@ -23,7 +23,8 @@ from covocp.problem.phases import Phases
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, method_options
-from covocp.solving.solver import Solver, check_problem, solve
+from covocp.solving.once import solve
+from covocp.solving.solver import Solver, check_problem
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -338,16 +339,14 @@ def _short(value: float | None) -> str:
 
 
 def terminal_miss(solution: Solution) -> float | None:
-    """Largest violation of a terminal condition, in its own unit; None where the problem is not known."""
+    """Largest violation of a condition at the end or at an instant, in its own unit; None: the problem is not known."""
     st = solution.statement
     if st is None:
         return None
     _, final, _, final_matrices = st.boundary_values(solution.parameters)
-    last = solution.extremal.columns()
     misses = [np.abs(solution.trajectory.x[-1] - final), np.abs(solution.trajectory.e[-1] - final_matrices)]
-    if st.end.size:
-        at_end = [v[:, -1] if isinstance(v, np.ndarray) else v for v in last]
-        rows = np.asarray(st.end.function(*at_end).full()).ravel()
-        misses.append(np.maximum(0.0, np.maximum(st.end.lower - rows, rows - st.end.upper)))
+    for conditions, place, values in solution.extremal.inequalities():
+        if place in ("end", "instants"):
+            misses.append(np.maximum(0.0, np.maximum(conditions.lower - values[0], values[0] - conditions.upper)))
     values = np.concatenate(misses)
     return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0

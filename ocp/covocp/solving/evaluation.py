@@ -359,8 +359,8 @@ def _check_system(design: Extremal, truth: Statement, parameters: Array) -> None
         ("takes another time: the value", ("duration",), duration[:, :1], np.array([lasts])),
     ]
     if unknowns := st.of_kind("unknown"):
-        rows = [k for b in unknowns for k in range(b.span.start, b.span.stop)]
-        one, two = (values[rows, None] for values in (design.parameters, parameters))
+        places = ([k for b in s.of_kind("unknown") for k in range(b.span.start, b.span.stop)] for s in (st, truth))
+        one, two = (v[rows, None] for v, rows in zip((design.parameters, parameters), places, strict=True))
         compared.append(("has another constant: the mean", entry_names(unknowns), one, two))
     functions: tuple[tuple[str, tuple[str, ...], int, Any, Any], ...] = (
         ("moves differently: the rate", st.state_names, 0, st.nominal, truth.nominal),

@@ -158,7 +158,7 @@ def _rows(own: Declarations) -> list[_Row]:
         for i in range(c.lower.size):
             row = c.expression[i]
             alone = all(s.__hash__() in allowed for s in ca.symvar(row))
-            if not used_in(own, row) or not alone or not np.isfinite(c.upper[i]) or c.at == "initial":
+            if not used_in(own, row) or not alone or not np.isfinite(c.upper[i]) or c.at not in WEIGHTS:
                 continue
             inner = ca.Function("row", [own.time, *known, half], [row, ca.densify(ca.jacobian(row, half))])
             parts = ca.vertsplit(stacked, np.cumsum([0, *(s.shape[0] for s in known)]).tolist()) if known else []

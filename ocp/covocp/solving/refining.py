@@ -22,6 +22,7 @@ from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.local_errors import local_errors
 from covocp.extremal.mesh_error import NO_COST
 from covocp.extremal.path_limits import limited_along
+from covocp.extremal.readings import stretches
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import cost_of, from_starts
 from covocp.solving.between_nodes import mention_between, more_points, worst_between
@@ -30,7 +31,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Graded, Mesh, Options
-from covocp.transcription.remeshing import divided, jumps_of, remeshed
+from covocp.transcription.remeshing import HIDING, divided, jumps_of, remeshed
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import nominal_along, stiffness
 
@@ -178,7 +179,7 @@ def adapted(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[s
     share = float(np.clip(SOLVED * refine, STRICTEST, LOOSEST))
     if VIOLATION in known:
         return {VIOLATION: share, **own}
-    if own.get("plugin", "ipopt") != "ipopt":
+    if "plugin" not in known or own.get("plugin", "ipopt") != "ipopt":
         return own
     result = dict(own) if own.get("tolerance") is not None else {**own, "tolerance": share}
     given = dict(own.get("plugin_options") or {})
@@ -354,13 +355,14 @@ def _next_nodes(statement: Statement, coarse: Measured, fine: Measured, errors: 
 
 
 def _jumps(extremal: Extremal) -> list[Any]:
-    """Jumps of the controls, on nodes that are there once."""
-    mesh, u = extremal.mesh, extremal.trajectory.u
-    nodes, last = np.unique(mesh.nodes[::-1], return_index=True)
-    kept = mesh.nodes.size - 1 - last  # the last one of those that are there twice
-    if mesh.control == "constant":
-        return jumps_of(nodes, u[kept[:-1]], True)
-    return jumps_of(nodes, u[kept], False)
+    """Jumps of the controls between the instants, at which they may jump; few intervals have nothing beside them."""
+    mesh, u, found = extremal.mesh, extremal.trajectory.u, []
+    constant = mesh.control == "constant"
+    for part in stretches(extremal):
+        nodes = mesh.nodes[part]
+        if len(stretches(extremal)) == 1 or nodes.size - 1 > HIDING + 2:
+            found += jumps_of(nodes, u[part.start : part.stop - constant], constant)
+    return found
 
 
 def _given_up(done: list[Measured]) -> str:

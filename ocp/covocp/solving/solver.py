@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from covocp.base.arguments import checked, text, truth
+from covocp.base.arguments import checked, optional, positive, text, truth, whole
 from covocp.base.checks import check_kind, is_whole
 from covocp.base.errors import (
     CovocpError,
@@ -25,34 +25,36 @@ from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.threads import methods_one_at_a_time, one_at_a_time
+from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
-from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
-from covocp.solving.between_nodes import check_between, watched
+from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.decisions import bent_data, far_away
+from covocp.solving.elsewhere import Elsewhere
+from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
-from covocp.solving.methods import METHODS, check_method, method_options
+from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import random_guesses
 from covocp.solving.unused import mention_forgotten, mention_lengths
-from covocp.solving.warm_start import make_guess, make_guesses
+from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
+from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Mesh, Options, with_substeps
 
 if TYPE_CHECKING:
-    from covocp.solution.phases import PhasesSolution
+    pass
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
@@ -133,15 +135,22 @@ class Solver:
         self.statement: Statement = problem.statement()
         check_between(self.statement, method)
         self._problem, self._classical = problem, cast("Solver | None", None)
+        self._elsewhere = Elsewhere(
+            declarations=problem.declarations,
+            statement=self.statement,
+            duration_read=problem.duration_read,
+            make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options),
+        )
         count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
         given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
-            asked = refining.first_options(self.statement, asked, nominal, points=method == "ipopt")
+            asked = refining.first_options(self.statement, asked, nominal, points=method != AT_NODES)
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
-        self._options = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
+        asked = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
+        self._options = with_instants(self.statement, asked)
         if refine is not None:
             self._options = refining.with_layers(self.statement, self._options, self.statement.values)
         self._own_steps = self._options.substeps == "auto" and refine is None
@@ -158,24 +167,47 @@ class Solver:
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options)
 
-    @checked(progress=truth, allow_failure=truth, assess=truth)
+    @checked(
+        progress=truth,
+        allow_failure=truth,
+        assess=truth,
+        time_limit=optional(positive),
+        iteration_limit=optional(whole(0)),
+    )
     def solve(
         self,
         parameters: Mapping[str, Any] | None = None,
         *,
+        initial: Mapping[Any, Any] | None = None,
+        means: Mapping[Any, Any] | None = None,
+        covariance: Given = None,
+        duration: float | None = None,
         guess: Given = None,
+        elapsed: float | None = None,
         progress: bool = True,
         allow_failure: bool = False,
         starts: int = STARTS,
         seed: int = 0,
         assess: bool = True,
+        time_limit: float | None = None,
+        iteration_limit: int | None = None,
     ) -> Solution:
-        """Solve for some values of the parameters.
+        """Solve for some values of the parameters, or from elsewhere.
+
+        With any of `initial`, `means`, `covariance` and `duration` the problem is that of `movable`, built at the first
+        such call: its solution has "initial_<name>" among its parameters, and is evaluated and simulated from there.
 
         Args:
             parameters: new values of known parameters and of means of unknowns, by name; the others keep theirs.
+            initial: other initial values of states, by symbol or name, NaN in entries that are free; the others keep
+                theirs.
+            means: other means of unknowns, by symbol or name.
+            covariance: another initial covariance of what is estimated, (n, n), rows of states, then of unknowns; or
+                initial values of matrices, by symbol or name.
+            duration: another duration [s]; builds a solver of its own, of which the last few are kept.
             guess: None: the problem's own; a `Solution` (also on another mesh, or of another problem with the same
                 names): warm start; "multistart": the best of several random starts; a dict of name to guess.
+            elapsed: time that has passed of the plan in guess= [s]: what is left of it is where to start.
             progress: whether to show the iterations on a terminal.
             allow_failure: return the last iterate of a run that did not converge instead of raising.
             starts: number of random starts of "multistart".
@@ -183,26 +215,46 @@ class Solver:
             assess: False in a loop that solves again and again: what is looked at after a run is left out (error of the
                 mesh and steps that are too long, curvature where a run ends as it began, cost of the classical design,
                 warnings). `mesh_error` is then nan; the residuals that a converged run must meet are the same.
+            time_limit: of all runs together [s], looked at after each iteration; building and assessing take theirs.
+            iteration_limit: of all runs together.
 
         Returns:
-            The solution.
+            The solution; where a limit was reached the last iterate, with what it violates, without raising.
 
         Raises:
             ProblemError: a name or a guess is wrong.
             SolveError: the method did not converge (carries the last iterate).
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
+        if not all(value is None for value in (initial, means, covariance, duration)):
+            other, known = self._elsewhere.solver(duration)
+            return other.solve(
+                self._elsewhere.values(known, parameters, initial, means, covariance),
+                guess=guess,
+                elapsed=elapsed,
+                progress=progress,
+                allow_failure=allow_failure,
+                starts=starts,
+                seed=seed,
+                assess=assess,
+                time_limit=time_limit,
+                iteration_limit=iteration_limit,
+            )
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
             self._keep(*self._first)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options)
-        first = self._best_gain(parameters, guess)
-        guess = guess if first is None else meeting_conditions(self._problem, first, parameters or {})
-        if isinstance(guess, Solution):
-            self._take_steps(guess.mesh)
+        guess = later_of(guess, elapsed)
+        title = self.statement.name or "solving"
         with evaluating(self.statement.name):
-            with Progress(self.statement.name or "solving", progress) as reporter:
+            with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
+                first = self._best_gain(parameters, guess, reporter)
+                if first is not None:
+                    near = not reporter.stop
+                    guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
+                if isinstance(guess, Later | Solution):
+                    self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
@@ -216,22 +268,31 @@ class Solver:
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
                 outcome = self._closed(outcome)
-            if reporter.stop:
+            if reporter.asked:
                 raise interrupted(Solution.of(outcome, self.method))
             outcome = with_gain_told(self._problem, outcome, first)
+            if reporter.spent and not outcome.converged:
+                outcome = replace(outcome, message=f"stopped at {reporter.spent}")
+                return self._finish(outcome, allow_failure=True, assess=assess)
             solution = self._finish(outcome, allow_failure, assess)
             return self._beside_classical(solution, values) if assess else solution
 
-    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given) -> Solution | None:
+    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress) -> Solution | None:
         """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
         named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
         for solver in self._best if guess is None or named else ():
+            if reporter.stop:
+                break
+            seconds, iterations = reporter.left
+            run = {"guess": guess, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
             try:
                 with without_warnings():  # they concern another solution
-                    best: Solution = solver.solve(parameters, guess=guess, progress=False)
+                    best: Solution = solver.solve(parameters, progress=False, **run)
             except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
                 continue
-            return best
+            reporter.count(int(best.stats["iterations"]))
+            if best.converged:
+                return best
         return None
 
     def _closed(self, outcome: Outcome) -> Outcome:
@@ -441,65 +502,3 @@ def is_roundoff(cost: float, statement: Statement, options: Options, parameters:
 
 def _noted(solution: Solution, **stats: Any) -> Solution:
     return replace(solution, stats={**solution.stats, **stats})
-
-
-@overload
-def solve(problem: Problem, method: str = "ipopt", **options: Any) -> Solution: ...
-
-
-@overload
-def solve(problem: Phases, method: str = "ipopt", **options: Any) -> PhasesSolution: ...
-
-
-@one_at_a_time
-@checked(method=text, nominal=text, progress=truth, allow_failure=truth)
-def solve(
-    problem: Problem | Phases,
-    method: str = "ipopt",
-    *,
-    intervals: Given = None,
-    guess: Given = None,
-    nominal: str = "combined",
-    progress: bool = True,
-    allow_failure: bool = False,
-    parameters: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> Solution | PhasesSolution:
-    """Solve a problem; `Solver` behind it solves again without rebuilding. Or several phases as one problem.
-
-    Args:
-        problem: what to solve.
-        method: a name in `methods()`.
-        intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of
-            each, or a list of one for each.
-        guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
-            or a dict by name of the phase.
-        nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
-        progress: whether to show the iterations on a terminal.
-        allow_failure: return the last iterate of a run that did not converge instead of raising.
-        parameters: values of parameters other than the declared ones, by name.
-        options: of the mesh and of the method; see `Solver`.
-
-    Returns:
-        The solution; a `PhasesSolution` of phases.
-
-    Raises:
-        ProblemError: the statement or an option is wrong.
-        SolveError: the method did not converge (carries the last iterate).
-        Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
-    """
-    if isinstance(problem, Phases):
-        check_method(method)
-        run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
-        run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
-        return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
-    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
-    if extra and not isinstance(guess, str):
-        raise ProblemError(
-            "The options of multistart are given, but not multistart.",
-            expected="guess='multistart'",
-            received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
-            remedy="add guess='multistart', or remove them",
-        )
-    solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
-    return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
 from covocp.base.quadrature import interpolated
+from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
@@ -22,6 +23,16 @@ from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import own_start, ranked
 from covocp.transcription.steering import quadrature_weights, resampled
 from covocp.transcription.trajectory import Multipliers, Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Later:
+    """A plan of which some time has passed [s]."""
+
+    plan: Solution
+    elapsed: float
+
+    __repr__ = short_repr
 
 
 def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Guess:
@@ -42,6 +53,8 @@ def make_guesses(
     """
     if isinstance(guess, Trajectory):
         yield Guess(trajectory=guess)
+    elif isinstance(guess, Later):
+        yield _from_solution(statement, mesh, parameters, guess.plan, linked, guess.elapsed)
     elif isinstance(guess, Solution):
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
@@ -76,8 +89,19 @@ def _with_guesses(statement: Statement, given: Mapping[Any, Any]) -> Statement:
     return replace(statement, guesses=guesses) if given else statement
 
 
-def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, linked: bool) -> Guess:
-    """A solution resampled on a mesh, primal and dual where the problems have the same symbols."""
+def _from_solution(
+    statement: Statement,
+    mesh: Mesh,
+    parameters: Array,
+    solution: Solution,
+    linked: bool,
+    elapsed: float | None = None,
+) -> Guess:
+    """A solution resampled on a mesh, primal and dual where the problems have the same symbols.
+
+    `elapsed`: what is left of it after this time [s], its last values held after its end; None: the whole, stretched
+    to this duration.
+    """
     _check_common(statement, solution)
     own = solution.mesh
     t, m = solution.trajectory, solution.multipliers
@@ -87,36 +111,64 @@ def _from_solution(statement: Statement, mesh: Mesh, parameters: Array, solution
     matched = (t.x.shape[1], t.u.shape[1], t.e.shape[1]) == (statement.nx, statement.nu, statement.ne)
     matched = matched and all(o is not None and o.offset == b.offset for b, o in zip(blocks, there, strict=True))
     nodes = np.array_equal(own.nodes, mesh.nodes) and np.array_equal(own.instants, mesh.instants)
-    duration = solution.duration if statement.duration.free else statement.duration.guess
-    if matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
+    duration = _duration(statement, solution, elapsed)
+    if elapsed is None and matched and nodes and own.control == mesh.control and t.u.shape[0] == mesh.control_nodes:
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
-        trajectory = _resampled(statement, mesh, parameters, solution, matched)
-    constraints = (statement.path.size, statement.start.size, statement.end.size)
-    if not matched or not solution.converged or (m.path.shape[1], m.start.size, m.end.size) != constraints:
+        trajectory = _resampled(statement, mesh, parameters, solution, matched, elapsed)
+    st = statement
+    constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
+    own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)
+    if not matched or not solution.converged or own_constraints != constraints:
         return Guess(trajectory=trajectory, warm=True)
     width = statement.nx + (0 if mesh.eliminated else statement.ne)
-    if nodes and own.segments == mesh.segments and m.gaps.shape == (len(mesh.segments), width) and not linked:
+    same = elapsed is None and nodes and own.segments == mesh.segments
+    if same and m.gaps.shape == (len(mesh.segments), width) and not linked:
         costates = np.zeros((mesh.nodes.size, statement.nx + statement.ne))  # read where segments meet and nowhere else
         costates[list(mesh.starts[1:]), :width] = m.gaps
     else:
         found = np.hstack([solution.costates.state, solution.costates.matrices])
-        costates = interpolated(found, own.nodes, mesh.nodes)
+        costates = interpolated(found, own.nodes, _places(mesh.nodes, duration, solution, elapsed))
     return Guess(
         trajectory=trajectory,
-        multipliers=_multipliers(m, own, mesh),
+        multipliers=_multipliers(m, own, mesh) if elapsed is None else _left(m, mesh, duration, solution, elapsed),
         costates=(costates[:, : statement.nx], costates[:, statement.nx :]),
         warm=True,
     )
 
 
-def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: Solution, matched: bool) -> Trajectory:
+def _duration(statement: Statement, solution: Solution, elapsed: float | None) -> float:
+    """The duration to start from [s]."""
+    if not statement.duration.free:
+        return float(statement.duration.guess)
+    left = solution.duration - (elapsed or 0.0)
+    return float(left if elapsed is None else np.clip(left, statement.duration.lower, statement.duration.upper))
+
+
+def _places(nodes: Array, duration: float, solution: Solution, elapsed: float | None) -> Array:
+    """Where in a solution, as shares of its duration, these shares of a duration are."""
+    if elapsed is None:
+        return nodes
+    return np.asarray(np.minimum((elapsed + nodes * duration) / solution.duration, 1.0))
+
+
+def _resampled(
+    statement: Statement,
+    mesh: Mesh,
+    parameters: Array,
+    solution: Solution,
+    matched: bool,
+    elapsed: float | None = None,
+) -> Trajectory:
     """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
-    duration = solution.duration if statement.duration.free else statement.duration.guess
+    duration = _duration(statement, solution, elapsed)
+
+    def at(nodes: Array, side: Literal["before", "after"] = "after") -> Any:
+        return solution.at(_places(nodes, duration, solution, elapsed) * solution.duration, side=side)
+
     sizes, t = mesh.nodes.size, solution.trajectory
-    sample = solution.at(mesh.nodes * solution.duration)
-    at_controls = solution.at(control_places(mesh.nodes, mesh.control) * solution.duration)
-    ahead = solution.at(mesh.nodes[mesh.instants] * solution.duration, side="before")
+    sample, ahead = at(mesh.nodes), at(mesh.nodes[mesh.instants], "before")
+    at_controls = at(control_places(mesh.nodes, mesh.control))
     gain = free_gain_block(statement) if solution.loop is not None else None
     others = {(b.name, b.kind, b.size) for b in solution.blocks}
     if matched:  # nothing of it stays
@@ -127,13 +179,16 @@ def _resampled(statement: Statement, mesh: Mesh, parameters: Array, solution: So
     for block in (*statement.states, *statement.controls, *statement.matrices):
         if (block.name, block.kind, block.size) not in others:
             if block == gain:
-                at = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
-                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, at)
+                nodes = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
+                places = _places(nodes, duration, solution, elapsed)
+                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, places)
             continue
         if block.kind == "state":
             x[:, block.span] = sample[block.name].reshape(-1, block.size)
         elif block.kind == "control":
             u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
+            if mesh.control == "linear":  # which may jump at an instant
+                u[mesh.instants, block.span] = ahead[block.name].reshape(-1, block.size)
         else:
             e[:, block.span] = pack(sample[block.name])
             e[mesh.instants, block.span] = pack(ahead[block.name])
@@ -181,4 +236,34 @@ def _multipliers(multipliers: Multipliers, old: Mesh, new: Mesh) -> Multipliers:
         inside_states=np.zeros((new.intervals, new.points - 1, multipliers.states.shape[1])),
         matrices=at_nodes(multipliers.matrices),
         controls=controls * quadrature_weights(new)[:, None],
+    )
+
+
+def _left(multipliers: Multipliers, mesh: Mesh, duration: float, solution: Solution, elapsed: float) -> Multipliers:
+    """Multipliers of what is left of a solution: those at nodes are densities times the weights of the nodes.
+
+    Densities in time keep their values; nothing binds after its end, and where it was met between its nodes.
+    """
+    old, kept = solution.mesh, duration / solution.duration
+    before, after = (quadrature_weights(replace(m, control="linear"))[:, None] for m in (old, mesh))
+    inside = (mesh.intervals, mesh.points - 1)
+
+    def moved(values: Array, places: Array, nodes: Array) -> Array:
+        wanted = elapsed + nodes * duration
+        found = interpolated(values, places, _places(nodes, duration, solution, elapsed))
+        return np.asarray(np.where((wanted <= solution.duration)[:, None], found, 0.0)) * kept
+
+    def at_nodes(values: Array) -> Array:
+        return moved(values / before, old.nodes, mesh.nodes) * after
+
+    weights = (quadrature_weights(m)[:, None] for m in (old, mesh))
+    own, new = (control_places(m.nodes, m.control) for m in (old, mesh))
+    return replace(
+        multipliers,
+        path=at_nodes(multipliers.path_at_nodes),
+        states=at_nodes(multipliers.states_at_nodes),
+        inside_path=np.zeros((*inside, multipliers.path.shape[1])),
+        inside_states=np.zeros((*inside, multipliers.states.shape[1])),
+        matrices=at_nodes(multipliers.matrices),
+        controls=moved(multipliers.controls / next(weights), own, new) * next(weights),
     )

@@ -18,6 +18,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
+from covocp.statement.conditions import Inside
 from covocp.statement.statement import Block, Conditions, Samples, Statement
 
 # Statements whose rows are known.
@@ -125,6 +126,7 @@ def _without(statement: Statement, kept: list[list[int]], entries: list[int], bl
             blocks=samples.blocks,
             places=samples.places,
             measurement=cut.of(samples.measurement, (None, (None, rows), None)),
+            groups=samples.groups,
             update=cut.of(samples.update, ((entries, None), None)),
         )
     forms = tuple(
@@ -144,6 +146,9 @@ def _without(statement: Statement, kept: list[list[int]], entries: list[int], bl
         path=cut.conditions(statement.path),
         start=cut.conditions(statement.start),
         end=cut.conditions(statement.end),
+        inside=Inside(
+            parts=tuple(replace(part, conditions=cut.conditions(part.conditions)) for part in statement.inside.parts)
+        ),
         matrix_lower=statement.matrix_lower[entries],
         augmented=tuple(statement.augmented[row] for row in rows),
     )

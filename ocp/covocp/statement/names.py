@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import bound_columns, column
+from covocp.base.checks import as_number, bound_columns, column, shape_error
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.matrices import Array, half_length, unpack_indices
@@ -165,6 +165,12 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
                 received=repr(key)[:100],
                 remedy=spelling(key, blocks, _not_given(str(key), statement, bool(blocks))),
             )
+        shape = statement.matrix_parameters.get(name)
+        if shape is not None:
+            matrix = as_number(name, "value", value)
+            if matrix.shape != shape:
+                raise shape_error(name, "value", f"shape {shape}", f"shape {matrix.shape}")
+            value = matrix.ravel(order="F")
         values[blocks[name].span] = column(name, "value", value, blocks[name].size)
     return values
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -24,6 +25,9 @@ from covocp.base.matrices import Array, half_indices, half_length
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.statement.chances import ChanceLimits
+from covocp.statement.conditions import Columns as Columns
+from covocp.statement.conditions import Conditions as Conditions
+from covocp.statement.conditions import Inside
 from covocp.statement.time_data import TimeData, kinks
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
@@ -91,50 +95,6 @@ class Tied:
     __repr__ = short_repr
 
 
-class Columns(NamedTuple):
-    """States, controls, half-vectors and times of several points, a column each."""
-
-    x: Expr
-    u: Expr
-    matrices: Expr
-    time: Expr
-
-
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """Inequalities lower <= value(...) <= upper of one kind: along the path, at the start or at the end.
-
-    `function` takes (state, control, matrices, time, duration, parameters); `names` has one entry for each row.
-    `realised` is the same of one run, whose spread is none: the covariance X of the closed loop is zero in it; None
-    where no row contains X. `between` tells the rows that must hold at all times, whatever it takes.
-    """
-
-    function: ca.Function
-    names: tuple[str, ...]
-    lower: Array
-    upper: Array
-    uses_matrices: bool
-    realised: ca.Function | None = None
-    between: tuple[bool, ...] = ()
-
-    __repr__ = short_repr
-
-    @property
-    def size(self) -> int:
-        """Number of rows."""
-        return len(self.names)
-
-    def columns(self, at: Columns, duration: Expr, parameters: Expr) -> Any:
-        """The values for columns of points; matrices that no row reads are no part of the expression.
-
-        Else every slope of these values would carry the propagation of the covariances along.
-        """
-        count = at.x.shape[1]
-        seen = at.matrices if self.uses_matrices else ca.DM(*at.matrices.shape)
-        rest = (ca.repmat(duration, 1, count), ca.repmat(parameters, 1, count))
-        return self.function.map(count)(at.x, at.u, seen, at.time, *rest)
-
-
 class LoopSlopes(NamedTuple):
     """F (n, n), G (n, m), A (n, n), B (m, m), N (n, m), Q (n, n), see `Loop.expansion`."""
 
@@ -192,6 +152,7 @@ class Samples:
     places: the instants of each, rising fractions of the terminal time.
     measurement: (state, control, time, duration, parameters) -> values (m), H = their Jacobian by the augmented state
         (m, n), variance R of the noise (m, m).
+    groups: rows that are read together, the others one after the other: their noises are correlated.
     update: (all six, reading) -> half-vectors after it [E+ = (I - K H) E (I - K H)' + K R K'], what it adds to the
         running cost: tr S (E - E+)/2 in a closed loop with the best gain, else nothing.
     """
@@ -199,6 +160,7 @@ class Samples:
     blocks: tuple[Block, ...]
     places: tuple[tuple[float, ...], ...]
     measurement: ca.Function
+    groups: tuple[tuple[int, ...], ...]
     update: ca.Function
 
     __repr__ = short_repr
@@ -244,6 +206,7 @@ class Statement:
         measurements: where each of them lies among the measured values.
         information: (state, control, time, duration, parameters) -> the inverse densities that were stated as
             information, which may be zero but not negative; None where none was.
+        inside: conditions at instants of the horizon, of which every mesh has the nodes.
         chances: conditions on probabilities, which are among those of `path`, `start` and `end`.
         samples: measurements that are taken at instants; None where there are none.
         data: values over time that are in some of these functions.
@@ -271,6 +234,7 @@ class Statement:
     path: Conditions
     start: Conditions
     end: Conditions
+    inside: Inside
     chances: tuple[ChanceLimits, ...]
     state_bounds: tuple[Array, Array]
     control_bounds: tuple[Array, Array]
@@ -286,6 +250,7 @@ class Statement:
     geometry: Geometry
     symbols: Mapping[str, Any] = field(repr=False)
     expression: Callable[[Any], ca.Function] = field(repr=False)
+    matrix_parameters: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -296,8 +261,14 @@ class Statement:
 
     @cached
     def instants(self) -> tuple[float, ...]:
-        """Fractions of the terminal time that must be nodes of every mesh."""
-        return () if self.samples is None else self.samples.instants
+        """Fractions of the terminal time at which every mesh has a node before and one after what happens there."""
+        sampled = () if self.samples is None else self.samples.instants
+        return tuple(sorted({*sampled, *self.inside.places}))
+
+    @cached
+    def conditions(self) -> tuple[Conditions, ...]:
+        """All inequalities: along the path, at the start, at the end, at each of the instants."""
+        return (self.path, self.start, self.end, *(part.conditions for part in self.inside.parts))
 
     @cached
     def kinks(self) -> tuple[tuple[float, ...], ...]:
@@ -430,8 +401,7 @@ class Statement:
 
     def boundary_values(self, parameters: Array) -> Boundary:
         """Initial state, final state, initial matrices, final matrices for these parameters (NaN: free)."""
-        values = self.boundary(parameters)
-        return Boundary(*(np.asarray(value.full()).ravel() for value in values))
+        return Boundary(*(values.copy() for values in _boundary_values(self, tuple(parameters.tolist()))))
 
     def started(self, x0: Expr, parameters: Expr, e0: Expr = None) -> tuple[Any, Any]:
         """Initial state and half-vectors with what decisions give of them; numbers or symbols.
@@ -512,3 +482,9 @@ def entries_of(matrix: Any) -> list[str]:
 def half_names(name: str, labels: tuple[str, ...]) -> list[str]:
     """Names of the entries of the half-vector of a matrix, such as 'E[x, b]'."""
     return [f"{name}[{labels[i]}, {labels[j]}]" for i, j in zip(*half_indices(len(labels)), strict=True)]
+
+
+@lru_cache(maxsize=16)
+def _boundary_values(statement: Statement, parameters: tuple[float, ...]) -> Boundary:
+    """See `Statement.boundary_values`, which is asked several times in every solve."""
+    return Boundary(*(np.asarray(value.full()).ravel() for value in statement.boundary(np.array(parameters))))

@@ -1,8 +1,8 @@
 """Before anything is measured nothing is fed back: the gain as a control has no effect there, the estimate no spread.
 
-Xhat is zero until the first reading and singular until enough was read, whatever the gain is. The limit Xhat >= 0 has no
-inside there: its multipliers grow without limit, and where a variance z^2 could pass through z = 0 the barrier keeps it
-off. What Xhat follows from keeps it semidefinite by itself: the limit is left out, and the gain held until it acts.
+Xhat is zero until the first reading and singular until enough was read, whatever the gain is. The limit Xhat >= 0 has
+no inside there: its multipliers grow without limit, and where a variance z^2 could pass through z = 0 the barrier keeps
+it off. Its dynamics keep Xhat semidefinite by themselves: the limit is left out, and the gain held until it acts.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ def unfed(statement: Statement, mesh: Mesh, start: Array) -> Unfed | None:
         mesh: with its instants.
         start: half-vectors at time zero, (ne,); NaN where they are free.
     """
-    if statement.loop is None or statement.behind or statement.measurement is not None or not mesh.instants:
+    if statement.loop is None or statement.behind or statement.measurement is not None or not mesh.readings.any():
         return None
     gain = next((block.span for block in statement.controls if block.name == GAIN), None)
     estimate = next((block.span for block in statement.matrices if block.name == ESTIMATE), None)
     if gain is None or estimate is None or not (start[estimate] == 0.0).all():
         return None
-    return Unfed(nodes=mesh.instants[0] + 1, controls=gain, matrices=estimate)
+    first = int(np.flatnonzero(mesh.readings.any(axis=0))[0])
+    return Unfed(nodes=first + 1, controls=gain, matrices=estimate)
 
 
 def hold(own: Unfed, lower: Array, upper: Array) -> None:

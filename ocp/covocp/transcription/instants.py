@@ -1,4 +1,7 @@
-"""Meshes with nodes where something happens: where a measurement is taken there are two, before and after it.
+"""Meshes with nodes where something happens: at an instant there are two, before and after it.
+
+At an instant a measurement is taken, or a condition holds: a covariance or a costate jumps there. Where a condition is
+about what comes after a measurement, or about the control that goes on, there is a third node for it between them.
 
 Data over time have kinks, over which integration steps lose their order. Those of each of the data are nodes too, of
 every mesh that was asked to have at least as many intervals; to a coarser one they are noise, and what they cost is in
@@ -28,10 +31,10 @@ def with_instants(statement: Statement, options: Options) -> Options:
 
     Args:
         statement: the problem.
-        options: a grid that is complete stays as it is.
+        options: a grid that has them stays as it is.
     """
     if isinstance(options.grid, Graded):
-        return options
+        return _completed_grid(statement, options, options.grid)
     nodes = np.unique(options.nodes())
     asked = nodes.size - 1
     needed = _needed(statement, asked)
@@ -43,7 +46,7 @@ def with_instants(statement: Statement, options: Options) -> Options:
 
 
 def completed(statement: Statement, nodes: Array, asked: int | None = None) -> Array:
-    """Some nodes with the instants among them; twice where a measurement is taken.
+    """Some nodes with the instants among them, before and after what happens there.
 
     Args:
         statement: the problem.
@@ -55,8 +58,16 @@ def completed(statement: Statement, nodes: Array, asked: int | None = None) -> A
         return nodes
     others = np.unique(nodes)
     kept = others[~_near(others, needed) | (others == 0.0) | (others == 1.0)]
-    twice = () if statement.samples is None else statement.samples.instants
-    return np.sort(np.concatenate([np.union1d(kept, needed), twice]))
+    return np.sort(np.concatenate([np.union1d(kept, needed), statement.instants, statement.inside.thrice]))
+
+
+def _completed_grid(statement: Statement, options: Options, grid: Graded) -> Options:
+    """The options with the instants in a grid that was graded, perhaps for another problem."""
+    twice, thrice = np.array(statement.instants), np.array(statement.inside.thrice)
+    there = all((np.sum(grid.nodes == place) >= 2 + (place in thrice)) for place in twice)
+    if there:
+        return options
+    return replace(options, grid=replace(grid, nodes=completed(statement, grid.nodes, grid.asked)))
 
 
 def _needed(statement: Statement, asked: int) -> Array:

@@ -138,7 +138,7 @@ class Mesh:
         step: covariance step; "rodas": implicit steps of the nominal, gauss steps of the covariances.
         linear_solver: CasADi's linear solver of the covariance steps.
         readings: what each interval takes of each measurement at instants, (measurements, N): its node is there twice,
-            and the interval between has no length.
+            and the interval between has no length; nothing where only a condition holds there.
         points: equally spread points of an interval, its start among them, where path inequalities and bounds of
             states are imposed; they are ends of substeps. 1: at the nodes only.
     """
@@ -175,7 +175,7 @@ class Mesh:
 
     @cached
     def instants(self) -> list[int]:
-        """Intervals of no length, at which measurements are taken."""
+        """Intervals of no length, at which measurements are taken or conditions hold."""
         return [int(k) for k in np.flatnonzero(np.diff(self.nodes) == 0.0)]
 
     def placed(self, s: Array) -> Array:
@@ -203,6 +203,10 @@ class Mesh:
             if self.nodes[last - 1] == self.nodes[last]:
                 end = int(np.flatnonzero(self.nodes == self.nodes[last])[0])
                 own[end:] = [end] * (last + 1 - end)
+        still = set(self.instants)
+        for k in reversed(self.instants):
+            if k - 1 in still and not self.readings[:, k].any():  # for a condition on what goes on
+                own[k] = own[k + 1]
         return own
 
     @cached

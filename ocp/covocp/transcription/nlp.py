@@ -194,11 +194,13 @@ class NLP:
         elif "final_matrices" in by_kind:
             known = ~np.isnan(st.boundary_values(parameters)[3])
             final_matrices[known] = by_kind["final_matrices"]
+        parts_inside = [by_kind[inside_kind(i)] for i in range(len(st.inside.parts))]
         return Multipliers(
             final=costate - slope_x,
             final_matrices=final_matrices,
             end=end,
             start=by_kind.get("start", zero.start),
+            instants=np.concatenate([np.zeros(0), *parts_inside]),
             path=path,
             states=states,
             matrices=matrices,
@@ -242,7 +244,7 @@ class NLP:
             "end": multipliers.end,
             "final_matrices": multipliers.final_matrices[known],
             "backward_ends": multipliers.final_matrices[st.entries(st.behind)],
-        }
+        } | {inside_kind(i): own for i, own in enumerate(st.inside.split(multipliers.instants))}
         lam_g = [values[rows.kind].ravel() * rows.scale for rows in self.rows]
         lam_x = [multipliers.states[starts] * self.scales.x]
         if not self.mesh.eliminated:
@@ -285,6 +287,11 @@ class NLP:
             parts[name] = w[offset : offset + shape[0] * shape[1]].reshape(shape)
             offset += shape[0] * shape[1]
         return parts
+
+
+def inside_kind(number: int) -> str:
+    """Kind of the rows of the conditions at one of the instants."""
+    return f"instant {number}"
 
 
 def terminal_slopes(

@@ -78,7 +78,7 @@ def implicit_step(statement: Statement, fractions: tuple[float, ...]) -> ca.Func
     at = ca.Function("at", [value, c, side, *interval], [rate])
     slopes = ca.Function("slopes", [value, c, side, *interval], [ca.jacobian(rate, value), ca.jacobian(rate, c)])
     h = interval.h
-    if statement.readings:  # a measurement is taken in an interval of no length
+    if statement.instants:  # an interval of no length
         h = ca.if_else(h == 0, SHORTEST, h)
     slope, in_time = slopes(x, 0.0, one_sided(0.0), *interval)
     solve = _solver(ca.DM.eye(nx) / (GAMMA * h) - slope, scalar)

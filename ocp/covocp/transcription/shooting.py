@@ -18,7 +18,7 @@ from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import half_length
 from covocp.passage.library import functions
-from covocp.passage.sweep import depends, passed_by
+from covocp.passage.sweep import Told, depends, passed_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -35,6 +35,7 @@ from covocp.transcription.steps import (
     runge_kutta_step,
     simpson_interval,
     step_matrix,
+    told_at,
 )
 
 # Steps that a sequence of numbers takes at a time.
@@ -325,6 +326,8 @@ def _sequence(
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
     reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
+    if reads and passage != "plain" and len(positions) == 1:
+        return _reading_passage(statement, mesh, passage, positions[0], first, columns, kicks)
     moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
     chosen = [column[:, moving] for column in columns] if reads else columns
     matrices, run = _steps(statement, mesh, passage, positions, kicks is not None)(chosen, count - len(reads))
@@ -374,9 +377,47 @@ def _compiled(
     return [passed] if kicks is None else [passed, passed - kicks]
 
 
+def _reading_passage(
+    statement: Statement,
+    mesh: Mesh,
+    passage: Passage,
+    position: int,
+    first: Expr,
+    columns: tuple[Any, ...],
+    kicks: Expr,
+) -> tuple[Any, Any]:
+    """What `_sequence` gives of the covariance of the error where it is read at instants, by the compiled passage.
+
+    What a substep reads is a step of the passage for each group of rows.
+    """
+    assert statement.samples is not None
+    count, groups = mesh.intervals * mesh.substeps, len(statement.samples.groups)
+    reads = _reads(mesh)
+    within = set(reads)
+    moving = [k for k in range(count) if k not in within]
+    lengths = np.where(np.isin(np.arange(count), reads), groups, 1)
+    last = np.cumsum(lengths) - 1
+    steps = tuple(int(last[k]) - groups + 1 + j for k in reads for j in range(groups))
+    chosen = [column[:, reads] for column in (columns[0], *columns[2:])]
+    height = max(len(group) for group in statement.samples.groups)
+    told = Told(steps=steps, rows=height, columns=told_at(statement).map(len(reads))(*chosen))
+    points = gauss_points(statement, position, mesh.step).map(len(moving)).call([c[:, moving] for c in columns])
+    size = statement.matrices[position].size
+    passing = passed_by if passage == "compiled" else depends
+    if kicks is None:
+        values = passing(first, points, size, None, told)[:, last.tolist()]
+        return values, values
+    later = ca.MX(first.shape[0], int(last[-1]) + 1)
+    later[:, last[mesh.substeps - 1 :: mesh.substeps].tolist()] = kicks
+    passed = passing(first, points, size, ca.densify(later), told)[:, last.tolist()]
+    at_nodes = ca.MX(first.shape[0], count)
+    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
+    return passed - at_nodes, passed
+
+
 def _reads(mesh: Mesh) -> list[int]:
     """The substeps, in the order of travel forward, at which something is read."""
-    return [k * mesh.substeps + j for k in mesh.instants for j in range(mesh.substeps)]
+    return [k * mesh.substeps + j for k in mesh.instants if mesh.readings[:, k].any() for j in range(mesh.substeps)]
 
 
 def _kicked(step: ca.Function) -> ca.Function:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,7 +20,7 @@ from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import repeated
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.first_guess import (
     check_model,
     control_scale,
@@ -362,7 +363,9 @@ def _merit(run: Run, u: Array) -> tuple[float, float]:
     violation = float((np.maximum(lower - x, x - upper) / run.divisors).max(initial=0.0))
     count = x.shape[0]
     columns = (x.T, at_nodes(u, count).T, e.T, run.mesh.nodes[None, :] * duration, *repeated(duration, p, count))
-    for conditions, at in ((st.path, slice(None)), (st.start, slice(0, 1)), (st.end, slice(count - 1, count))):
+    places: list[tuple[Conditions, Any]] = [(st.path, slice(None)), (st.start, slice(1)), (st.end, slice(-1, None))]
+    nearest = [int(np.abs(run.mesh.nodes - part.place).argmin()) for part in st.inside.parts]  # of a coarse mesh
+    for conditions, at in [*places, *((p.conditions, [k]) for p, k in zip(st.inside.parts, nearest, strict=True))]:
         if conditions.size:
             chosen = [c[:, at] for c in columns]
             rows = conditions.function.map(chosen[0].shape[1])(*chosen).full().T

@@ -156,6 +156,28 @@ def read_step(statement: Statement, positions: tuple[int, ...]) -> ca.Function:
 
 
 @lru_cache(maxsize=KEPT)
+def told_at(statement: Statement) -> ca.Function:
+    """What is read in an interval without length, as the compiled passage is told it (`Told`): a column for each group.
+
+    Returns:
+        (state, *interval without length) -> rows of M and half-vector of R, for each group of rows.
+    """
+    samples = statement.samples
+    assert samples is not None
+    symbolic: Any = statement.symbolic
+    x, interval = symbolic.sym("x", statement.nx), Interval.symbols(statement)
+    _, H, R = samples.measurement(*interval.at(0.0, x))
+    height, columns = max(len(group) for group in samples.groups), []
+    for group in samples.groups:
+        rows = list(group)
+        own = next(j for j, block in enumerate(samples.blocks) if rows[0] in range(block.span.start, block.span.stop))
+        M = ca.vertcat(ca.sqrt(interval.reading[own]) * H[rows, :], symbolic.zeros(height - len(rows), H.shape[1]))
+        noise = ca.diagcat(R[rows, rows], ca.DM.eye(height - len(rows)))
+        columns.append(ca.vertcat(ca.vec(ca.densify(M).T), pack_symbolic(noise)))
+    return ca.Function("told", [x, *interval], [ca.densify(ca.horzcat(*columns))], _slopes(statement, 1))
+
+
+@lru_cache(maxsize=KEPT)
 def step_matrix(statement: Statement, index: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
     """The step matrix of one matrix state over one substep, given the nominal at both ends of it.
 

@@ -38,6 +38,7 @@ class Multipliers:
         on x(T), its part of p(T) comes beside l.)
     final_matrices: the same for the half-vectors, shape (ne,).
     end, start: of the terminal and initial inequalities.
+    instants: of the conditions at instants, one instant after the other.
     path: of the path inequalities at the nodes, shape (N + 1, rows).
     inside_path, inside_states: of the path inequalities and the bounds on states at the other points of the intervals
         where they are imposed, shapes (N, points - 1, rows), (N, points - 1, nx).
@@ -55,6 +56,7 @@ class Multipliers:
     final_matrices: Annotated[Array, "e"]
     end: Annotated[Array, "end"] = field(default_factory=lambda: np.zeros(0))
     start: Annotated[Array, "start"] = field(default_factory=lambda: np.zeros(0))
+    instants: Annotated[Array, "instants"] = field(default_factory=lambda: np.zeros(0))
     path: Annotated[Array, "nodes path or none"] = field(default_factory=lambda: np.zeros((0, 0)))
     states: Annotated[Array, "nodes x or none"] = field(default_factory=lambda: np.zeros((0, 0)))
     matrices: Annotated[Array, "nodes e or none"] = field(default_factory=lambda: np.zeros((0, 0)))
@@ -74,6 +76,7 @@ class Multipliers:
             final_matrices=np.zeros(statement.ne),
             end=np.zeros(statement.end.size),
             start=np.zeros(statement.start.size),
+            instants=np.zeros(statement.inside.size),
             path=np.zeros((nodes, statement.path.size)),
             states=np.zeros((nodes, statement.nx)),
             matrices=np.zeros((nodes, statement.ne)),

@@ -14,7 +14,7 @@ from covocp.base.matrices import Array
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.nlp import NLP, Rows, Scales
+from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.scales import limit_units
 from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, shoot
 
@@ -123,6 +123,10 @@ def _constraints(
             x, u, e, t = (v[:, columns] for v in arguments)
             value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
             rows.append(_condition_rows(kind, conditions, value, k, mesh))
+    for i, (part, k) in enumerate(zip(statement.inside.parts, statement.inside.nodes_among(mesh.nodes), strict=True)):
+        at = Columns(*(v[:, k] for v in arguments))
+        value = part.conditions.columns(at, variables.duration, variables.parameters)
+        rows.append(_condition_rows(inside_kind(i), part.conditions, value, 1, mesh))
     if mesh.points > 1:
         rows += _inside_rows(statement, mesh, scales, variables, nodes)
     if mesh.eliminated and statement.matrices:

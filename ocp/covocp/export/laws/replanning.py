@@ -15,9 +15,9 @@ from covocp.base.short_repr import short_repr
 from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
-from covocp.problem.declarations import Declarations, Free, Parameter
-from covocp.problem.estimation_covariance import with_estimation
+from covocp.problem.declarations import Declarations, Free, Matrix
 from covocp.problem.expected_cost import statement_of
+from covocp.problem.restart import Start, restartable
 from covocp.statement.statement import Statement
 
 # Shortest and longest duration of a plan, in units of that of the problem.
@@ -75,20 +75,9 @@ def replannable(problem: Problem) -> Replannable:
             received=", ".join(f"'{entry.name}'" for entry in own.sampled),
             remedy="export the controller or the trajectory; solve again in Python with the instants that are left",
         )
-    start, _, matrices, _ = statement.boundary_values(statement.values)
     taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
-    entries: list[Argument] = []
-    if own.expected is not None and not any(matrix.estimation for matrix in own.matrices):
-        own = with_estimation(own)  # so that its start can be a parameter
-    for position, state in enumerate(own.states):
-        if state.role != "moving":
-            continue
-        block = next(b for b in statement.states if b.name == state.name)
-        own = _with_start(own, position, start[block.span], taken, entries)
-    for position, matrix in enumerate(own.matrices):
-        block = next(b for b in statement.matrices if b.name == matrix.name)
-        if matrix.backward is None and matrix.role == "moving" and not np.isnan(matrices[block.span]).any():
-            own = _with_matrix(own, position, matrices[block.span], taken, entries)
+    found = restartable(own, statement)
+    own, entries = found.declarations, [_argument(start, taken) for start in found.starts]
     for block in (*statement.of_kind("parameter"), *statement.of_kind("unknown")):
         value = statement.values[block.span]
         about = "parameter" if block.kind == "parameter" else "mean of the unknown"
@@ -113,56 +102,23 @@ def _timed(problem: Declarations) -> bool:
     return any(ca.depends_on(expression, problem.time) for expression in expressions)
 
 
-def _parameter(problem: Declarations, name: str, value: Array, unit: str, taken: set[str]) -> Parameter:
-    """A new parameter."""
-    declared: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
-    unique = identifier(name, taken | {entry.name for entry in declared})
-    taken.add(unique)
-    symbol = ca.MX.sym(unique, value.size)
-    return Parameter(name=unique, symbol=symbol, size=value.size, where="the export", unit=unit, value=value)
-
-
-def _with_start(
-    problem: Declarations, position: int, start: Array, taken: set[str], entries: list[Argument]
-) -> Declarations:
-    """The declarations with the known initial values of a state as a parameter."""
-    state, known = problem.states[position], np.flatnonzero(~np.isnan(start))
-    if not known.size:
-        return problem
-    own = _parameter(problem, f"initial_{state.name}", start[known], state.unit, taken)
-    name, symbol = own.name, own.symbol
-    rows = [symbol[known.tolist().index(i)] if i in known else state.initial[i] for i in range(state.size)]
-    about = f"initial value of '{state.name}'"
-    about += "" if known.size == state.size else f", its entries {', '.join(map(str, known.tolist()))}"
-    deviation = np.full(known.size, 0.0)
-    if state.variance.is_constant():
-        deviation = 0.1 * np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(state.variance).full())), 0.0))[known]
-    deviation = np.maximum(deviation, 0.005 * np.abs(start[known]))
-    port = Port(name=name, rows=known.size, unit=state.unit, about=about)
-    entries.append(Argument(port=port, parameter=name, value=start[known], deviation=deviation))
-    return _started(problem.adding(parameters=own), "states", position, ca.vertcat(*rows))
-
-
-def _started(problem: Declarations, group: str, position: int, initial: Expr) -> Declarations:
-    """The declarations with another initial value of one entry of a group."""
-    found = list(getattr(problem, group))
-    found[position] = replace(found[position], initial=initial)
-    changed: dict[str, Any] = {group: tuple(found)}
-    return replace(problem, **changed)
-
-
-def _with_matrix(
-    problem: Declarations, position: int, half: Array, taken: set[str], entries: list[Argument]
-) -> Declarations:
-    """The declarations with the initial value of a matrix as a parameter."""
-    matrix = problem.matrices[position]
-    own = _parameter(problem, f"initial_{matrix.name}", half, matrix.unit, taken)
-    name, labels = own.name, matrix.labels
-    value = unpack(half, matrix.size)
-    about = f"initial value of the matrix '{matrix.name}', rows {', '.join(labels)}"
-    port = Port(name=name, rows=matrix.size, columns=matrix.size, unit=matrix.unit, about=about)
-    entries.append(Argument(port=port, parameter=name, value=value.ravel(), deviation=np.zeros(value.size)))
-    return _started(problem.adding(parameters=own), "matrices", position, own.symbol)
+def _argument(start: Start, taken: set[str]) -> Argument:
+    """An initial value as an argument of the solver."""
+    entry, known = start.of, list(start.known)
+    name = identifier(start.parameter, taken)
+    if isinstance(entry, Matrix):
+        value = unpack(start.value, entry.size)
+        about = f"initial value of the matrix '{entry.name}', rows {', '.join(entry.labels)}"
+        port = Port(name=name, rows=entry.size, columns=entry.size, unit=entry.unit, about=about)
+        return Argument(port=port, parameter=start.parameter, value=value.ravel(), deviation=np.zeros(value.size))
+    about = f"initial value of '{entry.name}'"
+    about += "" if len(known) == entry.size else f", its entries {', '.join(map(str, known))}"
+    deviation = np.zeros(len(known))
+    if entry.variance.is_constant():
+        deviation = 0.1 * np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(entry.variance).full())), 0.0))[known]
+    deviation = np.maximum(deviation, 0.005 * np.abs(start.value))
+    port = Port(name=name, rows=len(known), unit=entry.unit, about=about)
+    return Argument(port=port, parameter=start.parameter, value=start.value, deviation=deviation)
 
 
 def stacked(entries: tuple[Argument, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
