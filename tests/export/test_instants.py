@@ -99,7 +99,6 @@ def test_flown_laws_hold_what_the_solution_promises(period):
 @pytest.mark.parametrize(
     ("given", "options", "words"),
     [
-        ({"at": [0.0, 1.0]}, {}, "time zero"),
         ({"at": [0.33]}, {"period": 0.1}, "no samples of the controller"),
         ({}, {"solver": True}, "another plan"),
     ],

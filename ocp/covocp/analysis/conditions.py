@@ -58,7 +58,8 @@ def _kind(statement: Statement) -> str:
     if statement.coupled:
         return "the nominal depends on the estimation covariance"
     if statement.samples is not None:
-        return "measurements are taken at instants: " + ", ".join(block.name for block in statement.samples.blocks)
+        names = ", ".join(block.name for block in statement.samples.blocks)
+        return f"measurements are taken at instants, where information is no density along the way: {names}"
     if statement.inside.size:
         return "conditions hold at instants inside the horizon: " + ", ".join(statement.inside.names)
     if statement.measurement is None:

@@ -149,15 +149,21 @@ def smallest_eigenvalue(matrices: ArrayLike) -> float:
     return float(np.linalg.eigvalsh(full).min())
 
 
-def is_semidefinite(matrices: ArrayLike) -> bool:
-    """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff."""
+def is_semidefinite(matrices: ArrayLike, known: float = 0.0) -> bool:
+    """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff.
+
+    Args:
+        matrices: each is compared with its own largest eigenvalue.
+        known: share of the largest eigenvalue of all up to which they are known, where they are found by iteration.
+    """
     full = np.asarray(matrices, dtype=float)
     if full.size == 0:
         return True
     if not np.all(np.isfinite(full)):
         return False
     values = np.linalg.eigvalsh(full)
-    return bool(np.all(values[..., 0] >= -SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[..., -1]), 1e-300)))
+    least = SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[..., -1]), 1e-300)
+    return bool(np.all(values[..., 0] >= -np.maximum(least, known * np.abs(values).max())))
 
 
 def standard_deviations(covariances: ArrayLike) -> Array:

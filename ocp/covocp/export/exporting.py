@@ -27,7 +27,7 @@ from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
 from covocp.export.laws.limits import limits_of_each, warn_outside
-from covocp.export.laws.phase_controller import legs_of, phases_controller
+from covocp.export.laws.phase_controller import check_first_readings, legs_of, phases_controller
 from covocp.export.laws.phases import histories
 from covocp.export.laws.sampled import discretised, sampled_law
 from covocp.export.laws.solver import solver_law
@@ -267,6 +267,7 @@ def _phases(
                 remedy="load(path, phases) with the phases that were solved",
             )
         designs = [design_of(phase, own) for phase, own in zip(solution, limits_of_each(solution, limits), strict=True)]
+        check_first_readings(solution, designs)
         for phase, design, own in zip(solution, designs, found.tables, strict=True):
             warn_outside(design.statement, design.limits, own)
             check_flight(interpolated_flight(phase), largest_spread, None)

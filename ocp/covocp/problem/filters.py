@@ -56,7 +56,7 @@ def extended_filter(
     Continuous: the Kalman-Bucy filter with slopes at the estimate [Schmidt 2.5-3]. Discrete: the same model sampled
     (item 8); a reading is the mean of the measurement over a step, so its noise has the covariance density / step.
     What is measured at instants is read at the end of a step, with its variance, in the rows below the others; NaN
-    where nothing is.
+    where nothing is. What is read at time zero is an update before the first step.
 
     Args:
         problem: with noise and measurements as declared; parameters have their values.

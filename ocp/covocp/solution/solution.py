@@ -38,11 +38,16 @@ from covocp.solution.sample import Sample
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
 from covocp.statement.time_data import TimeData
+from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
     import matplotlib.figure
+
+# Share of its largest eigenvalue up to which the covariance of the estimate is known where it is a variable of the
+# program: after few readings it is singular, before them zero.
+ITERATED = 1e-9
 
 
 @methods_one_at_a_time
@@ -259,7 +264,13 @@ class Solution:
     @cached
     def semidefinite(self) -> bool:
         """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-        return all(is_semidefinite(matrix) for matrix in self._all_covariances())
+        estimates = [self.values.get(ESTIMATE), None if self.loop is None else self.loop.Xhat]
+        return all(
+            is_semidefinite(
+                matrix, 0.0 if self.mesh.eliminated or all(matrix is not own for own in estimates) else ITERATED
+            )
+            for matrix in self._all_covariances()
+        )
 
     def _all_covariances(self) -> list[Array]:
         loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]

@@ -13,6 +13,7 @@ from covocp.base.errors import OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
+from covocp.transcription.before_reading import hold, unfed
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -105,17 +106,22 @@ class NLP:
         _fix(xl[0], xu[0], x0)
         _fix(xl[-1], xu[-1], xf)
         lows, highs = [xl / self.scales.x], [xu / self.scales.x]
+        waiting = unfed(st, self.mesh, e0)
         if not self.mesh.eliminated:
             el, eu = np.tile(st.matrix_lower, (count, 1)), np.full((count, st.ne), np.inf)
+            if waiting is not None:
+                el[:, waiting.matrices] = -np.inf
             if st.tied is not None:
                 e0[list(st.tied.matrices)] = 0.0  # inserted: these variables stand for nothing
             _fix(el[0], eu[0], e0)
             _fix(el[-1], eu[-1], ef)
             lows.append(el / self.scales.e)
             highs.append(eu / self.scales.e)
-        nodes = self.mesh.control_nodes
-        for bounds, limit in ((lows, st.control_bounds[0]), (highs, st.control_bounds[1])):
-            bounds.append(np.tile(limit, (nodes, 1)) / self.scales.u)
+        ul, uu = (np.tile(limit, (self.mesh.control_nodes, 1)) for limit in st.control_bounds)
+        if waiting is not None:
+            hold(waiting, ul, uu)
+        for bounds, limits in ((lows, ul), (highs, uu)):
+            bounds.append(limits / self.scales.u)
             bounds[-1][self.mesh.idle] = 0.0  # these variables stand for nothing
         if st.duration.free:
             lows.append(np.array([st.duration.lower / self.scales.duration]))

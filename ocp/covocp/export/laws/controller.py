@@ -42,6 +42,8 @@ STATUSES = (
     "FAILED",
 )  # fmt: skip
 HELD = {"estimate": "estimate", "last": "time", "held": "control"}
+# Time or index of the last step before the first one, where something is read at time zero.
+NO_STEP = -1.0
 ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
@@ -54,6 +56,10 @@ ABOUT_INSTANTS = (
     "Rows of the measurement that are read at instants count with their variance in the step in which they are finite; "
     "NaN between the instants is no missing row.",
 )
+ABOUT_FIRST = (
+    "Something is read at time zero: give it to a first step at time zero, which corrects the estimate and the control "
+    "by it. Before that step the time of the last one is -1.",
+)
 
 
 def controller_law(design: Design, tables: History, tolerance: float) -> Law:
@@ -61,8 +67,9 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
     n, m, r = design.sizes
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
-    clock = tables.clock(time, last)
-    backwards = clock.time < last
+    begun = ca.fmax(last, 0.0)
+    clock = tables.clock(time, begun)
+    backwards = clock.time < begun
     valid = ca.if_else(backwards, 0.0, clock.within)
     found = stepped(design, tables, (y, last, held, measured), clock.time, valid)
     conditions = [
@@ -83,7 +90,7 @@ def controller_law(design: Design, tables: History, tolerance: float) -> Law:
         outputs=field_ports(design, fields),
         statuses=STATUSES,
         held=HELD,
-        start=first_fields(design, tables, fields),
+        start=first_fields(design, tables, fields, "time"),
         points=lambda random, count: points(design, tables, random, count),
         tolerance=tolerance,
     )
@@ -103,19 +110,23 @@ def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr,
     Args:
         design: the model.
         tables: the nominal.
-        given: estimate, time of the last step, control held since, measurement.
+        given: estimate, time of the last step (`NO_STEP`: there was none), control held since, measurement.
         time: within the range, no earlier than the last one [s].
         valid: where it is zero nothing is predicted, counted and fed back.
     """
     y, last, held, measured = given
     m = design.sizes[1]
-    h = ca.if_else(valid, time - last, 0.0)
-    middle = [last + c * h for c in GAUSS_NODES]
-    before = design.error(tables.at(last).e)
+    begun = ca.fmax(last, 0.0)
+    h = ca.if_else(valid, time - begun, 0.0)
+    middle = [begun + c * h for c in GAUSS_NODES]
+    before = design.error(tables.at(begun).e)
+    if design.reads_first:  # the tables have what is known after it
+        before = ca.if_else(last < 0.0, ca.DM(design.prior), before)
     predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
     now = tables.at(time)
     due = design.due(time, tables.margin * tables.duration)
-    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, measured, h, due), now, time)
+    taken = ca.if_else(valid, measured, 2.0 * LARGEST)  # what was read when nobody knows corrects nothing
+    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, taken, h, due), now, time)
     feedback = C @ corrected
     good = finite(corrected, feedback)
     nominal = now.u[:m]
@@ -133,7 +144,8 @@ def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr,
 
 def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:
     """What is said of a law, with what is read at instants where something is."""
-    return (*own, *(ABOUT_INSTANTS if design.always < design.sizes[2] else ()))
+    read = ABOUT_INSTANTS if design.always < design.sizes[2] else ()
+    return (*own, *read, *(ABOUT_FIRST if design.reads_first else ()))
 
 
 def finite(estimate: Expr, feedback: Expr) -> Any:
@@ -198,8 +210,11 @@ def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 
-def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Array:
-    """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits."""
+def first_fields(design: Design, tables: History, fields: dict[str, Any], last: str) -> Array:
+    """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits.
+
+    Where something is read at time zero the field `last`, that of the last step, says that there was none.
+    """
     m = design.sizes[1]
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
     x, u, e = (values[0] for values in tables.rows(np.zeros(1)))
@@ -208,6 +223,8 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any]) -> Arr
         "nominal_control": u[:m],
         "nominal_state": x,
     }
+    if design.reads_first:
+        zeros[last] = np.array([NO_STEP])
     zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
     return np.concatenate(list(zeros.values()))
 
@@ -309,6 +326,10 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
         rows[k, span(ports, "estimate")] = estimate
         rows[k, span(ports, "held")] = u[:m, k] - C[:, k * n : (k + 1) * n] @ estimate
         rows[k, span(ports, "measurement")] = seen + noise
+    if design.reads_first:
+        first = random.uniform(size=count) < 0.2
+        last[first] = NO_STEP
+        time[first & (random.uniform(size=count) < 0.5)] = 0.0
     rows[:, span(ports, "last")] = last[:, None]
     rows[:, span(ports, "time")] = time[:, None]
     for k, wrong in zip(range(count // 3, count), (np.nan, np.inf, -np.inf, 1e200, np.nan, 1e29), strict=False):

@@ -46,6 +46,7 @@ class Design:
         weights: (state, control, time) -> A (n, n), N (n, m), B (m, m): second derivatives of the expected running
             cost by deviations of state and control.
         final_weight: S(T) (n, n).
+        prior: E(0) (n, n), before what is read at time zero.
         best_gain: whether C is the best gain, not one that was constrained.
         limits: lower and upper limits of the control, (m,) each.
         units: largest standard deviation of each row of the estimate on the way, (n,); 1 where it is zero.
@@ -64,6 +65,7 @@ class Design:
     error: ca.Function
     weights: ca.Function
     final_weight: Array
+    prior: Array
     best_gain: bool
     limits: tuple[Array, Array]
     units: Array
@@ -76,6 +78,11 @@ class Design:
     def always(self) -> int:
         """Number of values that are always there, the first ones."""
         return sum(times is None for times in self.instants)
+
+    @property
+    def reads_first(self) -> bool:
+        """Whether something is read at time zero, where the covariance of the error jumps from the prior."""
+        return any(times is not None and times[0] == 0.0 for times in self.instants)
 
     def due(self, time: Expr, margin: float) -> Any:
         """Which values are there at a time, 1 or 0, (r,); an MX expression."""
@@ -130,7 +137,6 @@ def design_of(solution: Solution, limits: Given) -> Design:
     rest = (t, solution.duration, ca.DM(solution.parameters))
     F, G, A, B, N, Q = statement.loop.slopes(x, u, *rest)
     h, M, U = _measured(statement, n, x, u, *rest)
-    _check_instants(statement)
     slope = ca.jacobian(h, u)[:, :m]
     block = statement.estimation
     C, E = statement.loop.gain(x, u, e, *rest), unpack_symbolic(e[block.span], n)
@@ -144,6 +150,7 @@ def design_of(solution: Solution, limits: Given) -> Design:
         error=ca.Function("error", [e], [ca.densify(E)]),
         weights=ca.Function("weights", [x, u, t], [ca.densify(v) for v in (A, N, B)]),
         final_weight=np.asarray(statement.loop.terminal(solution.trajectory.x[-1], *rest[1:])[1].full()),
+        prior=unpack(solution.trajectory.e[0, block.span], n),
         best_gain=statement.loop.by_parts is not None,
         limits=control_limits(statement, m, limits),
         units=_units(solution, block),
@@ -178,24 +185,6 @@ def _instants(statement: Statement, duration: float) -> tuple[Array | None, ...]
         return tuple(always)
     pairs = zip(statement.samples.blocks, statement.samples.places, strict=True)
     return (*always, *(duration * np.array(places) for block, places in pairs for _ in range(block.size)))
-
-
-def _check_instants(statement: Statement) -> None:
-    """A controller starts after what is read at time zero.
-
-    Raises:
-        ExportError: something is read then.
-    """
-    if statement.samples is None:
-        return
-    for block, places in zip(statement.samples.blocks, statement.samples.places, strict=True):
-        if places[0] == 0.0:
-            raise ExportError(
-                f"'{block.name}' is read at time zero, where the controller starts with what is known before.",
-                expected="instants after time zero",
-                received="0 s among them",
-                remedy="put what is read at time zero into the initial variance, or let the first instant be later",
-            )
 
 
 def _units(solution: Solution, block: Block) -> Array:

@@ -19,6 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
@@ -120,6 +121,22 @@ def legs_of(
             )
         )
     return tuple(legs)
+
+
+def check_first_readings(solution: PhasesSolution, designs: list[Design]) -> None:
+    """Refuse what is read where a phase begins: a step there takes the reading of the phase before.
+
+    Raises:
+        ExportError: names the phase.
+    """
+    for phase, design in zip(solution, designs, strict=True):
+        if design.reads_first:
+            raise ExportError(
+                f"Something is read where the phase '{phase.name}' begins, which a controller through phases cannot take.",
+                expected="instants after the start of each phase",
+                received="one at its start",
+                remedy="read it at the end of the phase before, or put it into the initial variance of the first phase",
+            )
 
 
 def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tolerance: float) -> Law:

@@ -32,6 +32,7 @@ from covocp.base.matrices import Array, pack, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
 from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
+    NO_STEP,
     SCALAR_SIZE,
     STATUSES,
     about,
@@ -104,8 +105,9 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     period = samples.period
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
-    begun = ca.fmax(last, 0.0)  # a struct that was never set must not lead out of the tables
-    clock = tables.clock(time, begun * period)
+    least = NO_STEP if design.reads_first else 0.0
+    begun = ca.fmax(last, least)  # a struct that was never set must not lead out of the tables
+    clock = tables.clock(time, ca.fmax(begun, 0.0) * period)
     wanted = ca.fmin(ca.fmax(ca.floor(clock.time / period + 0.5), 0.0), float(samples.count))
     backwards = wanted < begun
     valid = ca.if_else(backwards, 0.0, clock.within)
@@ -130,7 +132,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     ]  # fmt: skip
     kept = ca.if_else(valid, index, begun)
     fields = {
-        "time": kept * period,
+        "time": ca.fmax(kept, 0.0) * period if design.reads_first else kept * period,
         "estimate": estimate,
         "control": ca.if_else(more, held, clipped(moved, design.limits)),
         "index": kept,
@@ -154,7 +156,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         outputs=field_ports(design, fields),
         statuses=STATUSES,
         held=HELD,
-        start=first_fields(design, tables, fields),
+        start=first_fields(design, tables, fields, "index"),
         points=lambda random, count: _points(design, tables, samples, random, count),
         tolerance=tolerance,
     )
@@ -204,17 +206,19 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     t = np.minimum(np.arange(count + 1) * period, tables.duration)
     x, u, e, h, M, H, U, C = _at_samples(design, tables, t)
     due = _due(design, t, period)
-    M, noise = M * due, _noise_of(design, U, due, period)
-    E0 = np.asarray(design.gain(x[0], u[0], e[0], 0.0)[1].full())
+    told = due.copy()
+    told[0, : design.always] = 0.0  # no time has passed of which a mean could tell
+    M, noise = M * told, _noise_of(design, U, told, period)
     held_on = tables.duration - t[-1] > WHOLE * period
     moves = Moves.of(design, tables, np.append(t, tables.duration) if held_on else t)
     if design.best_gain:
         C = sampled_gains(moves, design.final_weight, t.size)
     n, m, r = design.sizes
     Phi, Gamma, g = np.zeros((count + 1, n, n)), np.zeros((count + 1, n, m)), np.zeros((count + 1, n, 1))
-    Phi[0], P, gains, spreads = np.eye(n), E0, [np.zeros((n, r))], [np.eye(r)]
-    for k in range(1, count + 1):
-        Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
+    Phi[0], P, gains, spreads = np.eye(n), design.prior, [], []
+    for k in range(count + 1):
+        if k:
+            Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
         gain, spread = innovation_gain(P, M[k], noise[k], np.linalg.solve)
         P = joseph_form(P, gain, M[k], noise[k])
         gains.append(gain)
@@ -227,7 +231,7 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     if r > 1:
         parts["spread"] = _correlations(np.array(spreads))[:, :, None]
     with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges is told by its numbers
-        flown = flown_covariances(moves, period, E0, C, L, M, H, noise)
+        flown = flown_covariances(moves, period, design.prior, C, L, M, H, noise)
     return Samples(parts=parts, period=period, times=t, flown=flown)
 
 
@@ -300,5 +304,6 @@ def _points(design: Design, tables: History, samples: Samples, random: np.random
     before = random.choice([0, 1, 1, 1, 1, 2, 5, -1], count)
     time = np.nan_to_num(rows[:, -1], nan=0.0, posinf=tables.duration, neginf=0.0)
     index = np.floor(np.clip(time, 0.0, tables.duration) / samples.period + 0.5)
-    rows[:, place] = np.clip(index - before, 0, samples.count)[:, None]
+    least = NO_STEP if design.reads_first else 0
+    rows[:, place] = np.clip(index - before, least, samples.count)[:, None]
     return rows

@@ -62,8 +62,10 @@ def flown_covariances(
     """
     n, always = start.shape[0], moves.sizes[2]
     read = slice(n + always, None)
-    joint = np.zeros((2 * n, 2 * n))  # of (deviation, estimate)
-    joint[:n, :n] = start
+    first = filters[0]  # of what is read at time zero
+    told = first @ rows[0] @ start
+    known = told @ rows[0].T @ first.T + first @ variances[0] @ first.T
+    joint = np.block([[start, told.T], [told, known]])  # of (deviation, estimate)
     result = [start]
     for k in range(1, gains.shape[0]):
         by_state, by_control, noise = moves.measuring(k - 1)

@@ -1,0 +1,135 @@
+"""Conditions on the spread of the loop where everything is measured at instants, and the gain is a control.
+
+Before the first reading nothing is fed back, and after it the estimate scatters along one direction only.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.stats import beta, norm
+
+import covocp as co
+
+DURATION, LIMIT, SIGMAS = 6.0, 1.0, 3.0
+F, G = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+Q, R, P0 = np.diag([0.0, 0.02]), 4e-4, np.diag([0.01, 0.01])
+RUNS = 20_000
+
+
+@pytest.fixture(scope="module")
+def solution():
+    """A double integrator whose place is read each second, pulled towards a wall that it keeps clear of."""
+    ocp = co.Problem(DURATION, "wall")
+    x = ocp.state("x", initial=0.0, final=0.0, variance=P0[0, 0])
+    v = ocp.state("v", initial=0.0, final=0.0, variance=P0[1, 1])
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u, noise=Q[1, 1])
+    ocp.measurement("place", x, R, every=1.0)
+    X = ocp.closed_loop_covariance()
+    ocp.subject_to(x + SIGMAS * X.deviation(x), upper=LIMIT, name="wall")
+    ocp.minimize_expected(0.5 * u**2 + 0.1 * v**2 - x, terminal_weight={x: [1.0], v: [1.0]})
+    return co.solve(ocp, intervals=24, progress=False)
+
+
+def covariances(solution):
+    """E and Xhat at all nodes by scipy with Kalman updates, for the gains of the solution."""
+    t, E, Xhat = solution.t, P0.copy(), np.zeros((2, 2))
+    found = [(E, Xhat)]
+    gains = solution.loop.gain
+    for k, (begin, end) in enumerate(pairwise(t)):
+        if begin == end:
+            K = E[:, :1] / (E[0, 0] + R)
+            lost = K @ E[:1]
+            E, Xhat = E - lost, Xhat + lost
+        else:
+
+            def rate(time, y, k=k, begin=begin, end=end):
+                share = (time - begin) / (end - begin)
+                closed = F - G @ ((1 - share) * gains[k] + share * gains[k + 1])
+                E, Xhat = y.reshape(2, 2, 2)
+                return np.ravel([F @ E + E @ F.T + Q, closed @ Xhat + Xhat @ closed.T])
+
+            y = solve_ivp(rate, (begin, end), np.ravel([E, Xhat]), method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
+            E, Xhat = y.reshape(2, 2, 2)
+        found.append((E, Xhat))
+    return np.array(found).transpose(1, 0, 2, 3)
+
+
+def test_it_is_solved_and_nothing_is_fed_back_before_the_first_reading(solution):
+    """Limits Xhat >= 0, which have no inside before the second reading, took it 202 iterations."""
+    assert solution.converged
+    assert solution.stats["iterations"] < 100
+    until = np.count_nonzero(solution.t < 1.0) + 1
+    assert not solution["C"][:until].any()
+    assert np.abs(solution["Xhat"][:until]).max() < 1e-20
+    assert solution["C"][until:].any(axis=1).all()
+
+
+def test_covariances_are_those_of_scipy_with_the_gains(solution):
+    """But for the error of its integration steps, a quarter of an interval long."""
+    E, Xhat = covariances(solution)
+    loop = solution.loop
+    assert np.abs(loop.E - E).max() < 1e-9
+    assert np.abs(loop.Xhat - Xhat).max() < 1e-4 * np.abs(Xhat).max()
+    assert np.linalg.eigvalsh(Xhat).min() > -1e-9
+
+
+def test_the_wall_is_kept_by_three_deviations_and_reached(solution):
+    E, Xhat = covariances(solution)
+    x = solution["x"].ravel()
+    outermost = x + SIGMAS * np.sqrt(E[:, 0, 0] + Xhat[:, 0, 0])
+    assert outermost.max() == pytest.approx(LIMIT, abs=1e-4)
+    assert np.count_nonzero(outermost > LIMIT - 1e-4) >= 3
+
+
+def test_as_many_runs_cross_it_as_the_spread_says(solution):
+    """At the node where it is reached most closely; numpy's own runs of plant, filter and feedback."""
+    x, v = own_runs(solution)
+    E, Xhat = covariances(solution)
+    nominal, deviation = solution["x"].ravel(), np.sqrt(E[:, 0, 0] + Xhat[:, 0, 0])
+    k = int(np.argmax(nominal + SIGMAS * deviation))
+    crossed = int(np.count_nonzero(x[k] > LIMIT))
+    low, high = beta.ppf([5e-4, 1 - 5e-4], [crossed, crossed + 1], [RUNS - crossed + 1, RUNS - crossed])
+    assert low < norm.sf((LIMIT - nominal[k]) / deviation[k]) < high
+    assert low < norm.sf(SIGMAS) < high
+
+
+def own_runs(solution):
+    """Place and speed at all nodes, (nodes, runs)."""
+    random, t, gains = np.random.default_rng(5), solution.t, solution.loop.gain
+    d, y = np.linalg.cholesky(P0) @ random.standard_normal((2, RUNS)), np.zeros((2, RUNS))
+    E, found = P0.copy(), [d]
+    for k, (begin, end) in enumerate(pairwise(t)):
+        h = end - begin
+        if h == 0.0:
+            K = E[:, :1] / (E[0, 0] + R)
+            reading = d[:1] + np.sqrt(R) * random.standard_normal((1, RUNS))
+            y, E = y + K @ (reading - y[:1]), E - K @ E[:1]
+        else:
+
+            def rate(time, z, k=k, begin=begin, h=h):
+                C = gains[k] + (time - begin) / h * (gains[k + 1] - gains[k])
+                plant = np.block([[F, -G @ C], [np.zeros((2, 2)), F - G @ C]])
+                return (plant @ z.reshape(4, 4)).ravel()
+
+            move = solve_ivp(rate, (begin, end), np.eye(4).ravel(), method="DOP853", rtol=1e-9, atol=1e-12).y[:, -1]
+            ahead = np.array([[1.0, h], [0.0, 1.0]])
+            noise = Q[1, 1] * np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
+            joint = move.reshape(4, 4) @ np.vstack([d, y])
+            d, y = joint[:2] + np.linalg.cholesky(noise) @ random.standard_normal((2, RUNS)), joint[2:]
+            E = ahead @ E @ ahead.T + noise
+        found.append(d)
+    x, v = solution["x"].reshape(-1, 1), solution["v"].reshape(-1, 1)
+    return np.array([path[0] for path in found]) + x, np.array([path[1] for path in found]) + v
+
+
+def test_simulated_runs_are_as_predicted(solution):
+    sample = co.simulate(solution, 2000, 3, progress=False)
+    assert sample.verdict.holds
+    spread = np.sqrt(np.diagonal(solution.loop.X[-1]))
+    assert np.abs(sample.deviations.std(axis=0) / spread - 1).max() < 4 / np.sqrt(2 * sample.runs)
