@@ -295,3 +295,12 @@ def test_what_is_built_is_told():
     info = co.build_info()
     assert info["compiled"] is True
     assert str(info["library"]).endswith((".so", ".pyd"))
+
+
+def test_a_library_of_another_version_is_not_used(monkeypatch):
+    """Its functions would take their arguments for others."""
+    known = library.VERSION
+    monkeypatch.setattr(library, "VERSION", known + 1)
+    there, said = library._loaded.__wrapped__()
+    assert there is None
+    assert f"built from version {known} of its source, not {known + 1}" in said

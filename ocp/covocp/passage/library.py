@@ -11,6 +11,9 @@ from typing import Any
 
 MODULE = "covocp.passage._passage"
 
+# Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
+VERSION = 2
+
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE, _ADDRESS)),
@@ -30,11 +33,20 @@ def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
     try:
         library = ctypes.CDLL(found.origin)
         functions = {name: getattr(library, name) for name in _SIGNATURES}
+        version = _version(library)
     except (OSError, AttributeError) as error:
         return None, f"it cannot be loaded: {error}"
+    if version != VERSION:
+        return None, f"it was built from version {version} of its source, not {VERSION}: install covocp again"
     for name, (result, arguments) in _SIGNATURES.items():
         functions[name].restype, functions[name].argtypes = result, arguments
     return functions, found.origin
+
+
+def _version(library: ctypes.CDLL) -> int:
+    """Of the source that a library was built from; the first ones do not tell."""
+    function = getattr(library, "passage_version", None)
+    return 1 if function is None else int(function())
 
 
 def functions() -> dict[str, Callable[..., Any]] | None:

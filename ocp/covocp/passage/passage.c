@@ -86,6 +86,9 @@ typedef struct {
     double *turned; /* tangents of K, A, E+, of every reading, as `moved` */
 } Passage;
 
+/* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
+EXPORT int passage_version(void) { return 2; }
+
 EXPORT void passage_free(Passage *p) {
     if (!p) return;
     void *owned[] = {p->row,   p->col,    p->begin,  p->across, p->which, p->first, p->h1,  p->h2,

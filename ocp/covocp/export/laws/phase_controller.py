@@ -132,7 +132,7 @@ def check_first_readings(solution: PhasesSolution, designs: list[Design]) -> Non
     for phase, design in zip(solution, designs, strict=True):
         if design.reads_first:
             raise ExportError(
-                f"Something is read where the phase '{phase.name}' begins, which a controller through phases cannot take.",
+                f"Something is read where '{phase.name}' begins, which a controller through phases cannot take.",
                 expected="instants after the start of each phase",
                 received="one at its start",
                 remedy="read it at the end of the phase before, or put it into the initial variance of the first phase",
@@ -340,7 +340,7 @@ def _first(leg: Leg, room: _Room) -> Array:
     own = {"estimate": (n, 1), "control": (m, 1), "nominal_state": (leg.design.statement.nx, 1)}
     own |= {"nominal_control": (m, 1), "feedback_gain": (m, n), "filter_gain": (n, r)}
     shapes = {"time": ca.DM(0), **{name: ca.DM(*own[name]) for name in FIELDS}, "status": ca.DM(0)}
-    values = first_fields(leg.design, leg.tables, shapes)
+    values = first_fields(leg.design, leg.tables, shapes, "time")
     parts, offset = [np.zeros(2)], 1  # time and phase
     for name in FIELDS:
         rows, columns = own[name]
