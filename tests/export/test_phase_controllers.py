@@ -268,5 +268,5 @@ def test_what_does_not_apply_is_refused() -> None:
 def test_a_reading_where_a_phase_begins_is_refused_by_name(first: list[float], later: list[float]) -> None:
     parts = co.Phases([_lag(4.0, "A", first, last=False), _lag(6.0, "B", later, first=False)])
     solution = co.evaluate(parts, nominal=[{"u": 0.1}, {"u": 0.1}], intervals=20)
-    with pytest.raises(co.ExportError, match="Something is read where '[AB]' begins"):
+    with pytest.raises(co.ExportError, match=r"Something is read where '[AB]' begins"):
         export_c(solution, FOLDER / "begins")
