@@ -15,13 +15,12 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
-from covocp.extremal.costates import without_passage
-from covocp.extremal.extremal import Extremal, Guess, Outcome
+from covocp.extremal.extremal import Guess, Outcome
 from covocp.extremal.links import ChainOutcome
 from covocp.passage.library import build_info
 from covocp.solvers.plugins import merged
-from covocp.solvers.reached import Magnitudes, Round
-from covocp.solvers.runs import MAX_ITERATIONS, Runs
+from covocp.solvers.reached import Magnitudes
+from covocp.solvers.runs import MAX_ITERATIONS, Runs, extremals
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
 from covocp.transcription.domain import needs_exact_bounds
@@ -242,17 +241,7 @@ class ShootingSolver:
 
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
-        last, counts = self._runs.solve((parameters,), (guess,), progress)
-        (extremal,) = extremals(last, (parameters,))
-        values = last.where[1]
-        return Outcome(
-            extremal=without_passage(extremal),
-            cost_terms={"terminal": values["terminal"], "running": values["running"]},
-            converged=last.converged,
-            message=self._runs.message(last),
-            violations=last.nlp.violations(values["g"], (parameters,)),
-            stats=counts,
-        )
+        return self._runs.outcome(parameters, guess, progress)
 
 
 class ChainSolver:
@@ -310,13 +299,3 @@ def _builder(
         return alone(parts[0]) if chain is None else joined(chain, parts)
 
     return build
-
-
-def extremals(last: Round, parameters: Arrays) -> tuple[Extremal, ...]:
-    """Where a run ended, as data."""
-    nlp, point, trajectories = last.nlp, last.point, last.where[0]
-    multipliers = nlp.unpack_multipliers(point.lam_x, point.lam_g, trajectories, parameters)
-    return tuple(
-        Extremal(stated=part.statement, mesh=part.mesh, trajectory=trajectory, parameters=own, multipliers=found)
-        for (part, trajectory, own), found in zip(nlp.each(trajectories, parameters), multipliers, strict=True)
-    )

@@ -12,7 +12,8 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.extremal.extremal import ENDED, STOPPED, Guess
+from covocp.extremal.costates import without_passage
+from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
@@ -224,6 +225,20 @@ class Runs:
         known = self._ending(status)
         return {"wandered": ENDED} if known is not None and known.lost else {}
 
+    def outcome(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
+        """Where the runs on the program of one statement end, as data; arguments as of `solve`."""
+        last, counts = self.solve((parameters,), (guess,), progress)
+        (extremal,) = extremals(last, (parameters,))
+        values = last.where[1]
+        return Outcome(
+            extremal=without_passage(extremal),
+            cost_terms={"terminal": values["terminal"], "running": values["running"]},
+            converged=last.converged,
+            message=self.message(last),
+            violations=last.nlp.violations(values["g"], (parameters,)),
+            stats=counts,
+        )
+
     def message(self, last: Round) -> str:
         """How the run ended, a sentence."""
         status, known = last.point.status, self._ending(last.point.status)
@@ -329,3 +344,13 @@ def _best(rounds: list[Round]) -> Round:
     """The round with the least residuals; the last one where it did not move but for rounding."""
     least = min(rounds, key=lambda entry: entry.worst)
     return rounds[-1] if rounds[-1].worst <= UNMOVED * least.worst else least
+
+
+def extremals(last: Round, parameters: Arrays) -> tuple[Extremal, ...]:
+    """Where a run ended, as data."""
+    nlp, point, trajectories = last.nlp, last.point, last.where[0]
+    multipliers = nlp.unpack_multipliers(point.lam_x, point.lam_g, trajectories, parameters)
+    return tuple(
+        Extremal(stated=part.statement, mesh=part.mesh, trajectory=trajectory, parameters=own, multipliers=found)
+        for (part, trajectory, own), found in zip(nlp.each(trajectories, parameters), multipliers, strict=True)
+    )

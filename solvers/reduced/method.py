@@ -16,8 +16,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT
-from covocp.extremal.costates import without_passage
-from covocp.extremal.extremal import Extremal, Guess, Outcome
+from covocp.extremal.extremal import Guess, Outcome
 from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes
 from covocp.solvers.reduced.engine import Engine
@@ -140,7 +139,7 @@ class ReducedSolver:
 
     def __init__(self, statement: Statement, mesh: Mesh, tolerance: float, most: int) -> None:
         """Keep the settings; see `prepare`."""
-        self._statement, self._mesh = statement, mesh
+        self._mesh = mesh
         self._runs = ReducedRuns(statement, mesh, tolerance, most)
 
     @property
@@ -150,21 +149,4 @@ class ReducedSolver:
 
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
-        last, counts = self._runs.solve((parameters,), (guess,), progress)
-        nlp, point, (trajectories, values) = last.nlp, last.point, last.where
-        (multipliers,) = nlp.unpack_multipliers(point.lam_x, point.lam_g, trajectories, (parameters,))
-        extremal = Extremal(
-            stated=self._statement,
-            mesh=self._mesh,
-            trajectory=trajectories[0],
-            parameters=parameters,
-            multipliers=multipliers,
-        )
-        return Outcome(
-            extremal=without_passage(extremal),
-            cost_terms={"terminal": values["terminal"], "running": values["running"]},
-            converged=last.converged,
-            message=self._runs.message(last),
-            violations=nlp.violations(values["g"], (parameters,)),
-            stats=counts,
-        )
+        return self._runs.outcome(parameters, guess, progress)

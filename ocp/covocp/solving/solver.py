@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -52,9 +52,6 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Mesh, Options, with_substeps
-
-if TYPE_CHECKING:
-    pass
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
