@@ -4,7 +4,7 @@
 A lag whose rate b is unknown is brought from 2 m to 0, and b is to be known well. One plan for 8 s rests on what was
 known at the start. Here every 0.25 s a plan is made for the next 4 s, from the estimate and the covariance of then:
 `Solver.solve(initial=, means=, covariance=)` takes them as parameters of a problem that is built once, and starts from
-what is left of the plan before (`guess=`, `elapsed=`).
+what is left of the plan before (`guess=`, `elapsed=`). Most is learnt while x is large: at rest little tells of b.
 """
 
 import matplotlib.pyplot as plt

@@ -190,9 +190,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         name="step",
         kind="controller",
         about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
-        notes=tuple(
-            f"{leg.name}: {note}" for leg in legs for note in limits_notes(leg.design.statement, leg.design.limits)
-        ),
+        notes=_notes(legs),
         constants=_constants(legs),
         core=core,
         inputs=_inputs(legs, room),
@@ -321,8 +319,9 @@ def _limits(legs: tuple[Leg, ...]) -> tuple[str, ...]:
 
 def _notes(legs: tuple[Leg, ...]) -> tuple[str, ...]:
     """What the package says of the bounds of each phase."""
-    found = [(leg.name, limits_notes(leg.design.statement, leg.design.limits)) for leg in legs]
-    return tuple(f"in {name}: {note}" for name, notes in found for note in notes)
+    return tuple(
+        f"{leg.name}: {note}" for leg in legs for note in limits_notes(leg.design.statement, leg.design.limits)
+    )
 
 
 def _constants(legs: tuple[Leg, ...]) -> dict[str, float]:
