@@ -71,6 +71,10 @@ from covocp.statement.statement import Statement, error_names, error_size
 
 # Names of what the derived problem adds to the user's symbols.
 FEEDBACK, GAIN = "S", "C"
+# Where all is read at instants the estimate scatters along few directions, and a gain across them would cost nothing:
+# many are equally good, and a solver finds none. So what is fed back is priced as if the estimate scattered by so much
+# of its error's covariance more: 1e-8 is too little for a solver, 1e-6 changes costs by some 1e-8 of them.
+UNREAD = 1e-5
 
 
 def expected_cost(
@@ -188,6 +192,8 @@ def derive(problem: Declarations, *, part: bool = False, later: Expr = None) -> 
         C = expansion.gain
         derived = with_value(derived, E, X, C)
         fed = _trace(expansion.B @ C, X @ C.T) - 2 * _trace(expansion.N, C @ X)
+        if not (jacobian.shape[0] or gain.constant):
+            fed = fed + UNREAD * _trace(expansion.B @ C, E @ C.T)
         running = expansion.running + (_trace(expansion.A, E + X) + fed) / 2
         terminal = expansion.terminal + _trace(expansion.end, E + X) / 2
         if expansion.spread is not None:

@@ -8,12 +8,15 @@ it off. Its dynamics keep Xhat semidefinite by themselves: the limit is left out
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
-from covocp.transcription.mesh import Mesh
+
+if TYPE_CHECKING:
+    from covocp.transcription.mesh import Mesh
 
 # The gain among the controls of a loop whose gain is free, and the covariance of the estimate.
 GAIN, ESTIMATE = "C", "Xhat"
@@ -32,6 +35,12 @@ class Unfed:
     matrices: slice
 
 
+def waits(statement: Statement) -> bool:
+    """Whether the gain of a feedback is a control, and all that is measured is read at instants."""
+    gain = any(block.name == GAIN for block in statement.controls)
+    return gain and statement.loop is not None and not statement.behind and statement.measurement is None
+
+
 def unfed(statement: Statement, mesh: Mesh, start: Array) -> Unfed | None:
     """The stretch before the first reading where a gain that is a control waits for it; None where there is none.
 
@@ -40,11 +49,11 @@ def unfed(statement: Statement, mesh: Mesh, start: Array) -> Unfed | None:
         mesh: with its instants.
         start: half-vectors at time zero, (ne,); NaN where they are free.
     """
-    if statement.loop is None or statement.behind or statement.measurement is not None or not mesh.readings.any():
+    if not waits(statement) or not mesh.readings.any():
         return None
-    gain = next((block.span for block in statement.controls if block.name == GAIN), None)
-    estimate = next((block.span for block in statement.matrices if block.name == ESTIMATE), None)
-    if gain is None or estimate is None or not (start[estimate] == 0.0).all():
+    gain = next(block.span for block in statement.controls if block.name == GAIN)
+    estimate = next(block.span for block in statement.matrices if block.name == ESTIMATE)
+    if not (start[estimate] == 0.0).all():
         return None
     first = int(np.flatnonzero(mesh.readings.any(axis=0))[0])
     return Unfed(nodes=first + 1, controls=gain, matrices=estimate)

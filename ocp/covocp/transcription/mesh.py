@@ -16,6 +16,7 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.statement.statement import Statement
+from covocp.transcription.before_reading import waits
 from covocp.transcription.steps import StepKind
 
 ELIMINATED_SEGMENTS = 10
@@ -433,7 +434,9 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     Eliminated is faster for every covariance of benchmarks/measurements/formulations.py, down to a single variance.
     Integrals along the nominal have second derivatives that cost nothing as variables, and their sum over the whole
     path is ill-conditioned without them: an information matrix of 21 entries takes 45 iterations and 1.5 s, eliminated
-    900 and 10 s (`models.designed_excitation`).
+    900 and 10 s (`models.designed_excitation`). A gain that acts only along what was read has curvature of very
+    different size in its directions: an ellipse at the end takes 7 iterations with exact second derivatives, with an
+    approximate Hessian 655.
     """
     if not statement.matrices:
         return True
@@ -456,7 +459,7 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         )
     if options.covariances != "auto":
         return options.covariances == "eliminated"
-    if statement.integrals:
+    if statement.integrals or waits(statement):
         return False
     few = statement.loop is not None or statement.ne <= PATH_ENTRIES
     return obstacle is None and not (statement.path.uses_matrices and few)

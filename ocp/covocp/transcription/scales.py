@@ -18,15 +18,15 @@ RESPONSE_STEP = 1e-3
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
 STRETCH = 10.0
-# Limits below this are the units of their rows.
-SMALL = 1e-3
+# Limits below the first and above the second are the units of their rows.
+SMALL, LARGE = 1e-3, 1e3
 
 
 def limit_units(lower: Array, upper: Array) -> Array:
-    """Units of rows between limits: the larger one where it is small, else 1."""
+    """Units of rows between limits: the larger one where it is small or large, else 1."""
     limits = np.abs(np.stack([lower, upper]))
     largest = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
-    return np.where((largest > 0) & (largest < SMALL), largest, 1.0)
+    return np.where((largest > 0) & ((largest < SMALL) | (largest > LARGE)), largest, 1.0)
 
 
 def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:
