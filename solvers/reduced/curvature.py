@@ -19,6 +19,8 @@ from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Least curvature of a control, as a share of the largest one, below which the cost is asked along its own slope.
 FLAT = 1e-3
+# Least curvature of a combination of the controls of a node, as a share of the largest one there.
+RANK = 1e-4
 # Relative displacement by which slopes are differentiated.
 DISPLACEMENT = 1e-4
 # Powell's share of the curvature that is kept where a step shows less (Nocedal and Wright, 18.3).
@@ -90,7 +92,7 @@ def _running(nlp: NLP, trajectory: Trajectory, parameters: Array) -> tuple[Array
     blocks = q[:, None, None] * units[:, :, None] * blocks * units[:, None, :]
     for k in range(nodes):
         least, vectors = np.linalg.eigh(blocks[k])
-        blocks[k] = (vectors * np.maximum(least, 0.0)) @ vectors.T
+        blocks[k] = (vectors * np.maximum(least, RANK * max(float(least[-1]), 0.0))) @ vectors.T
     return blocks, q[:, None] * units**2
 
 

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import beta, norm
+from spreads import ellipse_read, ellipse_read_by_duality
 
 import covocp as co
+from covocp.solving.coarse_start import coarser
+from covocp.transcription.mesh import Options
 
 DURATION, LIMIT, SIGMAS = 6.0, 1.0, 3.0
 F, G = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
@@ -22,19 +25,20 @@ RUNS = 20_000
 
 
 @cache
-def solved(**options):
+def solved(unit=1.0, method="ipopt", **options):
     """A double integrator whose place is read each second, pulled towards a wall that it keeps clear of."""
     ocp = co.Problem(DURATION, "wall")
-    x = ocp.state("x", initial=0.0, final=0.0, variance=P0[0, 0])
-    v = ocp.state("v", initial=0.0, final=0.0, variance=P0[1, 1])
+    x = ocp.state("x", initial=0.0, final=0.0, variance=P0[0, 0] * unit**2)
+    v = ocp.state("v", initial=0.0, final=0.0, variance=P0[1, 1] * unit**2)
     u = ocp.control("u")
     ocp.dynamics(x, v)
-    ocp.dynamics(v, u, noise=Q[1, 1])
-    ocp.measurement("place", x, R, every=1.0)
+    ocp.dynamics(v, u, noise=Q[1, 1] * unit**2)
+    ocp.measurement("place", x, R * unit**2, every=1.0)
     X = ocp.closed_loop_covariance()
-    ocp.subject_to(x + SIGMAS * X.deviation(x), upper=LIMIT, name="wall")
-    ocp.minimize_expected(0.5 * u**2 + 0.1 * v**2 - x, terminal_weight={x: [1.0], v: [1.0]})
-    return co.solve(ocp, intervals=24, progress=False, **options)
+    ocp.subject_to(x + SIGMAS * X.deviation(x), upper=LIMIT * unit, name="wall")
+    weight = [1.0 / unit**2]
+    ocp.minimize_expected((0.5 * u**2 + 0.1 * v**2 - unit * x) / unit**2, terminal_weight={x: weight, v: weight})
+    return co.solve(ocp, method, intervals=24, progress=False, **options)
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +145,65 @@ def test_simulated_runs_are_as_predicted(solution):
     assert sample.verdict.holds
     spread = np.sqrt(np.diagonal(solution.loop.X[-1]))
     assert np.abs(sample.deviations.std(axis=0) / spread - 1).max() < 4 / np.sqrt(2 * sample.runs)
+
+
+def test_other_units_change_nothing(solution):
+    """A wall 10,000 m away, not scaled by what it is, made residuals of 7,000 and kept Ipopt from any solution."""
+    far = solved(1e4)
+    assert far.cost == pytest.approx(solution.cost, rel=1e-8)
+    np.testing.assert_allclose(far["C"], solution["C"], atol=1e-4 * np.abs(solution["C"]).max())
+
+
+def test_the_reduced_method_finds_the_same(solution):
+    """Its first Hessian is that of the running cost, which is singular across what was read (LinAlgError)."""
+    other = solved(method="reduced")
+    assert other.method == "reduced"
+    assert other.cost == pytest.approx(solution.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(("limits", "unit"), [((0.05, 0.05), 1.0), ((0.04, 0.3), 1e3)])
+def test_an_ellipse_at_the_end_costs_what_duality_says(limits, unit):
+    """What gains between the nodes and the price of those that hardly matter leave: 1.5e-5 and 3e-5."""
+    solution = co.solve(ellipse_read(limits, unit=unit), intervals=40, progress=False)
+    least = ellipse_read_by_duality(limits)
+    assert 0.0 < solution.cost / least - 1.0 < 5e-5
+    assert solution.stats["iterations"] < 50
+    reached = np.diagonal(solution.loop.X[-1]) / unit**2 / np.array(limits)
+    assert reached.max() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_an_unstable_plant_keeps_clear_of_a_wall():
+    """E and Xhat of one state between the readings, where they grow by exp(2 h) and what the gain makes of it."""
+    ocp = co.Problem(3.0, "unstable")
+    x = ocp.state("x", initial=1.0, final=0.0, variance=0.05)
+    u = ocp.control("u")
+    ocp.dynamics(x, x + u, noise=0.01)
+    ocp.measurement("position", x, noise=0.01, every=0.25)
+    X = ocp.closed_loop_covariance()
+    ocp.minimize_expected(running=0.5 * u**2 + x**2, terminal_weight={x: 1.0})
+    ocp.subject_to(x - 3 * X.deviation(x), lower=-0.35, name="wall")
+    solution = co.solve(ocp, intervals=36, progress=False)
+    E, Xhat, gains = 0.05, 0.0, solution.loop.gain.ravel()
+    for k, h in enumerate(np.diff(solution.t)):
+        if h == 0.0:
+            lost = E**2 / (E + 0.01)
+            E, Xhat = E - lost, Xhat + lost
+        else:
+            E = np.exp(2 * h) * E + 0.01 * np.expm1(2 * h) / 2
+            Xhat *= np.exp(2 * h * (1 - (gains[k] + gains[k + 1]) / 2))
+        assert solution.loop.E[k + 1].item() == pytest.approx(E, rel=1e-5)
+        assert solution.loop.Xhat[k + 1].item() == pytest.approx(Xhat, rel=1e-4, abs=1e-12)
+    outermost = solution["x"].ravel() - 3 * np.sqrt(solution.loop.X.ravel())
+    assert outermost.min() == pytest.approx(-0.35, abs=1e-6)
+
+
+def test_a_fine_mesh_starts_from_a_coarse_one_with_its_instants(solution):
+    statement, mesh = solution.statement, solution.mesh
+    assert coarser(statement, Options(intervals=24), mesh) is None
+    fewer = coarser(statement, Options(intervals=96), mesh.divided(4))
+    assert fewer is not None
+    nodes = fewer.nodes()
+    assert 18 <= np.unique(nodes).size - 1 <= 36
+    for instant in statement.instants:
+        assert np.sum(np.abs(nodes - instant) < 1e-12) == 2
+    assert np.isin(np.round(np.unique(nodes), 12), np.round(mesh.divided(4).nodes, 12)).all()

@@ -38,6 +38,7 @@ from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
+from covocp.solving.coarse_start import from_coarser
 from covocp.solving.decisions import bent_data, far_away
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
@@ -255,11 +256,7 @@ class Solver:
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
-                    guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
-                    outcome, start = from_starts(self._prepared, values, guesses, reporter)
-                    if first is not None and guess is not first and not outcome.converged and not reporter.stop:
-                        guesses = make_guesses(self._solved, self._prepared.mesh, values, first)
-                        outcome, start = from_starts(self._prepared, values, guesses, reporter)
+                    outcome, start = self._from_start(values, guess, first, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
@@ -291,6 +288,27 @@ class Solver:
             if best.converged:
                 return best
         return None
+
+    def _from_start(
+        self, values: Array, guess: Given, best: Solution | None, reporter: Progress
+    ) -> tuple[Outcome, Guess]:
+        """Solve from a guess; one that was made from the best gain, or None, perhaps by a coarser mesh."""
+        guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
+        first = None
+        if guess is None or best is not None:
+            run = partial(self._prepare, self._solved, **self._own)
+            first = from_coarser(self._solved, self._options, self._prepared.mesh, run, (values, guess, reporter))
+        starts = [guesses]
+        if first is not None:
+            coarse = Solution.of(first, self.method, assess=False)
+            starts.insert(0, make_guesses(self._solved, self._prepared.mesh, values, coarse))
+        if best is not None and guess is not best:
+            starts.append(make_guesses(self._solved, self._prepared.mesh, values, best))
+        for several in starts:
+            outcome, start = from_starts(self._prepared, values, several, reporter)
+            if outcome.converged or reporter.stop:
+                break
+        return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
 
     def _closed(self, outcome: Outcome) -> Outcome:
         """Filter and feedback around the nominal of the deterministic cost."""
