@@ -179,10 +179,16 @@ def test_the_wheel_imports_from_its_own_files(distributions, tmp_path):
     assert all(line.startswith(str(tmp_path)) for line in found.stdout.splitlines()[:3])
 
 
-def test_the_wheel_of_the_checkout_is_that_from_the_sdist(distributions, tmp_path):
-    project = copy_of_the_project(tmp_path / "project")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(project)]
+@pytest.fixture(scope="module")
+def wheel_of_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("checkout")
+    project = copy_of_the_project(folder / "project")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(project)]
     built = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300)
     assert built.returncode == 0, built.stdout + built.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    assert names_in_wheel(wheel) == names_in_wheel(distributions[1])
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def test_the_wheel_of_the_checkout_is_that_from_the_sdist(distributions, wheel_of_the_checkout):
+    assert names_in_wheel(wheel_of_the_checkout) == names_in_wheel(distributions[1])

@@ -81,6 +81,36 @@ def test_a_choice_may_overwrite_what_it_chooses_from():
     assert found[0, :4].tolist() == [2.0, 0.0, 0.0, 3.0]
 
 
+def test_a_condition_may_be_any_number():
+    a, b, c = ca.SX.sym("a"), ca.SX.sym("b"), ca.SX.sym("c")
+    both = ca.vertcat(ca.if_else(a, b, c), ca.if_else(ca.logic_not(a), b, -c), ca.if_else(c, b, 1 / a))
+    function = ca.Function("f", [a, b, c], [both])
+    values = np.array([[0.0, -0.0, 1.0, -2.5, 1e-310, np.inf], [1.0, np.nan, 3.0, np.inf, 5.0, 6.0]])
+    c_values = np.array([[2.0]])
+    (found,) = columns(function, [values[:1], values[1:], c_values[0]], shared=(2,))
+    expected = np.hstack([np.asarray(function(x, y, 2.0).full()) for x, y in values.T])
+    np.testing.assert_array_equal(found[:, : values.shape[1]], expected)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_choices_among_choices(seed):
+    """Random graphs in which conditions are chosen, negated and used again, and registers are written over."""
+    rng = np.random.default_rng(seed)
+    symbols = [ca.SX.sym(f"s{k}") for k in range(4)]
+    known = list(symbols)
+    for _ in range(40):
+        a, b, c = (known[k] for k in rng.integers(0, len(known), 3))
+        condition = [a < b, ca.logic_not(a < c), ca.logic_and(a > 0, b <= c), a - b][rng.integers(0, 4)]
+        known.append(
+            [ca.if_else(condition, a, c), condition * b - a, ca.if_else(condition, b * c, -b)][rng.integers(0, 3)]
+        )
+    function = ca.Function("f", symbols, [ca.vertcat(*known[-20:])])
+    values = [rng.normal(size=(1, 70)).round(1) for _ in symbols]
+    (found,) = columns(function, values)
+    expected = np.asarray(function(*values).full())
+    np.testing.assert_allclose(found[:, :70], expected, rtol=1e-13, atol=1e-14)
+
+
 def test_shared_inputs_are_the_same_for_all_columns():
     x, c = ca.SX.sym("x", 2), ca.SX.sym("c", 3)
     function = ca.Function("f", [x, c], [ca.vertcat(c[0] * x[0] + c[1] * c[2], x[1]), c[2] * c[2] + 0 * x[0]])

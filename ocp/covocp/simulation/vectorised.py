@@ -15,21 +15,37 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 
+Mask = npt.NDArray[np.int64]
+# An operation and its arguments, the result last.
+Call = tuple[Callable[..., Any], tuple[Given, ...]]
+
+# 1.0 has this bit and those below it that are shifted out, 0.0 has none.
+HIGH_BIT, ONE = np.array(61), np.array(1.0)
 # Widths are multiples of this, so that no column falls into the remainder of a vector loop.
 LANES = 64
 
 
-def _choose(condition: Array, value: Array, out: Array) -> None:
-    """CasADi's if_else_zero: the value where the condition holds, else zero (also where the value is NaN)."""
-    absent = condition == 0  # first: the result may be written over either operand
-    np.copyto(out, value)
-    np.copyto(out, 0.0, where=absent)
+def _mask(condition: Array, mask: Mask) -> None:
+    """All bits where a condition holds, none elsewhere: what a value is cut with, also one that is NaN."""
+    np.not_equal(condition, 0.0, mask, casting="unsafe")
+    np.negative(mask, mask)
+
+
+def _mask_of_truth(bits: Mask, mask: Mask) -> None:
+    """The same for a condition that is 1.0 or 0.0, from its bits, without a conversion: four times as fast."""
+    np.right_shift(bits, HIGH_BIT, mask)
+    np.negative(mask, mask)
+
+
+def _not_of_truth(value: Array, out: Array) -> None:
+    np.subtract(ONE, value, out)
 
 
 def _twice(value: Array, out: Array) -> None:
@@ -88,8 +104,11 @@ OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_AND: np.logical_and,
     ca.OP_OR: np.logical_or,
     ca.OP_NOT: _not,
-    ca.OP_IF_ELSE_ZERO: _choose,
 }
+
+
+# What gives 1.0 or 0.0.
+LOGICAL = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,10 +143,32 @@ def vectorise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Col
         Buffers and what evaluates them; every call overwrites the outputs.
     """
     if function.is_a("SXFunction"):
-        known = {*OPERATIONS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+        known = {*OPERATIONS, ca.OP_IF_ELSE_ZERO, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
         if all(function.instruction_id(k) in known for k in range(function.n_instructions())):
             return _elementwise(function, width, shared)
     return _mapped(function, width, shared)
+
+
+class _Conditions:
+    """What is known of the registers while a program is made: which hold 1.0 or 0.0, and masks of some."""
+
+    def __init__(self) -> None:
+        self.logical: set[int] = set()
+        self._masks: dict[int, Mask] = {}
+
+    def written(self, register: int, code: int) -> None:
+        """A register has another value now, by such an operation."""
+        self._masks.pop(register, None)
+        (self.logical.add if code in LOGICAL else self.logical.discard)(register)
+
+    def chosen(self, register: int, condition: Array, value: Array, out: Array) -> list[Call]:
+        """CasADi's if_else_zero: the value where a register is not zero, else zero (also where the value is NaN)."""
+        calls: list[Call] = []
+        if register not in self._masks:
+            mask = self._masks[register] = np.zeros(condition.shape, dtype=np.int64)
+            true = register in self.logical
+            calls.append((_mask_of_truth, (condition.view(np.int64), mask)) if true else (_mask, (condition, mask)))
+        return [*calls, (np.bitwise_and, (value.view(np.int64), self._masks[register], out.view(np.int64)))]
 
 
 def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> Columns:
@@ -141,7 +182,7 @@ def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> 
     # What depends on shared inputs and constants only is one number, kept without a dimension.
     narrow = [np.zeros(()) for _ in range(function.sz_w())]
     bound: list[Array] = list(wide)
-    program: list[tuple[Callable[..., Any], tuple[Array, ...]]] = []
+    known, program = _Conditions(), list[Call]()
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         source, target = function.instruction_input(k), function.instruction_output(k)
@@ -154,8 +195,16 @@ def _elementwise(function: ca.Function, width: int, shared: tuple[int, ...]) -> 
         else:
             operands = [bound[i] for i in source]
             out = (wide if any(value.ndim for value in operands) else narrow)[target[0]]
-            program.append((OPERATIONS[code], (*operands, out)))
+            if code == ca.OP_IF_ELSE_ZERO:
+                condition, value = operands
+                program += known.chosen(source[0], condition, value, out)
+            elif code == ca.OP_NOT and source[0] in known.logical:
+                program.append((_not_of_truth, (*operands, out)))
+            else:
+                program.append((OPERATIONS[code], (*operands, out)))
             bound[target[0]] = out
+        if code != ca.OP_OUTPUT:
+            known.written(target[0], code)
 
     def evaluate() -> None:
         for operation, arguments in program:
