@@ -12,6 +12,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.base.residuals import VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
 from covocp.solvers.endings import Ending
@@ -35,8 +36,9 @@ from covocp.transcription.program import Arrays, Program, Trajectories
 MAX_ITERATIONS = 1000
 # Runs from one start, each in the scales of the point that the last one reached.
 LARGEST_ROUNDS = 6
-# A run that ends after so few iterations had met its tolerance where it began: the next one has this share of it.
-AT_ONCE, STRICTER = 1, 0.03
+# A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
+# of what is too much, between these.
+ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
 # Residuals that are larger by less than this factor are those of the same point.
 UNMOVED = 1.0 + 1e-9
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
@@ -73,7 +75,7 @@ class Runs:
         self._plugin, self._settings, self._limited, self._limit = plugin, settings, limited, limit
         # Ipopt tells its functions and its iterations, and takes multipliers to start from
         self._open = plugin == "ipopt"
-        self._strictness = 1.0
+        self._strictness = self._share = 1.0  # of the tolerance, and of the unit of the cost
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: Monitor | None = None
         self._nlp: Program | None = None
@@ -90,6 +92,7 @@ class Runs:
             The last run, and its counts.
         """
         begin = time.perf_counter()
+        self._share = 1.0
         if self._strictness < 1.0:
             self._strictness, self._warm = 1.0, None
         trajectories = tuple(guess.trajectory for guess in guesses)
@@ -130,10 +133,9 @@ class Runs:
             best = _best(done)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
-            at_once = 0 <= done[-1].point.iterations <= AT_ONCE
-            if self._open and done[-1] is best and at_once:  # new scales alone do not move it
-                self._tighten()
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
+            if self._open and done[-1] is best and nlp is best.nlp:  # the same run would end where it begins
+                self._tighten(best.residuals)
             solver = self._warm_solver() if start.lam_x is not None else self._cold
             assert solver is not None
             point = self._run(nlp, solver, start, parameters, progress)
@@ -142,10 +144,19 @@ class Runs:
             done.append(done.pop(done.index(_best(done))))
         return done
 
-    def _tighten(self) -> None:
-        """Ask more of Ipopt in the warm starts that follow."""
-        self._strictness *= STRICTER
-        self._warm = None
+    def _tighten(self, found: Residuals) -> None:
+        """Ask more of the runs that follow.
+
+        Of the slope by larger numbers, not by a smaller tolerance: differences of the cost that are much smaller than
+        one are taken for nothing by Ipopt's filter, which then goes by the roundoff of the constraints.
+        """
+        slope = max(found.slope, found.complementarity) / self._limit
+        missed = max(found.infeasibility / self._limit, found.violation / VIOLATION)
+        if slope > 1.0:
+            self._share *= share_for(slope)
+        if missed > 1.0:
+            self._strictness *= share_for(missed)
+            self._warm = None
 
     def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
@@ -320,7 +331,7 @@ class Runs:
         if not self._open:  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
-            return self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)
+            return self._share * self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)
 
     def _curvature_along(self, gradient: ca.Function, w0: Array, parameters: Arrays) -> float:
         """|g' H g| / g' g of the cost, g its slopes, and what stands for it where it is no number."""
@@ -338,6 +349,11 @@ class Runs:
         second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+def share_for(times: float) -> float:
+    """How much less is asked for, as a share, where there is so many times too much."""
+    return float(np.clip(ENOUGH / times, STRICTEST, STRICTER))
 
 
 def _best(rounds: list[Round]) -> Round:

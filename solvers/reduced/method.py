@@ -15,13 +15,13 @@ from covocp.base.arguments import checked, positive, whole
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.base.residuals import LIMIT
+from covocp.base.residuals import LIMIT, Residuals
 from covocp.extremal.extremal import Guess, Outcome
 from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes
 from covocp.solvers.reduced.engine import Engine
 from covocp.solvers.reduced.statuses import Status
-from covocp.solvers.runs import Runs
+from covocp.solvers.runs import Runs, share_for
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.program import Arrays, Program, Trajectories, alone
@@ -124,6 +124,10 @@ class ReducedRuns(Runs):
         assert isinstance(self._cold, Engine)
         self._cold.tolerance = self._tolerance * self._strictness
         return self._cold
+
+    def _tighten(self, found: Residuals) -> None:
+        """All by the tolerance: nothing here is compared with one."""
+        self._strictness *= share_for(found.worst / LIMIT)
 
     def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
         """The Hessian has a magnitude of its own."""

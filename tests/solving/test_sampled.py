@@ -227,3 +227,19 @@ def test_gradient_solutions_can_be_saved(tmp_path):
     solution = co.solve(random_system(3).problem(), intervals=16, method="gradient", progress=False)
     solution.save(tmp_path / "s.json")
     assert co.load(tmp_path / "s.json").cost == solution.cost
+
+
+def test_a_run_goes_on_where_differences_of_the_cost_are_small():
+    """Ipopt's filter took differences of 1e-10 for nothing: the run ended at a slope of 2e-5 and was no solution."""
+    ocp = co.Problem(10.0)
+    x = ocp.state("x", 2, initial=np.zeros(2), variance=np.full(2, 0.1))
+    v = ocp.state("v", 2, initial=np.zeros(2), variance=np.full(2, 0.1))
+    k = ocp.unknown("k", mean=1.0, variance=0.05)
+    u = ocp.control("u", guess=0.1)
+    ocp.dynamics(x, v)
+    springs = ca.DM([[2.0, -1.0], [-1.0, 2.0]])
+    ocp.dynamics(v, -k * (springs @ x) - 0.1 * v + ca.DM([1.0, 0.0]) * u, noise=np.full(2, 0.01))
+    ocp.measurement("place", x[1], 0.2, every=1.0)
+    ocp.minimize_expected((x[1] - 1) ** 2 + 0.1 * u**2, x[1] ** 2)
+    by_ipopt, by_itself = (co.solve(ocp, method, intervals=120, progress=False) for method in ("ipopt", "reduced"))
+    assert by_ipopt.cost == pytest.approx(by_itself.cost, rel=1e-8)
