@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import product
 
 import casadi as ca
@@ -20,18 +21,21 @@ ZONES = [((1, 0, 0), (0.3, 1, -0.5), 20.0, "exclusion"), ((0, 1, 0), (-1, 0, 0),
 START = so3.principal(2, np.radians(60.0)) @ so3.principal(3, np.radians(20.0))
 
 
-def reduction(case, **options):
+@cache
+def reduction_function(rows, kappa, penalty, largest_step, curvature):
+    """The reduction of so many rows as a function of estimate, covariance, A and beta."""
+    symbols = ca.SX.sym("b", 3), ca.SX.sym("P", 3, 3), ca.SX.sym("A", rows, 3), ca.SX.sym("beta", rows)
+    b, P, A, beta = symbols
+    options = {"kappa": kappa, "penalty": penalty, "largest_step": largest_step, "curvature": curvature}
+    return ca.Function("reduction", list(symbols), list(reduced(b, P, Rows(A, beta), **options)))
+
+
+def reduction(case, *, curvature=False):
     """b, lambda, mu, zeta of a case."""
-    found = reduced(
-        ca.SX(ca.DM(case.estimate)),
-        ca.SX(ca.DM(case.covariance)),
-        Rows(ca.DM(case.A), ca.DM(case.beta)),
-        kappa=case.kappa,
-        penalty=case.penalty,
-        largest_step=case.largest_step,
-        **options,
-    )
-    return [np.ravel(ca.evalf(part).full()) for part in found]
+    numbers = (float(value) for value in (case.kappa, case.penalty, case.largest_step))
+    function = reduction_function(len(case.beta), *numbers, curvature)
+    found = function.call([ca.DM(v) for v in (case.estimate, case.covariance, case.A, case.beta)])
+    return [np.ravel(part.full()) for part in found]
 
 
 def cost(case, b, zeta):
