@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import casadi as ca
 import numpy as np
 
@@ -14,6 +16,24 @@ from covocp.transcription.program import Program
 PATIENCE = 40
 PROGRESS = 0.9
 NEAR = 1e-3
+# Rows that are violated by no more than this, in the units of the program, count as met.
+MET = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Iterate:
+    """Variables and multipliers (of the scaled cost) of one iteration, its cost and its largest violation."""
+
+    w: Array
+    lam_x: Array
+    lam_g: Array
+    cost: float
+    violation: float
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Less is better: what violates no row by its cost, anything else by what it violates."""
+        return (0.0, self.cost) if self.violation <= MET else (self.violation, self.cost)
 
 
 class Monitor(ca.Callback):
@@ -27,6 +47,7 @@ class Monitor(ca.Callback):
         self._bounds: dict[str, Array] = {}
         self._impatient, self.wandered = False, False
         self._least, self._since = np.inf, 0
+        self.best: Iterate | None = None  # of a run that a limit may end
         self.construct("progress", {})
 
     def attach(self, progress: Progress, scale: float, bounds: dict[str, Array], impatient: bool = False) -> None:
@@ -34,6 +55,7 @@ class Monitor(ca.Callback):
         self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
         self._impatient, self.wandered = impatient, False
         self._least, self._since = np.inf, 0
+        self.best = None
 
     def get_n_in(self) -> int:
         """One for each output of the solver."""
@@ -61,15 +83,20 @@ class Monitor(ca.Callback):
 
     def eval_buffer(self, arg: tuple[memoryview, ...], res: tuple[memoryview, ...]) -> int:
         """One iteration."""
-        cost, g = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in ("f", "g"))
-        np.frombuffer(res[0], dtype=float)[:] = self.seen(float(cost[0]), g)
+        names = ("f", "g", "x", "lam_x", "lam_g")
+        cost, g, *point = (np.frombuffer(arg[ca.nlpsol_out().index(name)], dtype=float) for name in names)
+        np.frombuffer(res[0], dtype=float)[:] = self.seen(float(cost[0]), g, *point)
         return 0
 
-    def seen(self, cost: float, g: Array) -> bool:
-        """Report an iteration with such a cost and such rows; whether to stop."""
+    def seen(self, cost: float, g: Array, w: Array, lam_x: Array, lam_g: Array) -> bool:
+        """Report an iteration with such a cost and such rows, variables and multipliers; whether to stop."""
         if self._progress is None:
             return False
         violation = float(np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0))
+        if self._progress.limited:
+            one = Iterate(w=w, lam_x=lam_x, lam_g=lam_g, cost=cost, violation=violation)
+            if self.best is None or one.rank < self.best.rank:
+                self.best = replace(one, w=w.copy(), lam_x=lam_x.copy(), lam_g=lam_g.copy())
         self._progress.update(self._iteration, cost * self._scale, violation)
         self._iteration += 1
         return self._progress.stop or self._wanders(violation)

@@ -207,6 +207,9 @@ class Runs:
         else:
             stats = solver.stats()
         w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
+        if not stats["success"] and progress.spent and self._monitor is not None and self._monitor.best is not None:
+            best = self._monitor.best
+            w, lam_x, lam_g = best.w, best.lam_x, best.lam_g
         success, status = bool(stats["success"]), str(stats.get("return_status", ""))
         evaluable = True
         try:

@@ -109,7 +109,7 @@ class Sequence:
         first: Callable[[Place], Curvature],
         tolerance: float,
         most: int,
-        watch: Callable[[float, Array], bool],
+        watch: Callable[[float, Array, Array, Array, Array], bool],
     ) -> None:
         """Keep what the run needs.
 
@@ -120,7 +120,7 @@ class Sequence:
             first: a first Hessian at a point.
             tolerance: relative, of the root of what can still be gained.
             most: iterations.
-            watch: told cost and rows of each iteration; whether to stop.
+            watch: told cost, rows, variables and multipliers of each iteration; whether to stop.
         """
         self._of, self._layout, self._bounds = functions, layout, bounds
         self._first, self._tolerance, self._most, self._watch = first, tolerance, most, watch
@@ -148,7 +148,7 @@ class Sequence:
             lam_x, lam_g = self._multipliers(place, rows, step)
             active = (step.active_rows, step.active_bounds)
             memory = Memory(curvature=curvature, active_rows=active[0], active_bounds=active[1])
-            stop = self._watch(place.cost, place.g)
+            stop = self._watch(place.cost, place.g, place.w, lam_x, lam_g)
             status = self._met(place, step, curvature, left)
             if status is None and stop:
                 status = Status.STOPPED

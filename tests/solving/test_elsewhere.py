@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -113,6 +116,27 @@ def test_limits_return_what_is_there_and_say_so(method):
     short = solver.solve(time_limit=1e-6)
     assert "stopped at the limit of 1e-06 s" in short.message
     assert solver.solve(iteration_limit=500, time_limit=100.0).cost == pytest.approx(whole.cost, rel=1e-8)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+def test_a_larger_limit_returns_nothing_worse(method):
+    """An iteration may be worse than one before; what is returned is not: it violates less, or costs less."""
+    ocp = co.Problem(2.0)
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u", lower=-3.0, upper=3.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - ca.sin(3 * x) - 0.3 * v**3)
+    ocp.minimize(running=u**2 + ca.sin(4 * x) ** 2)
+    ocp.subject_to(v, upper=0.8, name="speed")
+    solver = co.Solver(ocp, method, intervals=20)
+    most, ranks = solver.solve(progress=False).stats["iterations"], []
+    for limit in range(most + 1):
+        found = solver.solve(progress=False, iteration_limit=limit)
+        violated = max(found.violations.values(), default=0.0)
+        ranks.append((violated, found.cost if violated == 0.0 else 0.0))
+    assert len(ranks) > 8
+    assert all(later <= earlier or np.allclose(later, earlier, rtol=1e-9) for earlier, later in pairwise(ranks))
+    assert ranks[-1][0] == 0.0
 
 
 @pytest.mark.parametrize(

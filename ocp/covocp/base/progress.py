@@ -68,6 +68,11 @@ class Progress:
         return ""
 
     @property
+    def limited(self) -> bool:
+        """Whether a limit may end the iterations."""
+        return self._seconds is not None or self._iterations is not None
+
+    @property
     def left(self) -> tuple[float | None, int | None]:
         """Seconds, above zero, and iterations that are left to the limits; None: no limit."""
         past = time.perf_counter() - self._begin

@@ -217,7 +217,8 @@ class Solver:
             iteration_limit: of all runs together.
 
         Returns:
-            The solution; where a limit was reached the last iterate, with what it violates, without raising.
+            The solution; where a limit was reached the best iterate, with what it violates, without raising:
+            the cheapest that meets the conditions, else that which violates least (by "gradient" the last one).
 
         Raises:
             ProblemError: a name or a guess is wrong.
