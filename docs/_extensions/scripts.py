@@ -55,6 +55,7 @@ GALLERY = (
             "worth",
             "constrained_gain",
             "covariance_steering",
+            "corridor",
             "incorrect_statistics",
             "monte_carlo",
             "own_law",

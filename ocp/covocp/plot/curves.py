@@ -34,6 +34,7 @@ class Curve:
         t: times [s], or whatever else it is drawn over.
         y: values, the shape of t.
         deviation: standard deviation, the shape of t; None: no band.
+        needed: distances below and above, (2, K), that a probability asks limits to have; None: none does.
         order: number of its solution.
         entry: number of its entry in a panel of several.
         steps: whether the value holds until the next time.
@@ -43,6 +44,7 @@ class Curve:
     t: Array
     y: Array
     deviation: Array | None = None
+    needed: Array | None = None
     order: int = 0
     entry: int = 0
     steps: bool = False

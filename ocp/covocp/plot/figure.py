@@ -116,7 +116,8 @@ def plot_solutions(
             "rms" (root mean squares), "C" and "K" (gains of feedback and filter), "X", "Xhat" and "Z" (covariances of
             the closed loop); ("rms", h), ("C", h), ("K", h) those of one symbol, or of an expression ("rms"). A dict
             gives labels: {"load factor [g]": expression}. None: states, controls and unknowns with bands, then
-            covariances and other matrices (of large ones the diagonal), of a closed loop root mean squares instead.
+            covariances and other matrices (of large ones the diagonal), of a closed loop root mean squares instead;
+            and what `chance` states along the path, each with a band that must be inside its limits (also by its name).
         labels: of the solutions, for the legend; by default what tells them apart.
         costates: whether to draw the costates of the states and matrices drawn.
         gains: whether to add the gains of feedback and filter.
@@ -319,6 +320,9 @@ def _legend(
     widths += "s" if sigmas and sigmas[-1] != 1 else ""
     if sigmas and any(curve.deviation is not None for curve in curves):
         handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths}"))
+    if any(curve.needed is not None for curve in curves):
+        label = "must be inside the limits" if handles else "band: must be inside the limits"
+        handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=label))
     if sigmas and any(panel.ellipses for panel in panels):
         handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=f"ellipses of {widths}"))
     if any(panel.path for panel in panels):
@@ -358,6 +362,10 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
             axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0, step=step)
             for edge in (low, high):
                 axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7, drawstyle=style)
+        if curve.needed is not None:
+            low, high = curve.y - curve.needed[0], curve.y + curve.needed[1]
+            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0)
+            axes.plot(curve.t, np.column_stack([low, high]), color=line["color"], linewidth=0.5, alpha=0.7)
         axes.plot(curve.t, curve.y, drawstyle=style, **line)
     for ellipse in panel.ellipses:
         for width in sigmas:
@@ -389,7 +397,10 @@ def _targets(axes: Axes, panel: Panel) -> None:
 
 def _near_bounds(panel: Panel) -> list[float]:
     """The bounds that the curves come near."""
-    finite = np.concatenate([np.zeros(0), *(curve.y[np.isfinite(curve.y)] for curve in panel.curves)])
+    reached = [curve.y for curve in panel.curves]
+    for curve in panel.curves:
+        reached += [] if curve.needed is None else [curve.y - curve.needed[0], curve.y + curve.needed[1]]
+    finite = np.concatenate([np.zeros(0), *(values[np.isfinite(values)] for values in reached)])
     if not finite.size:
         return []
     low, high = float(finite.min()), float(finite.max())

@@ -14,6 +14,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
 from covocp.blocks.rotation_chart import rotation_vectors
+from covocp.plot.chance_panels import CHANCE, chance_names, chance_panels
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
@@ -74,7 +75,8 @@ def choose_panels(
     for solution in solutions:
         for block in solution.blocks:
             blocks[block.name] = _together(blocks.get(block.name, block), block)
-    keys = [key for name in names for key in _keys(solutions, name)] or _usual(drawn, blocks)
+    keys = [key for name in names for key in _keys(solutions, name)]
+    keys = keys or [*_usual(drawn, blocks), *(Quantity(word=CHANCE, of=name) for name in chance_names(solutions))]
     if gains:
         keys += [Quantity(word=w) for w in (GAIN, FILTER) if any(knows(solution, w) for solution in solutions)]
     panels: list[Panel] = []
@@ -153,6 +155,8 @@ def _of_key(drawn: list[Drawn], key: Given, blocks: Mapping[str, Block], units: 
         return [replace(panel, label=f"{key.label}: {panel.label}") for panel in panels]
     if isinstance(key, Together):
         return [_shared([panel for part in key.keys for panel in _of_key(drawn, part, blocks, units)])]
+    if isinstance(key, Quantity) and key.word == CHANCE:
+        return chance_panels(drawn, key.of)
     if isinstance(key, Quantity):
         return _quantity([d for d in drawn if knows(d.solution, key.word)], key, blocks, units)
     if isinstance(key, tuple):
@@ -232,6 +236,8 @@ def _resolved(solutions: list[Solution], key: Given) -> Any:
     error: ProblemError | None = None
     if isinstance(key, str) and (course := _course(solutions, key)) is not None:
         return course
+    if isinstance(key, str) and key in chance_names(solutions) and not _declared(solutions, key):
+        return Quantity(word=CHANCE, of=key)
     if isinstance(key, str) and key in WORDS and not _declared(solutions, key):
         if any(knows(solution, key) for solution in solutions):
             return Quantity(word=key)

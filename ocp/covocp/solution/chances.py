@@ -80,6 +80,20 @@ def reached(solution: Solution) -> tuple[Reached, ...]:
     return tuple(result)
 
 
+def widths(solution: Solution, limits: ChanceLimits) -> tuple[Array, Array]:
+    """Values along the nominal, and the distance from the nearer limit that the probability asks for, (K, k) each.
+
+    The distance is less than what is there where the condition holds with room to spare, and more where it does not
+    hold. Joint rows have their own share of the risk.
+    """
+    values, deviations = _scatter(solution, limits)
+    needed = np.empty_like(values)
+    for i, (lower, upper) in enumerate(zip(limits.lower, limits.upper, strict=True)):
+        nearest = np.minimum(upper - values[:, i], values[:, i] - lower)
+        needed[:, i] = nearest - margin(values[:, i], deviations[:, i], float(lower), float(upper), limits.each)
+    return values, needed
+
+
 def _scatter(solution: Solution, limits: ChanceLimits) -> tuple[Array, Array]:
     """Values along the nominal and their standard deviations at the nodes, (K, k) each."""
     columns = solution.extremal.columns()
