@@ -1,5 +1,5 @@
 """A corridor kept with a probability
-===================================
+==================================
 
 Limits that the actual system keeps with 99 per cent, by its position between two walls and by its actuator.
 """
