@@ -22,6 +22,15 @@ def bounced() -> Any:
     return co.solve(bounce(), intervals=[20, 20], **QUIET)
 
 
+def test_what_is_in_phases(bounced):
+    """`in` had compared solutions with names and found none."""
+    sample = co.simulate(bounced, 4, 1, progress=False)
+    for whole in (bounced, sample):
+        assert all(phase.name in whole for phase in whole)
+        assert whole[0] in whole
+        assert "third" not in whole
+
+
 @pytest.mark.parametrize("filter", ["perturbation", "extended"])
 @pytest.mark.parametrize("at", [None, [0.5, 1.0]])
 def test_a_cut_changes_no_run(filter: Any, at: list[float] | None) -> None:

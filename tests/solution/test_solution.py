@@ -93,6 +93,15 @@ def test_unknown_names(data):
         data.solution.at(0.5)["q"]
 
 
+def test_what_is_in_it(data):
+    """`in` had looked for nodes by number."""
+    assert "y" in data.solution
+    assert "y[1]" in data.solution
+    assert data.y[0] + data.b[1] in data.solution
+    assert "q" not in data.solution
+    assert ca.MX.sym("q") not in data.solution
+
+
 def test_covariances(data):
     s = data.solution
     E = s["E"]

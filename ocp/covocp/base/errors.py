@@ -209,3 +209,12 @@ def no_option(what: str, name: str, value: object, known: Iterable[str], beside:
         received=f"{name}={value!r}"[:100],
         remedy=spelling(name, [*names, *beside], "correct or remove it"),
     )
+
+
+def has_key(owner: Any, key: object) -> bool:
+    """Whether what refuses unknown keys by a `ProblemError` knows one."""
+    try:
+        owner[key]
+    except ProblemError:
+        return False
+    return True

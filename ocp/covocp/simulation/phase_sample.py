@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, spelling
+from covocp.base.errors import ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
@@ -73,6 +73,10 @@ class PhasesMonteCarlo:
     def __iter__(self) -> Iterator[MonteCarlo]:
         """The phases in order."""
         return iter(self.phases)
+
+    def __contains__(self, key: object) -> bool:
+        """Whether there is such a phase: a name, a number, or what is returned for one."""
+        return any(phase is key for phase in self.phases) or has_key(self, key)
 
     def __getitem__(self, key: Given) -> MonteCarlo:
         """What the runs did in a phase, by its name or its number (from 0; -1 is the last).

@@ -11,7 +11,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, one_of
 from covocp.base.checks import as_number
-from covocp.base.errors import ProblemError, spelling
+from covocp.base.errors import ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
@@ -143,6 +143,10 @@ class PhasesSolution:
     def __iter__(self) -> Iterator[Solution]:
         """The phases in order."""
         return iter(self.phases)
+
+    def __contains__(self, key: object) -> bool:
+        """Whether there is such a phase: a name, a number, or what is returned for one."""
+        return any(phase is key for phase in self.phases) or has_key(self, key)
 
     def __getitem__(self, key: Given) -> Solution:
         """The solution of a phase, by its name or its number (from 0; -1 is the last).

@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.base.arguments import checked, one_of
 from covocp.base.checks import as_number, is_whole
-from covocp.base.errors import ProblemError
+from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, is_semidefinite, read_only, smallest_eigenvalue, unpack, unpack_costate
@@ -314,6 +314,10 @@ class Solution:
                 values = values / np.linalg.norm(values, axis=1, keepdims=True)
             result[b.name] = values[:, 0] if b.size == 1 else values
         return result | {entry.name: entry.at(t) for entry in self._data}
+
+    def __contains__(self, key: object) -> bool:
+        """Whether there is such a symbol, name, entry or expression."""
+        return has_key(self, key)
 
     def __getitem__(self, key: Given) -> Array:
         """Values at the nodes of a symbol, a name, an entry of one, or an expression; decisions, integrals: numbers.
