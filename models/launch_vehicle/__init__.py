@@ -37,6 +37,8 @@ ORBIT = (24361.14, 0.7308, 28.5, 269.8, 130.5)
 
 # Directions where each phase begins and ends: up, then more and more to the east.
 UP, OVER, EAST, DOWN = [0.8, 0.4, 0.45], [0.4, 0.9, 0.2], [0.2, 0.97, 0.1], [-0.6, 0.7, -0.35]
+# Where the first stage is burnt out, about [km], and how fast [km/s]; points of the way from there to the perigee.
+BURN_OUT, SLOWEST, POINTS = (5700.0, 600.0, 3090.0), 5.0, 21
 GUESSES = {
     "six boosters": [UP, OVER],
     "three boosters": [OVER, OVER],
@@ -124,12 +126,23 @@ def _stage(name: str, duration: float | co.Free, engines: list[Engine], mass: fl
 
 
 def _way_to_perigee() -> tuple[Array, Array]:
-    """Where the second stage may begin and end: positions [km] and speeds [km/s], a row each."""
+    """How the second stage may fly: positions [km] and velocities [km/s], a row each, evenly in time.
+
+    Along an arc, at a speed that rises evenly: a straight line between both ends lies 150 km below the ground, where
+    the air is e^20 times as dense.
+    """
     momentum, eccentricity = target()
-    ahead = eccentricity / ORBIT[1]
-    distance = ORBIT[0] * (1.0 - ORBIT[1])
-    speed = np.cross(momentum, ahead) / distance
-    return np.array([[5700.0, 600.0, 3090.0], distance * ahead]), np.array([[0.2, 5.0, 0.1], speed])
+    begin, ahead = np.array(BURN_OUT), eccentricity / ORBIT[1]
+    last = ORBIT[0] * (1.0 - ORBIT[1])  # distance of the perigee
+    fastest = float(np.linalg.norm(momentum)) / last
+    first = float(np.linalg.norm(begin))
+    east = np.cross(np.cross(begin, ahead), begin)
+    up, east = begin / first, east / np.linalg.norm(east)
+    s = np.linspace(0.0, 1.0, POINTS)[:, None]
+    done = (SLOWEST * s + 0.5 * (fastest - SLOWEST) * s**2) / (0.5 * (SLOWEST + fastest))
+    angle = done * np.arccos(float(up @ ahead))
+    positions = (first + done * (last - first)) * (np.cos(angle) * up + np.sin(angle) * east)
+    return positions, (SLOWEST + (fastest - SLOWEST) * s) * (np.cos(angle) * east - np.sin(angle) * up)
 
 
 def target() -> tuple[Array, Array]:

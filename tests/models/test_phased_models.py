@@ -29,6 +29,16 @@ def ascent() -> co.PhasesSolution:
 def test_the_launch_vehicle_brings_the_published_mass_into_orbit(ascent: co.PhasesSolution) -> None:
     assert 1e3 * ascent["second stage"]["m"][-1] == pytest.approx(7529.712412, rel=3e-7)
     assert ascent.duration == pytest.approx(924.139, abs=1e-3)
+    assert "tried" not in ascent.stats  # from its first start
+
+
+def test_the_second_stage_is_guessed_to_fly_above_the_ground() -> None:
+    positions, speeds = launch_vehicle._way_to_perigee()
+    heights = np.linalg.norm(positions, axis=1) - launch_vehicle.RADIUS
+    assert heights.min() > 100.0
+    momentum, eccentricity = launch_vehicle.target()
+    np.testing.assert_allclose(positions[-1], 24361.14 * (1 - 0.7308) * eccentricity / 0.7308, rtol=1e-9)
+    assert np.linalg.norm(speeds[-1]) == pytest.approx(np.linalg.norm(momentum) / np.linalg.norm(positions[-1]))
 
 
 def test_the_launch_vehicle_ends_in_its_orbit(ascent: co.PhasesSolution) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -84,6 +85,30 @@ def test_the_error_that_was_measured_bounds_the_true_one(problem, optimum, optio
     assert true <= measured[-1] <= asked < min(measured[:-1], default=1.0)
     assert solution.stats["mesh_intervals"][-1] == solution.mesh.intervals
     assert len(measured) == len(solution.stats["mesh_intervals"])
+
+
+def test_a_direction_of_unit_length_turns_within_the_intervals():
+    """An equation along the path holds at the nodes: at the middles too it would keep the direction as it is."""
+
+    def crossing(*, by_angle):
+        ocp = co.Problem(co.Free(3.0, 0.5, 10.0), name="crossing")
+        x, y = ocp.state("x", initial=0.0, final=2.0), ocp.state("y", initial=0.0, final=1.0)
+        u = ocp.control("u", 1 if by_angle else 2, guess=0.5 if by_angle else [0.8, 0.6])
+        along, across = (ca.cos(u), ca.sin(u)) if by_angle else (u[0], u[1])
+        ocp.dynamics(x, along - 0.5 * y**2)
+        ocp.dynamics(y, across)
+        if not by_angle:
+            ocp.subject_to(ca.sumsqr(u), equals=1.0, name="direction")
+        ocp.minimize(terminal=ocp.duration)
+        return ocp
+
+    reference = co.solve(crossing(by_angle=True), intervals=60, progress=False)
+    for options in ({"refine": 3e-5}, {"intervals": 50, "points": 2}):
+        solution = co.solve(crossing(by_angle=False), progress=False, **options)
+        assert abs(solution.cost / reference.cost - 1.0) <= 3e-5
+    ocp = crossing(by_angle=True)
+    with pytest.raises(co.ProblemError, match="is an equation, which cannot hold between the nodes"):
+        ocp.subject_to(ocp.states[0].symbol, equals=1.0, between="auto")
 
 
 def test_it_takes_a_third_of_the_nodes_of_equal_intervals():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from covocp.transcription.remeshing import divided, jumps_of, remeshed
+from covocp.transcription.remeshing import demand, divided, jumps_of, remeshed
 
 
 def test_intervals_of_a_smooth_density_have_equal_errors():
@@ -68,3 +68,22 @@ def test_nodes_that_must_stay_stay():
         assert np.isin(kept, result).all()
         assert (np.diff(result) > 0).all()
         assert (result[0], result[-1]) == (0.0, 1.0)
+
+
+def test_meshes_that_share_what_is_allowed_have_intervals_of_one_error():
+    """Two meshes with errors of different size: shares by what each demands give all intervals the same error."""
+    sizes = (1e4, 3.0)
+    meshes = [np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 21)]
+    for _ in range(5):
+        given = []
+        for size, nodes in zip(sizes, meshes, strict=True):
+            ends = np.sort(np.append(nodes, 0.5 * (nodes[1:] + nodes[:-1])))
+            given.append((nodes, ends, 16 * size * np.diff(ends) ** 5, 5))
+        demands = [demand(*own, []) for own in given]
+        meshes = [
+            remeshed(*own, 1e-6 * part / sum(demands), [], np.zeros(0))
+            for own, part in zip(given, demands, strict=True)
+        ]
+    each = [size * np.diff(nodes) ** 5 for size, nodes in zip(sizes, meshes, strict=True)]
+    assert sum(own.sum() for own in each) == pytest.approx(1e-6, rel=0.3)
+    assert max(own.max() for own in each) < 3 * min(own.min() for own in each)

@@ -24,7 +24,8 @@ from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
 from covocp.solving.comparison import COMPARED
 from covocp.solving.methods import method_options
-from covocp.solving.solver import INTERVALS, STARTS
+from covocp.solving.random_starts import STARTS
+from covocp.solving.solver import INTERVALS
 from covocp.transcription.mesh import Options
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130

@@ -72,8 +72,13 @@ class Held:
         return tuple(result)
 
 
-def held_by(extremal: Extremal) -> Held:
-    """What holds an extremal."""
+def held_by(extremal: Extremal, points: int = 1) -> Held:
+    """What holds an extremal.
+
+    Args:
+        extremal: at whose nodes all limits are imposed.
+        points: number of its intervals between the nodes of the mesh that was solved, where equations hold.
+    """
     st, m, t = extremal.statement, extremal.multipliers, extremal.trajectory
     _, xf, _, ef = st.boundary_values(extremal.parameters)
     states = m.states.copy()
@@ -96,6 +101,10 @@ def held_by(extremal: Extremal) -> Held:
         multipliers = np.atleast_2d(getattr(m, kind))
         sides, strict = _sides(values, conditions.lower, conditions.upper, multipliers)
         equal = np.broadcast_to(conditions.lower == conditions.upper, sides.shape)
+        if kind == "path" and points > 1:
+            between = np.arange(sides.shape[0]) % points != 0
+            sides = np.where(between[:, None] & equal, 0.0, sides)
+            equal = equal & ~between[:, None]
         groups.append((kind, np.flatnonzero((sides != 0) | equal), np.where(equal, 0.0, sides), strict | equal))
     entries, side, strictly = [], [], []
     for kind, positions, sides_of, strict_of in groups:

@@ -196,7 +196,7 @@ class _Reduced:
 
         st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
         fine = refined(extremal)
-        held = held_by(fine)
+        held = held_by(fine, extremal.mesh.points)
         fine = held.bare(fine)
         own, touching = held.controls[:: mesh.points], held.touching[:: mesh.points]  # those between follow from them
         free = own == 0
@@ -337,7 +337,7 @@ def _free_start(extremal: Extremal) -> tuple[int, ...]:
 def held_jacobian(extremal: Extremal) -> Array:
     """Jacobian by the control values, node by node, of what is held by conditions, inequalities and state bounds."""
     fine = refined(extremal)
-    held = held_by(fine)
+    held = held_by(fine, extremal.mesh.points)
     fine = held.bare(fine)
     _, jacobian = second_order(fine.statement, fine.mesh, held.strictly)
     everything = np.ones(extremal.trajectory.u.shape, dtype=bool)

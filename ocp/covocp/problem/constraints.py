@@ -55,6 +55,13 @@ def with_constraint(
             received=f"between={between!r}, at={at!r}",
             remedy="correct between=, or leave it out",
         )
+    if between is not None and bool((np.asarray(low) == np.asarray(high)).any()):
+        raise ProblemError(
+            f"'{label}' is an equation, which cannot hold between the nodes.",
+            expected="an inequality with between='auto'",
+            received="the same value above and below",
+            remedy="leave between= out; or state what it fixes as rates or controls: an angle for a direction",
+        )
     own_place: dict[str, Any] = {"at": place, "where": caller(), "between": between is not None}
     if place == "inside" and instant is not None:
         own_place |= {"instant": instant[0], "late": instant[1], "relative": relative}

@@ -17,7 +17,7 @@ from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
-from covocp.solution.report import sections
+from covocp.solution.report import refinement, sections, starts_told
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
@@ -232,9 +232,12 @@ class PhasesSolution:
         ]
         columns = ["costates where phases meet: p against k_x + J' p+ (relative)", ""]
         links: Section = [Table(columns=columns, rows=met)] if met else []
+        effort = refinement(self.stats)
+        if "starts" in self.stats:
+            effort.append(Sentence(starts_told(self.stats["starts"])))
         violated = [[name, number(value, 4)] for name, value in self.violations.items()]
         limits: Section = [Table(columns=["violated constraint", "by"], rows=violated)] if violated else []
-        return [head, limits, table, links, *(section for phase in self.phases for section in sections(phase))]
+        return [head, limits, table, effort, links, *(section for phase in self.phases for section in sections(phase))]
 
     def __repr__(self) -> str:
         """One line."""

@@ -443,9 +443,12 @@ def _effort(solution: Solution) -> Section:
         effort.append(f"{seconds:.3g} s")
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
-    if "starts" in stats:
-        effort.append(_starts(np.asarray(stats["starts"], dtype=float)))
-    lines = [Sentence("mesh: " + ", ".join(words)), *_refinement(stats)]
+    if "starts" in stats and solution.within is None:
+        effort.append(starts_told(stats["starts"]))
+    lines = [
+        Sentence("mesh: " + ", ".join(words)),
+        *refinement(stats, "" if solution.within is None else " of all phases"),
+    ]
     return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
@@ -464,23 +467,25 @@ def _intervals(mesh: Mesh, stats: Mapping[str, Any]) -> str:
     return words + (f", a node for conditions at {_counted(held, 'instant')}" if held else "")
 
 
-def _refinement(stats: Mapping[str, Any]) -> list[Sentence]:
-    """The meshes that were tried, with their errors; nothing where the mesh was given."""
+def refinement(stats: Mapping[str, Any], of: str = "") -> list[Sentence]:
+    """The meshes that were tried, with the errors of the cost `of` what; nothing where the mesh was given."""
     meshes, errors, asked = (stats.get(name) for name in ("mesh_intervals", "mesh_errors", "refine"))
     if not meshes or not errors or asked is None:
         return []
-    tried = ", ".join(f"{count} ({error:.1e})" for count, error in zip(meshes, errors, strict=False))
+    words = [" + ".join(str(count) for count in np.atleast_1d(entry)) for entry in meshes]
+    tried = ", ".join(f"{count} ({error:.1e})" for count, error in zip(words, errors, strict=False))
     reached = "" if min(errors) <= asked else ", NOT REACHED"
     return [
         Sentence(
-            f"refined: {len(meshes)} mesh{'' if len(meshes) == 1 else 'es'}, intervals (error of the cost, "
+            f"refined: {len(meshes)} mesh{'' if len(meshes) == 1 else 'es'}, intervals (error of the cost{of}, "
             f"relative, measured on a finer one): {tried}; asked for {asked:.3g}{reached}"
         )
     ]
 
 
-def _starts(costs: Given) -> str:
-    """What the starts of a multistart found."""
+def starts_told(starts: Given) -> str:
+    """What the starts of a multistart found, by their costs."""
+    costs = np.asarray(starts, dtype=float)
     found = np.sort(costs[np.isfinite(costs)])
     text = f"best of {costs.size} starts"
     if found.size > 1:

@@ -13,8 +13,11 @@ from covocp.base.errors import Interrupted, OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.links import ChainOutcome
+from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 
+AnyOutcome = Outcome | ChainOutcome
 # Starts that are tried where a method loses its way.
 TRIED = 4
 
@@ -55,21 +58,23 @@ def from_starts(
     return outcome, guess
 
 
-def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: int, reporter: Progress) -> Outcome:
+def best_of(prepared: Any, values: Any, guesses: Iterable[Any], count: int, reporter: Progress) -> Any:
     """The cheapest converged outcome of several starts, with the costs of all of them (NaN: did not converge).
+
+    Of one problem, or of several phases: then parameters and guesses are tuples, one for each.
 
     A start outside the domain of the model counts as one that did not converge.
 
     Raises:
         OutsideDomainError: all of them lie outside it (says what the first one lacks).
     """
-    best: Outcome | None = None
-    stopped: tuple[int, Guess] | None = None
+    best: Any = None
+    stopped: tuple[int, Any] | None = None
     refused: list[OutsideDomainError] = []
     costs: list[float] = []
     for guess in guesses:
         try:
-            outcome = prepared.solve(values, replace(guess, tentative=True), reporter)
+            outcome = prepared.solve(values, _tentative(guess), reporter)
         except OutsideDomainError as error:
             refused.append(error)
             costs.append(np.nan)
@@ -91,12 +96,19 @@ def best_of(prepared: Prepared, values: Array, guesses: Iterable[Guess], count: 
     return replace(best, stats={**best.stats, "starts": costs, "asked": count})
 
 
-def cost_of(outcome: Outcome) -> float:
+def _tentative(guess: Guess | tuple[Guess, ...]) -> Any:
+    """A guess, or one for each phase, from which a method need not find its way."""
+    if isinstance(guess, Guess):
+        return replace(guess, tentative=True)
+    return tuple(replace(own, tentative=True) for own in guess)
+
+
+def cost_of(outcome: Outcome | ChainOutcome) -> float:
     """All terms together."""
-    return float(sum(outcome.cost_terms.values()))
+    return outcome.cost if isinstance(outcome, ChainOutcome) else float(sum(outcome.cost_terms.values()))
 
 
-def counted(first: Outcome | Solution, second: Outcome) -> dict[str, Any]:
+def counted(first: AnyOutcome | Solution, second: AnyOutcome) -> dict[str, Any]:
     """Iterations and times of two runs together."""
     names = ("iterations", "build_seconds", "solve_seconds")
     both = [name for name in names if name in first.stats and name in second.stats]
@@ -108,7 +120,7 @@ def with_stats(outcome: Outcome, **stats: Any) -> Outcome:
     return replace(outcome, stats={**outcome.stats, **stats})
 
 
-def interrupted(solution: Solution) -> Interrupted:
+def interrupted(solution: Solution | PhasesSolution) -> Interrupted:
     """What a run ends with that Ctrl-C stopped: it carries what was found until then."""
     starts = solution.stats.get("starts")
     if starts is None:
@@ -116,4 +128,4 @@ def interrupted(solution: Solution) -> Interrupted:
     else:
         found = f"the best of {len(starts)} of {solution.stats['asked']} starts"
         found += "" if solution.converged else ", of which none converged"
-    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)
+    return Interrupted(f"Interrupted. On this error (.solution): {found}.", solution=solution)  # type: ignore[arg-type]

@@ -70,10 +70,10 @@ def more_points(options: Options, mesh: Mesh) -> Options | None:
     return replace(options, points=points, substeps="auto" if fixed else max(int(options.substeps), points))
 
 
-def mention_between(passed: Passed, points: int, reason: str) -> None:
-    """Warn of a limit that does not hold as it was asked for."""
+def mention_between(passed: Passed, points: int, reason: str, where: str = "") -> None:
+    """Warn of a limit that does not hold as it was asked for; `where`: " of the phase ..." where there are several."""
     warn_user(
-        f"The limit of '{passed.name}' does not hold between the nodes as between='auto' asks: with {points} points of "
-        f"each interval it is passed by {passed.by:.3g} ({100 * passed.share:.2g} % of it) at t = {passed.time:.4g} s; "
-        f"{reason}. Use more intervals, or keep a margin."
+        f"The limit of '{passed.name}'{where} does not hold between the nodes as between='auto' asks: with {points} "
+        f"points of each interval it is passed by {passed.by:.3g} ({100 * passed.share:.2g} % of it) at "
+        f"t = {passed.time:.4g} s; {reason}. Use more intervals, or keep a margin."
     )

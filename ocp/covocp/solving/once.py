@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast, overload
 
 from covocp.base.arguments import checked, text, truth
-from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.threads import one_at_a_time
@@ -14,6 +13,7 @@ from covocp.problem.builder import Problem
 from covocp.problem.phases import Phases
 from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, check_method
+from covocp.solving.random_starts import multistart
 from covocp.solving.solver import Solver
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ def solve(
         method: a name in `methods()`.
         intervals: number of control intervals; None: 100, and 16 of the first mesh with `refine`. Of phases that of
             each, or a list of one for each.
-        guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, or such a guess for each phase: a list,
-            or a dict by name of the phase.
+        guess: where to start; see `Solver.solve`. Of phases a `PhasesSolution`, "multistart", or a guess for each
+            phase: a list, or a dict by name of the phase.
         nominal: of an expected cost: "combined" or "deterministic"; see `Solver`.
         progress: whether to show the iterations on a terminal.
         allow_failure: return the last iterate of a run that did not converge instead of raising.
@@ -70,13 +70,7 @@ def solve(
         run = {"intervals": intervals, "guess": guess, "nominal": nominal, "progress": progress}
         run |= {"allow_failure": allow_failure, "parameters": parameters, **options}
         return cast("PhasesSolution", later("solving.phases").solve_phases(problem, method, METHODS[method], **run))
-    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
-    if extra and not isinstance(guess, str):
-        raise ProblemError(
-            "The options of multistart are given, but not multistart.",
-            expected="guess='multistart'",
-            received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
-            remedy="add guess='multistart', or remove them",
-        )
+    random = multistart(guess, options)
+    extra: dict[str, Any] = {} if random is None else dict(zip(("starts", "seed"), random, strict=True))
     solver = Solver(problem, method, intervals=intervals, nominal=nominal, **options)
     return solver.solve(parameters, guess=guess, progress=progress, allow_failure=allow_failure, **extra)

@@ -28,7 +28,8 @@ from covocp.problem.phases import Phases
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.evaluation import SAME, check_same, first_options, run_along, statistics_along, told
-from covocp.solving.phases import intervals_of, of_each, phases_solution, values_of
+from covocp.solving.phases import intervals_of, of_each, values_of
+from covocp.solving.phases_outcome import phases_solution
 from covocp.statement.chain import Chain
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
+from covocp.base.checks import is_whole
 from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Guess
 from covocp.statement.statement import Statement
@@ -27,6 +31,8 @@ STRETCH = 4.0
 DECADE = 5.0
 # A control along which the model leaves its domain at the start is halved at most so often.
 HALVINGS = 6
+MULTISTART = "multistart"
+STARTS, MOST_STARTS = 8, 10**6
 
 
 def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: int, seed: int) -> Iterator[Guess]:
@@ -35,9 +41,6 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: i
     Free initial values and durations are drawn one from each of `count` equally likely ranges, in random order: few
     starts then look everywhere.
     """
-    tied = () if statement.tied is None else statement.tied.states
-    free = [int(k) for k in np.flatnonzero(np.isnan(statement.boundary_values(parameters)[0])) if k not in tied]
-    drawn = _latin(len(free) + int(statement.duration.free), count, seed)
     own: ProblemError | None = None
     try:
         first = next(ranked(statement, mesh, parameters))
@@ -46,9 +49,8 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: i
     else:
         yield Guess(trajectory=first)
     made = 0
-    for child, shares in zip(np.random.SeedSequence(seed).spawn(count), drawn, strict=True):
-        generator = np.random.default_rng(child)
-        guess = _random_guess(statement, mesh, parameters, free, shares, generator)
+    for k in range(count):
+        guess = drawn_guess(statement, mesh, parameters, count, seed, k)
         if guess is not None:
             made += 1
             yield guess
@@ -56,6 +58,65 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: i
         raise own
 
 
+def drawn_guess(statement: Statement, mesh: Mesh, parameters: Array, count: int, seed: int, k: int) -> Guess | None:
+    """The random start number k, from 0, of so many; None where it lies outside the domain of the model."""
+    tied = () if statement.tied is None else statement.tied.states
+    free = [int(k) for k in np.flatnonzero(np.isnan(statement.boundary_values(parameters)[0])) if k not in tied]
+    shares = _latin(len(free) + int(statement.duration.free), count, seed)[k]
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(k,)))
+    return _random_guess(statement, mesh, parameters, free, shares, generator)
+
+
+def phase_seed(seed: int, phase: int) -> int:
+    """A seed for one of several phases, by its number."""
+    return int(np.random.SeedSequence((seed, phase)).generate_state(1, np.uint64)[0])
+
+
+def check_multistart(guess: str, starts: Given, seed: Given) -> None:
+    """A guess that is a word, and the options that belong to it.
+
+    Raises:
+        ProblemError: another word than "multistart", or numbers that are none.
+    """
+    if guess != MULTISTART:
+        raise ProblemError(
+            "The guess is an unknown word.",
+            expected="None, 'multistart', a Solution, or a dict of name to guess",
+            received=repr(guess),
+            remedy="correct guess=",
+        )
+    for name, number, most in (("starts", starts, MOST_STARTS), ("seed", seed, None)):
+        if not is_whole(number, 0, most):
+            raise ProblemError(
+                f"The option '{name}' is not a whole number.",
+                expected="0, 1, 2, ...",
+                received=repr(number),
+                remedy=f"correct {name}=",
+            )
+
+
+def multistart(guess: Given, options: dict[str, Any]) -> tuple[int, int] | None:
+    """Number of random starts and their seed, taken out of some options; None where the guess asks for none.
+
+    Raises:
+        ProblemError: as `check_multistart`; or the options are given without the guess.
+    """
+    extra = {name: options.pop(name) for name in ("starts", "seed") if name in options}
+    if not isinstance(guess, str):
+        if extra:
+            raise ProblemError(
+                "The options of multistart are given, but not multistart.",
+                expected="guess='multistart'",
+                received=", ".join(f"{name}={value!r}" for name, value in extra.items()) + " without it",
+                remedy="add guess='multistart', or remove them",
+            )
+        return None
+    starts, seed = extra.get("starts", STARTS), extra.get("seed", 0)
+    check_multistart(guess, starts, seed)
+    return starts, seed
+
+
+@lru_cache(maxsize=64)
 def _latin(columns: int, count: int, seed: int) -> Array:
     """Numbers in (0, 1), shape (count, columns): each column has one in each of `count` equal ranges."""
     generator = np.random.default_rng((seed, columns, count))

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
-from covocp.base.checks import check_kind, is_whole
+from covocp.base.checks import check_kind
 from covocp.base.errors import (
     CovocpError,
     Interrupted,
@@ -45,7 +45,8 @@ from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.methods import check_method, method_options
-from covocp.solving.random_starts import random_guesses
+from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
+from covocp.solving.refined_meshes import remade
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -59,7 +60,6 @@ SUSPICIOUS_ITERATIONS = 3
 # A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
 UNMOVED = 1e-6
 ESCAPES = (1.0, -1.0)
-STARTS, MOST_STARTS = 8, 10**6
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
 # Control intervals where none are asked for.
@@ -392,23 +392,10 @@ class Solver:
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
         """The best of the problem's own start and several random ones."""
-        if guess != "multistart":
-            raise ProblemError(
-                "The guess is an unknown word.",
-                expected="None, 'multistart', a Solution, or a dict of name to guess",
-                received=repr(guess),
-                remedy="correct guess=",
-            )
-        for name, number, most in (("starts", starts, MOST_STARTS), ("seed", seed, None)):
-            if not is_whole(number, 0, most):
-                raise ProblemError(
-                    f"The option '{name}' is not a whole number.",
-                    expected="0, 1, 2, ...",
-                    received=repr(number),
-                    remedy=f"correct {name}=",
-                )
+        check_multistart(guess, starts, seed)
         guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
-        return best_of(self._prepared, values, guesses, starts + 1, reporter)
+        outcome: Outcome = best_of(self._prepared, values, guesses, starts + 1, reporter)
+        return outcome
 
     def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
         """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it."""
@@ -470,13 +457,12 @@ class Solver:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
         if not self._remade or reporter.stop:
             return outcome
-        runs = refining.Runs(
+        runs = refining.ProblemRuns(
             self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter
         )
-        found = refining.remade(
-            refining.Measured(self._options, self._prepared, outcome, least=refining.unseen(self._own)), runs
-        )
-        self._keep(found.options, found.prepared)
+        found = remade(runs.measured(self._options, self._prepared, outcome, refining.unseen(self._own)), runs)
+        assert isinstance(found.outcome, Outcome)
+        self._keep(found.options[0], found.prepared)
         return found.outcome
 
     def _finish(self, outcome: Outcome, allow_failure: bool, assess: bool) -> Solution:

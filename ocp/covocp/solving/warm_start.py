@@ -35,9 +35,9 @@ class Later:
     __repr__ = short_repr
 
 
-def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given) -> Guess:
+def make_guess(statement: Statement, mesh: Mesh, parameters: Array, guess: Given, *, linked: bool = False) -> Guess:
     """The first of `make_guesses`."""
-    return next(make_guesses(statement, mesh, parameters, guess))
+    return next(make_guesses(statement, mesh, parameters, guess, linked=linked))
 
 
 def make_guesses(

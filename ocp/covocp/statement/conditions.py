@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
@@ -47,6 +48,11 @@ class Conditions:
     def size(self) -> int:
         """Number of rows."""
         return len(self.names)
+
+    @property
+    def equations(self) -> NDArray[np.bool_]:
+        """Which rows have both limits equal."""
+        return np.asarray(self.lower == self.upper)
 
     def columns(self, at: Columns, duration: Expr, parameters: Expr) -> Any:
         """The values for columns of points; matrices that no row reads are no part of the expression.

@@ -141,7 +141,7 @@ class Mesh:
         readings: what each interval takes of each measurement at instants, (measurements, N): its node is there twice,
             and the interval between has no length; nothing where only a condition holds there.
         points: equally spread points of an interval, its start among them, where path inequalities and bounds of
-            states are imposed; they are ends of substeps. 1: at the nodes only.
+            states are imposed, equations at the nodes alone; they are ends of substeps. 1: at the nodes only.
     """
 
     nodes: Array

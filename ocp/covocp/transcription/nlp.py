@@ -194,6 +194,7 @@ class NLP:
         elif "final_matrices" in by_kind:
             known = ~np.isnan(st.boundary_values(parameters)[3])
             final_matrices[known] = by_kind["final_matrices"]
+        inside_path = by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape)
         parts_inside = [by_kind[inside_kind(i)] for i in range(len(st.inside.parts))]
         return Multipliers(
             final=costate - slope_x,
@@ -206,7 +207,7 @@ class NLP:
             matrices=matrices,
             controls=self._acting(parts["u"] / self.scales.u),
             gaps=np.hstack(gaps),
-            inside_path=by_kind.get("path_inside", zero.inside_path.ravel()).reshape(zero.inside_path.shape),
+            inside_path=np.where(st.path.equations, 0.0, inside_path),  # which hold at the nodes
             inside_states=inside_states,
         )
 

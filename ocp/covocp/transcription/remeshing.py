@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -85,22 +86,14 @@ def remeshed(
     Returns:
         Rising from 0 to 1.
     """
-    pieces = errors.copy()
-    for jump in jumps:
-        pieces[(ends[:-1] >= jump.begin - CLOSEST) & (ends[1:] <= jump.end + CLOSEST)] = 0.0
-    owner = np.searchsorted(nodes, ends[:-1], side="right") - 1
-    count = nodes.size - 1
-
-    def gathered(values: Array) -> Array:
-        return np.bincount(owner, weights=values, minlength=count).astype(float)
-
-    whole = gathered(pieces)
+    pieces, owner = _pieces(nodes, ends, errors, jumps)
+    whole = _gathered(pieces, owner, nodes)
     total = float((whole ** (1 / order)).sum())
     each = (allowed / total) ** (order / (order - 1)) if total > 0 else np.inf
     parts = np.clip((whole / each) ** (1 / order), LEAST_PART, MOST_PARTS)
     weights = pieces ** (1 / order)
-    weights = np.maximum(weights, EVENLY * gathered(weights)[owner])
-    sums = gathered(weights)[owner]
+    weights = np.maximum(weights, EVENLY * _gathered(weights, owner, nodes)[owner])
+    sums = _gathered(weights, owner, nodes)[owner]
     shares = np.where(sums > 0, weights / np.where(sums > 0, sums, 1.0), 1.0 / np.bincount(owner)[owner])
     levels = np.append(0.0, np.cumsum(parts[owner] * shares))
     fixed = np.unique(np.concatenate([[0.0, 1.0], kept, *(jump.nodes for jump in jumps)]))
@@ -112,6 +105,34 @@ def remeshed(
         inner = np.interp(low + (high - low) * np.arange(1, count) / count, levels, ends)
         result += [inner[(inner > first + CLOSEST) & (inner < last - CLOSEST)], np.array([last])]
     return np.concatenate(result)
+
+
+def demand(nodes: Array, ends: Array, errors: Array, order: int, jumps: list[Jump]) -> float:
+    """How much of what several meshes are allowed together one of them takes, in proportion.
+
+    With these shares the intervals of all of them have about the same error: no others have as few.
+
+    Args:
+        nodes: of the mesh.
+        ends: these and others between them.
+        errors: by the pieces between the ends.
+        order: power of the length with which the error of an interval falls.
+        jumps: of controls.
+    """
+    return float((_gathered(*_pieces(nodes, ends, errors, jumps), nodes) ** (1 / order)).sum())
+
+
+def _pieces(nodes: Array, ends: Array, errors: Array, jumps: list[Jump]) -> tuple[Array, Any]:
+    """The errors without those where jumps are hidden, and the intervals that the pieces are of."""
+    pieces = errors.copy()
+    for jump in jumps:
+        pieces[(ends[:-1] >= jump.begin - CLOSEST) & (ends[1:] <= jump.end + CLOSEST)] = 0.0
+    return pieces, np.searchsorted(nodes, ends[:-1], side="right") - 1
+
+
+def _gathered(values: Array, owner: Any, nodes: Array) -> Array:
+    """Sums of the pieces of each interval."""
+    return np.bincount(owner, weights=values, minlength=nodes.size - 1).astype(float)
 
 
 def jumps_of(nodes: Array, controls: Array, constant: bool) -> list[Jump]:

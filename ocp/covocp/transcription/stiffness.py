@@ -28,15 +28,19 @@ def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> M
     return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
 
 
-def stiffness(statement: Statement, options: Options, parameters: Array) -> Stiffness:
+def stiffness(statement: Statement, options: Options, parameters: Array, *, at_end: bool = False) -> Stiffness:
     """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
 
     A graded mesh knows that of the filter on each of its intervals, or that of the nominal along a solution.
+    `at_end`: with the final values of the states that have one.
     """
     nodes, control = options.nodes(), options.control
     u = controls_guess(statement, nodes[:2], control)[0]
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
     x, e = starts(statement, mesh, parameters)
+    if at_end:
+        final = statement.boundary_values(parameters)[1]
+        x = np.where(np.isnan(final), x, final)
     duration = statement.duration.guess
     rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
     longest = duration * float(np.diff(nodes).max())

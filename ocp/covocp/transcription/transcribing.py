@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -207,7 +208,11 @@ def _bound_rows(kind: str, statement: Statement, scales: Scales, values: Expr) -
 def _inside_rows(
     statement: Statement, mesh: Mesh, scales: Scales, variables: _Variables, nodes: dict[str, Any]
 ) -> list[Rows]:
-    """Bounds on states and path constraints at the points inside the intervals where they are imposed."""
+    """Bounds on states and path constraints at the points inside the intervals where they are imposed.
+
+    An equation is none of them: at each point between the nodes it would take what a linear control leaves free, so
+    that a direction of unit length could not turn within an interval.
+    """
     n, inner, rows = mesh.intervals, mesh.points - 1, []
     if statement.bounded_states:
         rows.append(_bound_rows("bounds_inside", statement, scales, nodes["x_inside"][statement.bounded_states, :]))
@@ -219,7 +224,9 @@ def _inside_rows(
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
         places = Columns(nodes["x_inside"], points.start, e, variables.duration * points.s)
         value = path.columns(places, variables.duration, variables.parameters)
-        rows.append(_condition_rows("path_inside", path, value, n * inner, mesh))
+        own = _condition_rows("path_inside", path, value, n * inner, mesh)
+        free = np.where(np.tile(path.equations, n * inner), np.inf, 0.0)
+        rows.append(replace(own, lower=own.lower - free, upper=own.upper + free))
     return rows
 
 

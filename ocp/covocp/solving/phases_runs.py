@@ -1,0 +1,247 @@
+"""Runs of a method on several phases: from several starts, with shorter steps, on other meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from covocp.base.errors import CovocpError
+from covocp.base.matrices import Array
+from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
+from covocp.extremal.extremal import Guess
+from covocp.extremal.links import ChainOutcome, completed
+from covocp.extremal.mesh_error import OPTIMISED, finer_steps
+from covocp.solving.attempts import TRIED, best_of, counted
+from covocp.solving.phases_outcome import phases_solution
+from covocp.solving.random_starts import drawn_guess, phase_seed
+from covocp.solving.refined_meshes import Measured, remade
+from covocp.solving.refining import first_guesses, unseen, with_layers
+from covocp.solving.warm_start import make_guess
+from covocp.statement.chain import Chain, started_at
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import matrices_function
+from covocp.transcription.grading import graded
+from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.stiffness import resolve_mesh
+
+Arrays = tuple[Array, ...]
+Guesses = tuple[Guess, ...]
+# Number, statement, options, mesh and parameters of a phase -> where it starts; None where there is no such start.
+Made = Callable[[int, Statement, Options, Mesh, Array], Guess | None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Begun:
+    """Where a method starts: a guess for each phase, parameters with what passes, graded options, statements."""
+
+    chain: Chain
+    guesses: Guesses
+    values: Arrays
+    options: tuple[Options, ...]
+
+    __repr__ = short_repr
+
+
+class ChainRuns:
+    """Runs of a method on a chain, in the way of `refined_meshes`."""
+
+    def __init__(
+        self,
+        chain: Chain,
+        method: str,
+        prepare: Callable[..., Any],
+        own: dict[str, Any],
+        reporter: Progress,
+        values: Arrays,
+        guesses: list[Any],
+    ) -> None:
+        """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed."""
+        self._chain, self._method, self._prepare, self._own = chain, method, prepare, own
+        self._reporter, self._values, self._guesses = reporter, values, guesses
+
+    @property
+    def statements(self) -> tuple[Statement, ...]:
+        """Of the phases."""
+        return self._chain.statements
+
+    @property
+    def progress(self) -> Progress:
+        """Of the iterations."""
+        return self._reporter
+
+    def solve(self, options: tuple[Options, ...], starts: tuple[int, int] | None = None) -> ChainOutcome:
+        """Solve from the guesses, or from the best of several random starts, on meshes that are made anew if asked.
+
+        Args:
+            options: of each phase.
+            starts: number of random starts and their seed; None: none.
+        """
+        begun = self._begun(options)
+        found = self._shorter(self._from_starts(begun) if starts is None else self._best_of(begun, *starts))
+        if not self._reporter.stop and found.outcome.converged:
+            found = remade(found, self)
+        assert isinstance(found.outcome, ChainOutcome)
+        return found.outcome
+
+    def cold(self, options: tuple[Options, ...], least: float) -> Measured:
+        """From the phases' own start."""
+        return self._from_starts(self._begun(options))
+
+    def warm(self, options: tuple[Options, ...], start: Measured) -> Measured:
+        """From a solution on other meshes, primal and dual."""
+        chain = replace(self._chain, statements=tuple(extremal.statement for extremal in start.extremals))
+        values = tuple(extremal.parameters for extremal in start.extremals)
+        prepared = self._prepare(chain, options, **self._own)
+        assert isinstance(start.outcome, ChainOutcome)
+        known = phases_solution(chain, start.outcome, self._method)
+        parts = zip(chain.statements, prepared.meshes, values, known, strict=True)
+        guesses = tuple(make_guess(st, mesh, own, phase, linked=True) for st, mesh, own, phase in parts)
+        return self._measured(options, prepared, prepared.solve(values, guesses, self._reporter))
+
+    def _measured(self, options: tuple[Options, ...], prepared: Any, outcome: ChainOutcome) -> Measured:
+        """Meshes with what came of them, not measured; costates of converged ones are those within the whole."""
+        extremals = outcome.extremals
+        if outcome.converged:
+            extremals = tuple(passed.extremal for passed in completed(outcome, self._chain.links))
+        return Measured(
+            options=options,
+            meshes=prepared.meshes,
+            prepared=prepared,
+            outcome=outcome,
+            extremals=extremals,
+            cost=outcome.cost,
+            least=unseen(self._own),
+        )
+
+    def _shorter(self, found: Measured) -> Measured:
+        """Solved again from there where the default steps are too long; meshes that refine themselves see to it."""
+        if found.refine is not None:
+            return found
+        automatic = tuple(own.substeps == "auto" for own in found.options)
+        while found.outcome.converged and not self._reporter.stop:
+            assert isinstance(found.outcome, ChainOutcome)
+            extremals = found.outcome.extremals
+            pairs = list(zip(extremals, found.options, automatic, strict=True))
+            finer = tuple((finer_steps(x, own, OPTIMISED) if auto else None) or own for x, own, auto in pairs)
+            if all(a is b for a, b in zip(finer, found.options, strict=True)):
+                break
+            chain = replace(self._chain, statements=tuple(x.statement for x in extremals))
+            guesses = tuple(Guess(trajectory=x.trajectory, warm=True) for x in extremals)
+            try:
+                prepared = self._prepare(chain, finer, **self._own)
+                again = prepared.solve(tuple(x.parameters for x in extremals), guesses, self._reporter)
+            except CovocpError:  # what the steps are off is told with the solution that there is
+                break
+            if not again.converged:
+                break
+            both = {**found.outcome.stats, **again.stats, **counted(found.outcome, again)}
+            found = self._measured(finer, prepared, replace(again, stats=both))
+        return found
+
+    def _prepared(self, begun: Begun) -> Any:
+        """The method made ready for the chain with these parameters as its own."""
+        return self._prepare(begun.chain, begun.options, **self._own)
+
+    def _from_starts(self, begun: Begun) -> Measured:
+        """From the first start from which the method finds its way; from the first one where there is none."""
+        prepared, values = self._prepared(begun), begun.values
+        start, tried = begun.guesses, 0
+        for attempt in range(TRIED):
+            tentative = attempt < TRIED - 1 and not any(guess.warm for guess in start)
+            given = tuple(replace(guess, tentative=tentative) for guess in start)
+            outcome: ChainOutcome = prepared.solve(values, given, self._reporter)
+            tried += 1
+            if outcome.converged or not outcome.stats.get("wandered") or self._reporter.stop or not tentative:
+                break
+            start = self._begun(begun.options, attempt + 1).guesses
+        if not outcome.converged and outcome.stats.get("wandered") and not self._reporter.stop:
+            outcome = prepared.solve(values, begun.guesses, self._reporter)
+        if tried > 1:
+            outcome = replace(outcome, stats={**outcome.stats, "tried": tried})
+        return self._measured(begun.options, prepared, outcome)
+
+    def _best_of(self, begun: Begun, count: int, seed: int) -> Measured:
+        """The best of the phases' own start and of random ones, whose phases go on from where the one before ends."""
+        prepared = self._prepared(begun)
+
+        def starts() -> Iterator[Guesses]:
+            yield begun.guesses
+            for k in range(count):
+                drawn = self._drawn(begun.options, count, seed, k)
+                if drawn is not None:
+                    yield drawn
+
+        outcome = best_of(prepared, begun.values, starts(), count + 1, self._reporter)
+        return self._measured(begun.options, prepared, outcome)
+
+    def _drawn(self, options: tuple[Options, ...], count: int, seed: int, k: int) -> Guesses | None:
+        """One random start; None where a phase of it lies outside the domain of the model."""
+
+        def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess | None:
+            return drawn_guess(st, mesh, value, count, phase_seed(seed, i), k)
+
+        found = self._forward(options, self._values, made)
+        return None if found is None else found.guesses
+
+    def _begun(self, options: tuple[Options, ...], attempt: int = 0) -> Begun:
+        """A guess for each phase, each of which starts where the one before it ends.
+
+        The parameters have the matrices that a phase then starts with, and the weights that the next one has where it
+        begins; the options are graded for them.
+        """
+
+        def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess:
+            guesses = first_guesses(own, st, mesh, value, self._guesses[i], linked=True)
+            return list(islice(guesses, attempt + 1))[-1]
+
+        found = self._forward(options, self._values, made)
+        if found is not None and any(link.weights for link in self._chain.links):
+            found = self._forward(options, self._weighed(found), made)
+        assert found is not None
+        return found
+
+    def _weighed(self, begun: Begun) -> Arrays:
+        """The parameters with S of each later phase along its guess, where it begins; from the last to the first."""
+        result = list(begun.values)
+        for i in range(len(result) - 1, 0, -1):
+            st, link, t = self._chain.statements[i], self._chain.links[i - 1], begun.guesses[i].trajectory
+            mesh = resolve_mesh(st, begun.options[i], result[i])
+            along = matrices_function(st, mesh)(t.x.T, t.u.T, t.duration, result[i])
+            start = np.asarray(along[0].full())[list(link.behind), 0]
+            if np.isfinite(start).all():
+                result[i - 1] = link.weighed(result[i - 1], start)
+        return tuple(result)
+
+    def _forward(self, options: tuple[Options, ...], values: Arrays, made: Made) -> Begun | None:
+        """Guesses from the first phase to the last, for the weights that are among the parameters.
+
+        Returns:
+            None where some phase has no guess.
+        """
+        found: list[Guess] = []
+        filled: list[Array] = []
+        fine: list[Options] = []
+        for i, (st, own, value) in enumerate(zip(self._chain.statements, options, values, strict=True)):
+            if i:
+                link, t = self._chain.links[i - 1], found[-1].trajectory
+                states, matrices = link.values(t.x[-1], t.e[-1], t.duration, filled[-1], value)
+                value, st = link.filled(value, matrices), started_at(st, link, states)
+            own = graded(st, own, value)
+            fine.append(own if own.refine is None else with_layers(st, own, value))
+            guess = made(i, st, fine[-1], resolve_mesh(st, fine[-1], value), value)
+            if guess is None:
+                return None
+            filled.append(value)
+            found.append(guess)
+        statements = tuple(replace(st, values=own) for st, own in zip(self._chain.statements, filled, strict=True))
+        return Begun(
+            chain=replace(self._chain, statements=statements),
+            guesses=tuple(found),
+            values=tuple(filled),
+            options=tuple(fine),
+        )
