@@ -142,7 +142,7 @@ def test_margin_of_four_degrees_keeps_the_zones(name, allowed):
 
 @pytest.mark.slow
 def test_margin_and_quadratic_condition_keep_the_zones_in_every_run():
-    runs = antenna_pointing.simulate("constrained", margin=4.0, curvature=True, duration=100.0)
+    runs = antenna_pointing.simulate("constrained", margin=4.0, curvature=True)
     assert runs.success == 1.0
     assert runs.violation[1] <= 0.002
 
