@@ -9,6 +9,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.base.short_repr import short_repr
 from covocp.transcription.program import Program
 
 # A run that has not brought its largest violation below this share of the smallest one before, for so many iterations,
@@ -29,6 +30,8 @@ class Iterate:
     lam_g: Array
     cost: float
     violation: float
+
+    __repr__ = short_repr
 
     @property
     def rank(self) -> tuple[float, float]:
