@@ -10,8 +10,9 @@ import covocp as co
 from covocp.base.threads import TURN
 
 
-def counts() -> list[int]:
-    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+def counts() -> dict[str, int]:
+    """Threads of each library that is loaded."""
+    return {one["filepath"]: one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 
 
 def test_linear_algebra_has_one_thread_for_as_long_as_a_call_lasts():
@@ -28,10 +29,10 @@ def test_linear_algebra_has_one_thread_for_as_long_as_a_call_lasts():
         ocp.dynamics(x, u)
         ocp.minimize(running=u**2)
         assert co.solve(ocp, intervals=10).cost == pytest.approx(1.0)
-        assert counts()[: len(before)] == before
+        assert before.items() <= counts().items()
     assert len(before) >= 1
     assert seen
-    assert set(seen[0]) == {1}
+    assert set(seen[0].values()) == {1}
 
 
 def test_they_are_restored_after_an_error_and_while_other_threads_have_their_turn():
@@ -42,9 +43,9 @@ def test_they_are_restored_after_an_error_and_while_other_threads_have_their_tur
         assert counts() == before
         with TURN:
             with TURN:
-                assert set(counts()) == {1}
-            assert set(counts()) == {1}
+                assert set(counts().values()) == {1}
+            assert set(counts().values()) == {1}
             with TURN.handed_over():
                 assert counts() == before
-            assert set(counts()) == {1}
+            assert set(counts().values()) == {1}
         assert counts() == before
