@@ -326,6 +326,7 @@ def plain_truth(truth: Declarations) -> Declarations:
         matrices=tuple(matrix for matrix in truth.matrices if matrix.estimation),
         rates={name: entry for name, entry in truth.rates.items() if name in moving},
         constraints=(),
+        chances=(),
         expected=None,
         cost=(ca.MX(0), ca.sumsqr(ca.vertcat(*(state.symbol for state in truth.states)))),
     )

@@ -67,11 +67,11 @@ def actual_phases(solution: PhasesSolution, designs: tuple[System, ...], truth: 
             systems.append(in_its_phase(phase, actual_system, design, own))
             fixed |= {block.name for block in phase.blocks if block.kind == "unknown" and block.name in own}
     elif isinstance(truth, Phases) and len(truth.problems) == len(solution):
-        plain = [plain_truth(problem.declarations) for problem in truth.problems]
+        plain = [plain_truth(problem.stated) for problem in truth.problems]
         chain = chain_of(truth.name, truth.names, plain, truth.jumps)
         links = chain.links
         for k, (phase, design) in enumerate(zip(solution, designs, strict=True)):
-            stated = truth.problems[k].declarations, chain.statements[k]
+            stated = truth.problems[k].stated, chain.statements[k]
             systems.append(in_its_phase(phase, stated_system, design, *stated))
     else:
         raise ProblemError(

@@ -83,13 +83,15 @@ def simulate(
         seed: of the random numbers, a whole number.
         truth: what is simulated instead of the design's system: a problem with the same states, unknowns, controls and
             measurements and any dynamics, noises and variances; or a dict of parameter or unknown to the value that it
-            has in every run. Filter and feedback stay those of the design.
+            has in every run. Of phases: `Phases` of such problems, or the dict for all that have the name. Filter and
+            feedback stay those of the design.
         law: what flies instead of the design's filter and feedback: an object with `step(measurement, time)` that
             returns the whole control, (m,), such as a CPackage's `python()`. Each run has a deep copy of it, started by
             its `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual
             measurement over the period before, (r,), NaN at time zero, and below it what was read at instants since
             its last step, NaN where nothing was; its control is held until the next step. Where
-            it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too.
+            it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too. Of phases: a
+            list or a dict by name, a law for each phase, which starts there anew in the time of the phase.
         period: time between two steps of the law [s]; None: its own attribute `period`.
         executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
