@@ -86,7 +86,7 @@ def _check_kinds(phase: Declarations) -> None:
     for constraint in phase.constraints:
         if constraint.chance is not None:
             _refuse(
-                f"The phase '{phase.name}' has the chance condition '{constraint.chance.name}' with a spread of its own.",
+                f"The phase '{phase.name}' has the chance condition '{constraint.chance.name}' of a spread of its own.",
                 "phases as they were stated, so that what scatters goes through all of them",
                 "a problem that movable() returned",
                 "give the problem itself",
