@@ -64,6 +64,7 @@ OPTIONS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "limits": ({"limits": {"u": (-0.8, 0.6)}}, {"limits": {"u": (-0.8, 0.6)}}),
     "parameter": ({"truth": {"k": 0.8}}, {"truth": {"k": 0.8}}),
     "unknown": ({"truth": {"b": 0.6}}, {"truth": {"b": 0.6}}),
+    "constant": ({"truth": {"b": 0.2}}, {"truth": {"b": 0.2}}),
     "extended": ({"truth": {"k": 0.8}, "filter": "extended"}, {"truth": {"k": 0.8}, "filter": "extended"}),
     "noise": (
         {"truth": oscillator(2.0, "true", noise=0.4, spread=0.1), "limits": "bounds"},
@@ -92,6 +93,8 @@ def test_a_cut_changes_no_run(whole_and_cut: tuple[Any, Any], case: str) -> None
     for name in ("predicted", "predicted_error", "predicted_mean", "predicted_control"):
         np.testing.assert_allclose(getattr(got["second"], name)[-1], getattr(expected, name)[-1], atol=1e-4)
     np.testing.assert_allclose(sum(p.predicted_cost for p in got), expected.predicted_cost, rtol=1e-5)
+    # What is no more uncertain, or moves otherwise, `evaluate` does not know.
+    assert np.isnan(expected.predicted_cost) == ("truth" in of_one and case != "noise")
     assert all(bool(phase.truth) == bool(expected.truth) for phase in got)
 
 

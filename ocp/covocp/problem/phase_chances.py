@@ -34,8 +34,8 @@ def with_phase_chances(phases: Sequence[Declarations], jumps: Sequence[Any]) -> 
         if phase.chances and phase.expected is not None:
             raise ProblemError(
                 f"The phase '{phase.name}' has the chance condition '{phase.chances[0].name}' on a closed loop.",
-                expected="chance() in phases with minimize(), where nothing is fed back: the gain of phases is the best one "
-                "of their expected cost, which such a condition would change",
+                expected="chance() in phases with minimize(), where nothing is fed back: the gain in phases is best "
+                "for their expected cost, and such a condition would change it",
                 received="chance() beside minimize_expected()",
                 remedy="weigh deviations in the expected cost instead, or solve one Problem by itself",
             )

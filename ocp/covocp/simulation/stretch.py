@@ -28,7 +28,7 @@ from covocp.simulation.workers import Harvest
 from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
-from covocp.statement.names import control_limits
+from covocp.statement.names import control_limits, name_of
 
 # What stands for no such limit; a number, so that a comparison finds inf and NaN.
 UNLIMITED = 1e300
@@ -236,9 +236,12 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
 
 
 def true_cost(solution: Solution, truth: Given) -> float:
-    """Expected cost by linear theory for the truth; NaN where that knows other dynamics."""
+    """Expected cost by linear theory for the truth; NaN where that knows other dynamics or constants."""
     if truth is None:
         return solution.cost
+    unknowns = tuple(block.name for block in solution.blocks if block.kind == "unknown")
+    if isinstance(truth, Mapping) and any(name_of(k, solution.symbols, unknowns, missing_ok=True) for k in truth):
+        return np.nan  # what has one value in every run is not uncertain any more
     try:
         return evaluate(solution, truth=truth).cost
     except (ProblemError, RuntimeError):  # `evaluate` takes other statistics only, of what has second derivatives
