@@ -44,18 +44,18 @@ def walled(measured: tuple[bool, bool], factor: float = 1.0, **second: Any) -> c
 
 
 @pytest.mark.parametrize(
-    ("measured", "options"),
+    ("measured", "factor", "options"),
     [
-        ((False, False), {}),
-        ((True, True), {"covariances": "states"}),
-        ((True, True), {"covariances": "eliminated"}),
-        ((False, True), {}),
-        ((True, False), {"method": "gradient"}),
+        ((False, False), 1.0, {}),
+        ((False, False), -0.5, {}),
+        ((True, True), -0.5, {"covariances": "states"}),
+        ((True, True), -0.5, {"covariances": "eliminated"}),
+        ((False, True), 1.0, {}),
+        ((True, False), -0.5, {"method": "gradient"}),
     ],
 )
-@pytest.mark.parametrize("factor", [1.0, -0.5])
 def test_the_spread_goes_through_the_link_in_closed_form(
-    measured: tuple[bool, bool], options: dict[str, Any], factor: float
+    measured: tuple[bool, bool], factor: float, options: dict[str, Any]
 ) -> None:
     solution = co.solve(walled(measured, factor), intervals=3, **options, **QUIET)
     noise = 0.0 if factor == 1.0 else JUMP
