@@ -68,12 +68,6 @@ def spread_limit() -> co.Problem:
     return ocp
 
 
-def risky() -> co.Problem:
-    ocp = part("risky")
-    ocp.chance(ocp.states[0].symbol, upper=2.0, probability=0.99, name="wall")
-    return ocp
-
-
 WRONG: dict[str, tuple[Callable[[], list[co.Problem]], str]] = {
     "initial": (lambda: [first(), part(initial=1.0)], "goes on from 'first' to 'second' and has an initial value too"),
     "variance": (lambda: [first(), part(variance=1.0)], "goes on from 'first' to 'second' and has a variance too"),
@@ -90,7 +84,6 @@ WRONG: dict[str, tuple[Callable[[], list[co.Problem]], str]] = {
     "no rate": (lambda: [first(), co.Problem(1.0, name="empty")], "In the phase 'empty': The problem has no state"),
     "unused": (lambda: [first(decision=True), part(decision=True)], "Nothing depends on the decision 'd'"),
     "attitude": (lambda: [first(), attitude()], "The phase 'turning' has the attitude 'C'"),
-    "chance": (lambda: [first(), risky()], "The phase 'risky' has the chance constraint 'wall'"),
     "mixed": (lambda: [first(), closed()], "The phase 'first' has no expected cost, and others have one"),
     "gain": (lambda: [closed("open"), closed(gain=co.Gain())], "The gain of the phase 'closed' is not the best one"),
     "spread": (lambda: [closed("open"), spread_limit()], "The gain of the phase 'closed' is not the best one"),

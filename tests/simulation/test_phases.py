@@ -257,10 +257,6 @@ def test_files_and_what_is_refused(bounced: Any, tmp_path: Path) -> None:
     asked: dict[str, Any] = {"runs": 64, "seed": 1, "step": 0.1, **QUIET}
     again = co.simulate(co.load(path, bounce()), **asked)
     np.testing.assert_array_equal(again["rise"].deviations, co.simulate(bounced, **asked)["rise"].deviations)
-    for name, value in (("truth", {"r": 0.5}), ("law", object()), ("period", 0.1), ("limits", "bounds")):
-        with pytest.raises(co.ProblemError, match=f"'{name}'") as caught:
-            co.simulate(bounced, 10, seed=1, **{name: value})
-        assert "phase" in str(caught.value)
     first, second = co.Problem(1.0, name="first"), co.Problem(1.0, name="second")
     for ocp in (first, second):
         x = ocp.state("x", initial=0.0 if ocp is first else None, variance=1.0 if ocp is first else None)

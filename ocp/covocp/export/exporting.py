@@ -26,7 +26,7 @@ from covocp.export.laws.design import design_of
 from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
-from covocp.export.laws.limits import limits_of_each, warn_outside
+from covocp.export.laws.limits import warn_outside
 from covocp.export.laws.phase_controller import check_first_readings, legs_of, phases_controller
 from covocp.export.laws.phases import histories
 from covocp.export.laws.sampled import discretised, sampled_law
@@ -42,7 +42,7 @@ from covocp.export.text.self_test import self_test
 from covocp.export.text.source import source
 from covocp.problem.builder import Problem
 from covocp.solution.flight import interpolated_flight
-from covocp.solution.phases import PhasesSolution, check_begins
+from covocp.solution.phases import PhasesSolution, check_begins, limits_of_each
 from covocp.solution.solution import Solution
 
 PRECISIONS = {"double": "double", "single": "float"}

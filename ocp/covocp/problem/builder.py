@@ -104,6 +104,11 @@ class Problem:
         return self._expanded
 
     @property
+    def stated(self) -> Declarations:
+        """What is declared so far, conditions on probabilities as they were stated."""
+        return self._declarations
+
+    @property
     def chances(self) -> tuple[Chance, ...]:
         """Conditions on probabilities as they were stated."""
         given = self._declarations

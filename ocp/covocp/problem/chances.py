@@ -14,6 +14,7 @@ keep their limits together where each takes an equal share of the risk (Boole's 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -158,45 +159,82 @@ def with_chance_conditions(own: Declarations) -> Declarations:
     missing = any(state.name not in own.rates for state in own.states if state.role == "moving")
     if not own.chances or missing or (own.cost is None and own.expected is None):
         return own
-    chances, own = own.chances, replace(own, chances=())
     fed_back = own.expected is not None
+    chances, own = own.chances, replace(own, chances=())
     if fed_back:
         own = with_closed_loop(own) if own.spread is None else own
         assert own.spread is not None
         covariance, name = own.spread.matrix, None
     else:
-        own, covariance, name = _with_open_loop(own)
+        own, covariance, name = with_open_loop(own, bool(own.measurements))
+    return with_conditions(own, chances, covariance, name)
+
+
+def with_conditions(own: Declarations, chances: tuple[Chance, ...], covariance: Any, name: str | None) -> Declarations:
+    """The declarations with constraints that conditions on probabilities are.
+
+    Args:
+        own: the declarations.
+        chances: the conditions.
+        covariance: of augmented state and, with feedback, controls.
+        name: of the matrix that it is; None: it is that of the closed loop.
+
+    Raises:
+        ProblemError: nothing scatters in one of them.
+    """
+    controls = [control.symbol for control in own.controls] if name is None else []
     for entry in chances:
-        controls = [control.symbol for control in own.controls] if fed_back else []
         by_state = augmented_slope(own, entry.expression)
         by_control = slope_by(entry.expression, controls) if controls else ca.MX(entry.lower.size, 0)
         known = replace(entry, slopes=(by_state, by_control), spread=name)
-        _check_scatters(own, known, fed_back)
+        _check_scatters(known, name is None)
         own = own.adding(constraints=_condition(known, ca.horzcat(by_state, by_control), covariance))
     return own
 
 
-def _with_open_loop(own: Declarations) -> tuple[Declarations, Any, str]:
-    """The declarations with the covariance of the actual system without feedback, that matrix and its name."""
+def with_open_loop(own: Declarations, measured: bool) -> tuple[Declarations, Any, str]:
+    """The declarations with the covariance of the actual system without feedback, that matrix and its name.
+
+    Args:
+        own: the declarations.
+        measured: whether anything is measured, here or in a phase beside; if not it is E.
+    """
     error = next((matrix for matrix in own.matrices if matrix.estimation), None)
-    if error is None and not own.measurements:
-        own = with_estimation(own)
-        error = next(matrix for matrix in own.matrices if matrix.estimation)
-    if error is not None and not own.measurements:
+    if not measured:
+        if error is None:
+            own = with_estimation(own)
+            error = next(matrix for matrix in own.matrices if matrix.estimation)
         return own, error.matrix, error.name
     if error is None:
         with_it = with_estimation(own)  # for its labels and its first value alone
         error = next(matrix for matrix in with_it.matrices if matrix.estimation)
     check_name(SPREAD, list(own.taken))
     matrix = declare_matrix(SPREAD, labels=error.labels, where=caller(), lower=0.0, covariance=True)
-    matrix = replace(matrix, initial=error.initial)
+    matrix = replace(matrix, initial=error.initial, unmeasured=True)
     moved = augmented_drift(own) @ matrix.matrix
     rate = pack_symbolic(ca.densify(moved + moved.T + process_noise(own)))
     own = own.adding(matrices=matrix, rates={SPREAD: Dynamics(rate=rate, noise=None, where=caller())})
     return own, matrix.matrix, SPREAD
 
 
-def _check_scatters(own: Declarations, entry: Chance, fed_back: bool) -> None:
+def uncertainties(own: Declarations) -> list[Any]:
+    """All variances and densities that say what is uncertain in a problem."""
+    started: list[Any] = [q.variance for q in own.augmented] + [m.initial for m in own.matrices if m.estimation]
+    return started + [rate.noise for rate in own.rates.values() if rate.noise is not None]
+
+
+def check_uncertain(chances: Sequence[Chance], uncertain: list[Any]) -> None:
+    """Something is uncertain where probabilities are asked for."""
+    if chances and all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
+        raise ProblemError(
+            f"'{chances[0].name}' asks for a probability, but nothing in the system is uncertain.",
+            expected="variance= of a state or an unknown, or noise= in dynamics()",
+            received="no initial variance and no process noise",
+            remedy="say what is uncertain, or use subject_to()",
+        )
+
+
+def _check_scatters(entry: Chance, fed_back: bool) -> None:
     """Every row contains something that scatters."""
     assert entry.slopes is not None
     slopes = ca.horzcat(*entry.slopes)
@@ -210,15 +248,6 @@ def _check_scatters(own: Declarations, entry: Chance, fed_back: bool) -> None:
                 received=str(entry.expression[i])[:200],
                 remedy="use subject_to() for what does not scatter",
             )
-    uncertain: list[Any] = [q.variance for q in own.augmented] + [m.initial for m in own.matrices if m.estimation]
-    uncertain += [rate.noise for rate in own.rates.values() if rate.noise is not None]
-    if all(value.is_constant() and not np.any(ca.evalf(value).full()) for value in uncertain):
-        raise ProblemError(
-            f"'{entry.name}' asks for a probability, but nothing in the system is uncertain.",
-            expected="variance= of a state or an unknown, or noise= in dynamics()",
-            received="no initial variance and no process noise",
-            remedy="say what is uncertain, or use subject_to()",
-        )
 
 
 def _condition(entry: Chance, slopes: Any, covariance: Any) -> Constraint:

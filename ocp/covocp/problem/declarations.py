@@ -153,6 +153,7 @@ class Matrix:
     """A symmetric matrix state; `symbol` is its half-vector, `matrix` the full matrix that the user sees.
 
     role: "integral" of one number that depends on matrices and on which nothing depends; these come last.
+    unmeasured: whether it is the covariance of the augmented state that nobody measures.
     """
 
     name: str
@@ -170,8 +171,14 @@ class Matrix:
     labels: tuple[str, ...]
     backward: Backward | None = None
     role: Role = "moving"
+    unmeasured: bool = False
 
     __repr__ = short_repr
+
+    @property
+    def of_deviations(self) -> bool:
+        """Whether it is a covariance of the augmented state, which grows and passes as deviations do."""
+        return self.estimation or self.unmeasured
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,6 +14,7 @@ from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
 from covocp.base.riccati_rates import inverse, recognise, riccati_rate
+from covocp.problem.chances import check_uncertain, uncertainties
 from covocp.problem.checks import check_dynamics
 from covocp.problem.data import used_data
 from covocp.problem.decisions import check_decisions
@@ -143,6 +144,7 @@ def _check_complete(problem: Declarations, part: bool) -> None:
     check_integrals(problem)
     if not part:
         check_decisions(problem)
+        check_uncertain([c.chance for c in problem.constraints if c.chance is not None], uncertainties(problem))
     check_readings(problem.measurements, problem.matrices)
 
 

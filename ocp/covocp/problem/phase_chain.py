@@ -16,6 +16,7 @@ from covocp.base.matrices import half_length, pack_symbolic
 from covocp.problem.decisions import decisions_of, matters
 from covocp.problem.declarations import Declarations, Matrix, Parameter
 from covocp.problem.freeze import freeze
+from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import WEIGHT, deviations, in_phase, tangent, with_feedback
 from covocp.statement.chain import Chain, Link
 from covocp.statement.statement import Statement, entries_of, entry_names, error_size
@@ -38,7 +39,7 @@ def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], ju
         _check_kinds(phase)
     _check_constants(phases)
     jumping = [{j.name: j for j in jumps if j.phase == k} for k in range(len(phases))]
-    phases = with_feedback(phases, jumping)
+    phases = with_feedback(with_phase_chances(phases, jumps), jumping)
     _check_cost(phases)
     _check_decisions(phases, jumps)
     own = [replace(phases[0], cost=phases[0].cost or _no_cost())]
@@ -85,10 +86,10 @@ def _check_kinds(phase: Declarations) -> None:
     for constraint in phase.constraints:
         if constraint.chance is not None:
             _refuse(
-                f"The phase '{phase.name}' has the chance constraint '{constraint.chance.name}'.",
-                "subject_to(), also of variances: E[x, x] of the estimation covariance",
-                "chance()",
-                "state the limit with the deviation that it needs: subject_to(x + 3 * sqrt(E[x, x]), upper=...)",
+                f"The phase '{phase.name}' has the chance condition '{constraint.chance.name}' of a spread of its own.",
+                "phases as they were stated, so that what scatters goes through all of them",
+                "a problem that movable() returned",
+                "give the problem itself",
             )
     for state in phase.states:
         if state.chart is not None:
@@ -163,8 +164,8 @@ def _check_constants(phases: Sequence[Declarations]) -> None:
 
 def _check_same(name: str, kind: str, where: str, one: Any, other: Any) -> None:
     """Size and unit of what has the same name; values of what is constant."""
-    estimation = kind == "matrix" and one.estimation and other.estimation  # it grows with what appears
-    if kind != "control" and not estimation and one.size != other.size:
+    growing = kind == "matrix" and one.of_deviations and other.of_deviations  # with what appears
+    if kind != "control" and not growing and one.size != other.size:
         _refuse(
             f"The sizes of '{name}' in the phases {where} do not fit.",
             "the same number of components, or a jump() from one to the other of another name",
@@ -244,7 +245,9 @@ def _check_pair(before: Declarations, after: Declarations, jumps: dict[str, Any]
                 f"none in '{before.name}'",
                 "call estimation_covariance() there too: what is not measured there grows with its noise",
             )
-        plain = not matrix.estimation and matrix.role == "moving" and matrix.name in names and matrix.backward is None
+        plain = (
+            not matrix.of_deviations and matrix.role == "moving" and matrix.name in names and matrix.backward is None
+        )
         if plain and not _free_matrix(matrix):
             _refuse(
                 f"The matrix '{matrix.name}' goes on {pair} and has an initial value too.",
@@ -329,7 +332,7 @@ def _link(
         offset = span.stop
         if matrix.name not in going:
             continue
-        after_jump = _covariance(before, after, earlier[matrix.name], jumps) if matrix.estimation else None
+        after_jump = _covariance(before, after, earlier[matrix.name], jumps) if matrix.of_deviations else None
         halves.append(earlier[matrix.name].symbol if after_jump is None else pack_symbolic(after_jump))
         places += span
         names += [f"continuity of {name} from '{before.name}' to '{after.name}'" for name in entries_of(matrix)]

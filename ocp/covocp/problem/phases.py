@@ -150,7 +150,7 @@ class Phases:
         Raises:
             ProblemError: what does not fit: names, sizes, units, initial values, covariances.
         """
-        stated = (*(problem.declarations for problem in self._problems), self._jumps)
+        stated = (*(problem.stated for problem in self._problems), self._jumps)
         if self._chain is None or any(a is not b for a, b in zip(self._chain[0], stated, strict=True)):
             found = chain_of(self._name, self.names, stated[:-1], self._jumps)
             self._chain = (stated, found)
@@ -160,7 +160,7 @@ class Phases:
         """The phase, not the first one, and the state that a symbol stands for."""
         x = symbol_of(x)
         for k, problem in enumerate(self._problems):
-            for state in problem.declarations.states:
+            for state in problem.states:
                 same = isinstance(x, ca.MX) and x.is_symbolic() and ca.is_equal(x, state.symbol)
                 if not same or state.role == "integral":
                     continue

@@ -7,7 +7,7 @@ own unknowns there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -186,8 +186,16 @@ def actual_system(design: System, truth: Given) -> System:
             received=repr(truth)[:100],
             remedy="correct truth=",
         )
-    _check_measured(design, truth.declarations)
-    statement = _statement_of(truth.declarations)
+    return stated_system(design, truth.declarations, statement_of(plain_truth(truth.declarations)))
+
+
+def stated_system(design: System, truth: Declarations, statement: Statement) -> System:
+    """The system of a truth, from its declarations and the statement of `plain_truth` of them.
+
+    Raises:
+        ProblemError: names, sizes or instants differ from those of the design.
+    """
+    _check_measured(design, truth)
     _check_symbols(design, statement)
     return _from_statement(design, statement, statement.values)
 
@@ -278,14 +286,17 @@ def _with_values(design: System, truth: Mapping[Any, Any]) -> System:
     given = {name_of(key, statement.symbols, names, missing_ok=True) or str(key): v for key, v in truth.items()}
     values = stacked_parameters(statement, given, design.parameters)
     system = _from_statement(design, statement, values)
-    variance = system.variance.copy()
-    first = statement.np - design.unknowns
-    for block in statement.of_kind("unknown"):
-        if block.name in given:
-            rows = slice(design.states + block.offset - first, design.states + block.offset - first + block.size)
-            variance[rows, :] = 0.0
-            variance[:, rows] = 0.0
+    variance, rows = system.variance.copy(), unknown_rows(design, given)
+    variance[rows, :] = 0.0
+    variance[:, rows] = 0.0
     return replace(system, variance=variance)
+
+
+def unknown_rows(system: System, names: Container[str]) -> list[int]:
+    """Rows of the augmented state with the unknowns of some names."""
+    first = system.statement.np - system.size
+    blocks = [block for block in system.statement.of_kind("unknown") if block.name in names]
+    return [k - first for block in blocks for k in range(block.span.start, block.span.stop)]
 
 
 def _from_statement(design: System, statement: Statement, values: Array) -> System:
@@ -307,18 +318,19 @@ def _from_statement(design: System, statement: Statement, values: Array) -> Syst
     )
 
 
-def _statement_of(truth: Declarations) -> Statement:
-    """The truth as a statement with an estimation covariance; its cost and its constraints do not matter."""
+def plain_truth(truth: Declarations) -> Declarations:
+    """The truth with an estimation covariance and no other matrix; its cost and its constraints do not matter."""
     moving = {state.name for state in truth.states}
     plain = replace(
         truth,
         matrices=tuple(matrix for matrix in truth.matrices if matrix.estimation),
         rates={name: entry for name, entry in truth.rates.items() if name in moving},
         constraints=(),
+        chances=(),
         expected=None,
         cost=(ca.MX(0), ca.sumsqr(ca.vertcat(*(state.symbol for state in truth.states)))),
     )
-    return statement_of(plain if plain.matrices else with_estimation(plain))
+    return plain if plain.matrices else with_estimation(plain)
 
 
 def _check_symbols(design: System, truth: Statement) -> None:

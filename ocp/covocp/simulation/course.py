@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, Cloud, run_stretch
+from covocp.simulation.flown import LawFailedError
 from covocp.simulation.junction import Junction
 from covocp.simulation.plan import Plan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Course:
-    """The plan of each stretch, and what carries the runs from one to the next."""
+    """The plan of each stretch, and what carries the runs from one to the next; names of the stretches."""
 
     plans: tuple[Plan, ...]
     junctions: tuple[Junction, ...]
+    names: tuple[str, ...]
 
     __repr__ = short_repr
 
@@ -36,11 +38,19 @@ class Legs:
 
 
 def run_course(course: Course, first: int, last: int, stop: Callable[[], bool] | None = None) -> Legs:
-    """Simulate the runs first, ..., last - 1 through all stretches; see `run_batch`."""
+    """Simulate the runs first, ..., last - 1 through all stretches; see `run_batch`.
+
+    Raises:
+        LawFailedError: a law raised; in which phase is said.
+        StoppedError: when `stop` said so.
+    """
     cloud: Cloud | None = None
     found: list[Batch] = []
     for k, plan in enumerate(course.plans):
-        batch, end = run_stretch(plan, first, last, stop, cloud)
+        try:
+            batch, end = run_stretch(plan, first, last, stop, cloud)
+        except LawFailedError as error:
+            raise LawFailedError(f"in the phase '{course.names[k]}' {error}") from error
         found.append(batch)
         if k < len(course.junctions):
             cloud = course.junctions[k].carried(end)

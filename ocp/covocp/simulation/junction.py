@@ -1,6 +1,6 @@
 """From one phase of a simulation to the next: what jump, appearance and end do to the runs and to the prediction.
 
-The actual system jumps by its expression J(x, b) at where it is, with noise of the variance that is stated there; a
+The actual system jumps by its own expression J(x, b) at where it is, with noise of the variance that is stated there; a
 state or an unknown that appears is drawn about its mean. The perturbation filter passes its estimate of the deviation
 by the tangent along the nominal, as the covariance of the design does (E+ = J E J' + N); the extended filter puts its
 own estimate into the expression, and its covariance goes by the tangent there.
@@ -8,6 +8,7 @@ own estimate into the expression, and its covariance goes by the tangent there.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_length, pack_symbolic, unpack_symbolic
 from covocp.base.short_repr import short_repr
-from covocp.simulation.actual import System
+from covocp.simulation.actual import System, unknown_rows
 from covocp.simulation.batches import Cloud
 from covocp.simulation.run_parts import factor, part
 from covocp.simulation.schedule import Estimator
@@ -25,17 +26,42 @@ from covocp.statement.chain import Link
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Passage:
+    """What linear theory knows of a junction; n, n+: rows of the augmented state before and after.
+
+    tangent: of the actual system along the nominal, (n+, n); believed: that of the design, by which estimates pass.
+    offset: by how much the actual system lands beside the nominal with no deviation, (n+,). noise: (n+, n+).
+    """
+
+    tangent: Array
+    believed: Array
+    offset: Array
+    noise: Array
+
+    __repr__ = short_repr
+
+    def predicted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Mean and covariance of deviation and estimate, stacked, after it."""
+        none, rows = np.zeros_like(self.tangent), self.noise.shape[0]
+        both = np.block([[self.tangent, none], [none, self.believed]])
+        moved, carried = both @ covariance @ both.T, both @ mean
+        moved[:rows, :rows] += self.noise
+        carried[:rows] += self.offset
+        return carried, moved
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Junction:
-    """What carries runs and prediction over; n, n+: rows of the augmented state before and after.
+    """What carries runs and predictions over.
 
     function: (state, unknowns, estimate, half-vector E of the extended filter, normal numbers) -> the first four after.
-    noises: normal numbers of a run; tangent: of the augmented states along the nominal, (n+, n); noise: (n+, n+).
+    noises: normal numbers of a run. design, actual: what linear theory knows of it for either system.
     """
 
     function: ca.Function
     noises: int
-    tangent: Array
-    noise: Array
+    design: Passage
+    actual: Passage
 
     __repr__ = short_repr
 
@@ -50,34 +76,40 @@ class Junction:
         )
         return Cloud(x=x, own=own, estimate=estimate, E=E, gone=cloud.gone, streams=cloud.streams)
 
-    def predicted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean and covariance of deviation and estimate, stacked, after it."""
-        none = np.zeros_like(self.tangent)
-        both = np.block([[self.tangent, none], [none, self.tangent]])
-        moved = both @ covariance @ both.T
-        moved[: self.noise.shape[0], : self.noise.shape[0]] += self.noise
-        return both @ mean, moved
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Ends:
-    """The end of a phase and the start of the next one, with the link between them."""
+class Ends:
+    """The end of a phase and the start of the next one for a system, with its link between them.
+
+    before, after: solutions of the design. earlier, later: the system in both phases. fixed: names of the unknowns that
+    have one value in all runs.
+    """
 
     before: Solution
     after: Solution
     earlier: System
     later: System
     link: Link
+    fixed: Container[str] = ()
 
-    def given(self, state: Any, unknowns: Any, e: Any) -> tuple[Any, Any]:
-        """Augmented state after the jump from that before it, and E after it from all half-vectors.
+    __repr__ = short_repr
 
-        Rows that nothing gives are those of the later nominal.
+    @property
+    def nominal(self) -> tuple[Array, Array]:
+        """State and unknowns before it along the nominal, the unknowns at the mean that the system has."""
+        return self.before.trajectory.x[-1, : self.earlier.states], self.earlier.start[self.earlier.states :]
+
+    def given(self, state: Any, unknowns: Any, e: Any = None) -> tuple[Any, Any]:
+        """Augmented state after the jump from that before it, and E after it from all half-vectors (None: zero).
+
+        Rows that nothing gives are those with which the system starts.
         """
-        end, p = self.before.trajectory.x[-1], self.before.parameters
-        whole = ca.vertcat(state, ca.DM(end[self.earlier.states :]))
-        known = ca.vertcat(ca.DM(p[: p.size - self.earlier.unknowns]), unknowns)
-        values, halves = self.link.function(whole, e, self.before.duration, known, ca.DM(self.after.parameters))
+        earlier, end = self.earlier, self.before.trajectory.x[-1]
+        whole = ca.vertcat(state, ca.DM(end[earlier.states : earlier.statement.nx]))
+        known = ca.vertcat(ca.DM(earlier.parameters[: earlier.parameters.size - earlier.unknowns]), unknowns)
+        e = ca.DM.zeros(earlier.statement.ne) if e is None else e
+        duration, later = self.before.duration, ca.DM(self.later.parameters)
+        values, halves = self.link.function(whole, e, duration, known, later)
         rows = [ca.MX(float(value)) for value in self.later.start]
         for place, entry in enumerate(self.link.states):
             if entry < self.later.states:
@@ -85,7 +117,9 @@ class _Ends:
         for row, column in self.same:
             rows[row] = unknowns[column]
         places = [self.link.matrices.index(k) for k in range(self.later.covariance.start, self.later.covariance.stop)]
-        return ca.vertcat(*rows), unpack_symbolic(halves[places], self.later.size)
+        drawn = np.ones(self.later.size)
+        drawn[[k for k in unknown_rows(self.later, self.fixed) if k not in dict(self.same)]] = 0.0
+        return ca.vertcat(*rows), unpack_symbolic(halves[places], self.later.size) * ca.DM(np.outer(drawn, drawn))
 
     @property
     def same(self) -> list[tuple[int, int]]:
@@ -103,40 +137,47 @@ class _Ends:
         return [row for row in range(self.later.size) if row not in going]
 
 
-def junction(
-    before: Solution, after: Solution, earlier: System, later: System, link: Link, kind: Estimator
-) -> Junction:
+def junction(design: Ends, actual: Ends, kind: Estimator) -> Junction:
     """What carries a simulation from a phase to the next one.
 
     Args:
-        before: solution of the phase that ends.
-        after: of the next one.
-        earlier: the system of the phase that ends.
-        later: of the next one.
-        link: between them.
+        design: both ends for the system that filter and feedback were designed for.
+        actual: for the one that flies.
         kind: of the filter.
     """
-    ends = _Ends(before=before, after=after, earlier=earlier, later=later, link=link)
-    n, still, noisy = earlier.size, earlier.unknowns, ends.noisy
-    x, own, w = ca.MX.sym("x", earlier.states), ca.MX.sym("own", still), ca.MX.sym("w", len(noisy))
-    nothing = ca.DM.zeros(before.trajectory.e.shape[1])
-    moved, N = ends.given(x, own, nothing)
-    tangent = ca.horzcat(*(ca.jacobian(moved, symbol) for symbol in (x, own)))
-    at = ca.Function("at", [x, own], [tangent, N])
-    end = before.trajectory.x[-1, : earlier.states], before.parameters[before.parameters.size - still :]
-    J, spread = (np.asarray(v.full()) for v in at(*end))
-    actual = ca.MX(moved)
+    earlier, later, noisy = design.earlier, design.later, actual.noisy
+    x, own, w = (ca.MX.sym(*a) for a in (("x", earlier.states), ("own", earlier.unknowns), ("w", len(noisy))))
+    believed, landed, noise = _along_nominal(design)
+    tangent, flown, added = (believed, landed, noise) if actual is design else _along_nominal(actual)
+    known = np.concatenate([np.zeros(earlier.states), actual.nominal[1] - design.nominal[1]])
+    # Another mean of an unknown stands in the mean of the deviation before, and is taken off here.
+    offset = flown - landed - tangent @ known
+    moved, N = actual.given(x, own)
+    moved = ca.MX(moved)
     if noisy:
-        actual[noisy] += factor(N[noisy, noisy]) @ w
+        moved[noisy] += factor(N[noisy, noisy]) @ w
     if kind == "extended":
-        y, E = ca.MX.sym("y", n), ca.MX.sym("E", half_length(n))
-        e = ca.MX(nothing)
+        y, E = ca.MX.sym("y", earlier.size), ca.MX.sym("E", half_length(earlier.size))
+        e = ca.MX.zeros(earlier.statement.ne)
         e[earlier.covariance] = E
-        estimate, covariance = ends.given(part(y, 0, earlier.states), part(y, earlier.states), e)
+        estimate, covariance = design.given(part(y, 0, earlier.states), part(y, earlier.states), e)
         outputs = [estimate, pack_symbolic(covariance)]
     else:
-        y, E = ca.MX.sym("y", n), ca.MX.sym("E", 0)
-        outputs = [ca.DM(J) @ y, ca.MX(0, 1)]
-    outputs = [part(actual, 0, later.states), part(actual, later.states), *outputs]
-    function = ca.Function("junction", [x, own, y, E, w], [ca.densify(value) for value in outputs])
-    return Junction(function=function, noises=len(noisy), tangent=J, noise=spread)
+        y, E = ca.MX.sym("y", earlier.size), ca.MX.sym("E", 0)
+        outputs = [ca.DM(believed) @ y, ca.MX(0, 1)]
+    outputs = [part(moved, 0, later.states), part(moved, later.states), *outputs]
+    return Junction(
+        function=ca.Function("junction", [x, own, y, E, w], [ca.densify(value) for value in outputs]),
+        noises=len(noisy),
+        design=Passage(tangent=believed, believed=believed, offset=np.zeros(later.size), noise=noise),
+        actual=Passage(tangent=tangent, believed=believed, offset=offset, noise=added),
+    )
+
+
+def _along_nominal(ends: Ends) -> tuple[Array, Array, Array]:
+    """Tangent, augmented state after it and noise along the nominal."""
+    x, own = ca.MX.sym("x", ends.earlier.states), ca.MX.sym("own", ends.earlier.unknowns)
+    moved, N = ends.given(x, own)
+    tangent = ca.horzcat(*(ca.jacobian(moved, symbol) for symbol in (x, own)))
+    J, landed, noise = ca.Function("along", [x, own], [tangent, moved, N])(*ends.nominal)
+    return np.asarray(J.full()), np.asarray(landed.full()).ravel(), np.asarray(noise.full())

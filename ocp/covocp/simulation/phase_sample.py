@@ -108,6 +108,7 @@ class PhasesMonteCarlo:
         first, failing = self.phases[0], self.failing
         fed_back = any(phase.fed_back for phase in self.phases)
         flown = f"{first.filter} filter" + (" and feedback" if fed_back else ", no feedback")
+        flown = "a law in each phase" if first.filter == "law" else flown
         what = f"{self.runs} runs through {len(self)} phases, seed {first.seed}, {flown}"
         verdict = f"The linear prediction of the {'spread' if fed_back else 'errors of the filter'} "
         verdict += f"FAILS at the end of {', '.join(failing)}." if failing else "holds at the end of every phase."

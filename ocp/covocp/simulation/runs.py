@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, overload
 
 from covocp.base.arguments import checked, truth
@@ -12,6 +11,7 @@ from covocp.base.threads import one_at_a_time
 from covocp.simulation.actual import actual_system
 from covocp.simulation.flown import flown_law, sample_indices
 from covocp.simulation.monte_carlo import MonteCarlo
+from covocp.simulation.phase_asked import Asked
 from covocp.simulation.phase_runs import simulate_phases
 from covocp.simulation.phase_sample import PhasesMonteCarlo
 from covocp.simulation.plan import make_plan
@@ -25,10 +25,12 @@ from covocp.simulation.stretch import (
     designed,
     domain_of,
     examined_sample,
+    in_words,
     limits_of,
     reporting,
     sample_of,
     tell_missing,
+    true_cost,
 )
 from covocp.simulation.workers import simulate_batches
 from covocp.solution.phases import PhasesSolution, check_begins
@@ -36,15 +38,6 @@ from covocp.solution.solution import Solution
 
 # Runs in a batch: wide enough that numpy's operations outweigh their calls, and tasks enough for some workers.
 LARGEST_BATCH, LARGEST_TASK = 2048, 512
-
-
-# What phases do not take: the design's system, filter and feedback are what flies in them, without limits.
-SINGLE = {
-    "truth": "the design's system",
-    "law": "the design's filter and feedback",
-    "period": "the design's filter and feedback",
-    "limits": "no limit of the actual control",
-}
 
 
 @overload
@@ -84,19 +77,21 @@ def simulate(
     some 5 kB each, in every process, and for all runs the terminal values; histories of the first `paths` runs only.
 
     Args:
-        solution: of a problem with an expected cost or an estimation covariance; or of phases with one each, without
-            `truth`, `law`, `period` and `limits`: every run then goes through all of them, with their jumps.
+        solution: of a problem with an expected cost or an estimation covariance; or of phases with one each: every run
+            then goes through all of them, with their jumps.
         runs: number of runs.
         seed: of the random numbers, a whole number.
         truth: what is simulated instead of the design's system: a problem with the same states, unknowns, controls and
             measurements and any dynamics, noises and variances; or a dict of parameter or unknown to the value that it
-            has in every run. Filter and feedback stay those of the design.
+            has in every run. Of phases: `Phases` of such problems, or the dict for all that have the name. Filter and
+            feedback stay those of the design.
         law: what flies instead of the design's filter and feedback: an object with `step(measurement, time)` that
             returns the whole control, (m,), such as a CPackage's `python()`. Each run has a deep copy of it, started by
             its `init()` where it has one, stepped every `period` from time zero on: with the mean of the actual
             measurement over the period before, (r,), NaN at time zero, and below it what was read at instants since
             its last step, NaN where nothing was; its control is held until the next step. Where
-            it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too.
+            it has an `estimate` of the deviation from the nominal, (n,), its errors are reported too. Of phases: a
+            list or a dict by name, a law for each phase, which starts there anew in the time of the phase.
         period: time between two steps of the law [s]; None: its own attribute `period`.
         executor: anything with the `concurrent.futures` interface (processes, MPI, a Dask client's `get_executor()`);
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
@@ -125,8 +120,8 @@ def simulate(
     size = (LARGEST_BATCH if executor is None else LARGEST_TASK) if batch is None else batch
     request = Request(runs=runs, seed=seed, store=store, paths=paths, batch=size, level=level, filter=filter, step=step)
     if isinstance(solution, PhasesSolution):
-        _check_phased({"truth": truth, "law": law, "period": period, "limits": limits})
-        return simulate_phases(solution, request, executor=executor, progress=progress)
+        asked = Asked(truth=truth, law=law, period=period, limits=limits)
+        return simulate_phases(solution, request, asked, executor=executor, progress=progress)
     design = designed(solution)
     check_begins(solution, "simulate()")
     flown = flown_law(law, period, design, solution.duration)
@@ -153,13 +148,6 @@ def simulate(
         tell_missing(harvest, runs)
         at = indices(base, t)
         kept = tuple(prediction.at(at) for prediction in (expected, true))
-        result = sample_of(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, truth)
+        told = in_words(truth), true_cost(solution, truth)
+        result = sample_of(setting, request, chosen, nominal_at(solution, t, intervals), kept, harvest, told)
         return examined_sample(result, setting, reporter)
-
-
-def _check_phased(given: Mapping[str, Any]) -> None:
-    """Refuse what a simulation of phases does not take."""
-    for name, value in given.items():
-        if value is not None:
-            expected = f"None: in phases there is {SINGLE[name]}"
-            raise wrong_argument(name, expected, value, f"leave {name}= out, or simulate a phase, solution[name]")

@@ -28,7 +28,7 @@ from covocp.simulation.workers import Harvest
 from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
-from covocp.statement.names import control_limits
+from covocp.statement.names import control_limits, name_of
 
 # What stands for no such limit; a number, so that a comparison finds inf and NaN.
 UNLIMITED = 1e300
@@ -94,7 +94,7 @@ def chosen_step(
         return given_step(base, float(request.step), true.step_rates)
     try:
         chosen = choose_step(
-            _pilot(setting),
+            pilot_setting(setting),
             base,
             true.step_rates,
             runs=request.runs,
@@ -111,7 +111,7 @@ def chosen_step(
     return chosen
 
 
-def _pilot(setting: Setting) -> Setting:
+def pilot_setting(setting: Setting) -> Setting:
     """What flies in pilot runs: a law would take long, and the system moves as fast under the design's own filter."""
     return replace(setting, filter="perturbation", flown=None) if setting.flown else setting
 
@@ -122,7 +122,7 @@ def examined_sample(sample: MonteCarlo, setting: Setting, reporter: Progress, cl
         return sample
     try:
         asked: Any = {"runs": sample.runs, "seed": sample.seed, "stop": lambda: reporter.stop, "cloud": cloud}
-        step = examined(sample.step, _pilot(setting), **asked)
+        step = examined(sample.step, pilot_setting(setting), **asked)
     except StoppedError:
         return sample
     if not step.settled:
@@ -173,14 +173,14 @@ def sample_of(
     nominal: Nominal,
     predictions: tuple[Prediction, ...],
     harvest: Harvest[Batch],
-    truth: Given,
+    truth: tuple[str, float],
 ) -> MonteCarlo:
-    """The batches put together."""
+    """The batches put together; `truth`: in words, and what linear theory says that it costs."""
     design, solution, (expected, true) = setting.design, setting.solution, predictions
     unknowns = np.tile(design.start[design.entries :], (nominal.t.size, 1))
     states = _values(design.motion, nominal.x)
     limits, m = setting.limits, design.fed_back
-    costs = _predicted_costs(solution, truth) if setting.costs else (np.nan, np.nan)
+    costs = (solution.cost, truth[1]) if setting.costs else (np.nan, np.nan)
 
     return MonteCarlo(
         **_of_runs(harvest.batches),
@@ -191,7 +191,7 @@ def sample_of(
         period=np.nan if setting.flown is None else setting.flown.period,
         estimated=setting.flown is None or setting.flown.estimates,
         fed_back=m > 0,
-        truth=_in_words(truth),
+        truth=truth[0],
         level=float(request.level),
         step=chosen,
         t=nominal.t,
@@ -235,17 +235,20 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     return {**read_only(values), "moments": moments_of(batches)}
 
 
-def _predicted_costs(solution: Solution, truth: Given) -> tuple[float, float]:
-    """Expected cost by the design, and by linear theory for the truth; NaN where that knows other dynamics."""
+def true_cost(solution: Solution, truth: Given) -> float:
+    """Expected cost by linear theory for the truth; NaN where that knows other dynamics or constants."""
     if truth is None:
-        return solution.cost, solution.cost
+        return solution.cost
+    unknowns = tuple(block.name for block in solution.blocks if block.kind == "unknown")
+    if isinstance(truth, Mapping) and any(name_of(k, solution.symbols, unknowns, missing_ok=True) for k in truth):
+        return np.nan  # what has one value in every run is not uncertain any more
     try:
-        return solution.cost, evaluate(solution, truth=truth).cost
+        return evaluate(solution, truth=truth).cost
     except (ProblemError, RuntimeError):  # `evaluate` takes other statistics only, of what has second derivatives
-        return solution.cost, np.nan
+        return np.nan
 
 
-def _in_words(truth: Given) -> str:
+def in_words(truth: Given) -> str:
     """The truth in a few words; "" where it is the design's system."""
     if truth is None:
         return ""

@@ -21,6 +21,7 @@ from covocp.solution.report import refinement, sections, starts_told
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
+from covocp.statement.names import name_of, sizes_of, unknown_name
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -251,6 +252,30 @@ class PhasesSolution:
     def _repr_html_(self) -> str:
         """What a notebook shows: the same summary, and the figure."""
         return as_html(self.sections(), later("plot.embedding").embedded(self.plot))
+
+
+def limits_of_each(solution: PhasesSolution, limits: Given) -> list[Any]:
+    """Limits of each phase from those of all: of a dict what a phase has controls of.
+
+    Raises:
+        ProblemError: no phase has a control of that name.
+    """
+    if not isinstance(limits, Mapping):
+        return [limits] * len(solution)
+    known = [tuple(block.name for block in phase.blocks if block.kind == "control") for phase in solution]
+    every = {name: 0 for names in known for name in names}
+    result: list[dict[Any, Any]] = [{} for _ in known]
+    for key, value in limits.items():
+        found = [
+            name_of(key, phase.symbols, names, missing_ok=True, sizes=sizes_of(phase.blocks))
+            for phase, names in zip(solution, known, strict=True)
+        ]
+        if not any(found):
+            raise unknown_name(key, tuple(every))
+        for own, name in zip(result, found, strict=True):
+            if name:
+                own[name] = value
+    return list(result)
 
 
 def _merged(samples: list[tuple[Any, Mapping[str, Array]]], times: Array) -> dict[str, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -27,6 +27,7 @@ from covocp.solving.refining import FIRST, adapted, first_options
 from covocp.solving.unused import mention_lengths
 from covocp.statement.chain import Chain
 from covocp.statement.names import name_of, stacked_parameters
+from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Options
 
 Arrays = tuple[Array, ...]
@@ -162,23 +163,31 @@ def of_each(chain: Chain, guess: Given, what: str = "guess") -> list[Any]:
 
 def values_of(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
     """Parameters of each statement; a name counts in all that have it."""
-    carried = [{b.name for b in st.matrices} for st in chain.statements]
-    own = [
-        [b.name for b in st.blocks if b.kind in ("parameter", "unknown") and b.name[:-3] not in names]
-        for st, names in zip(chain.statements, carried, strict=True)
-    ]
     if not isinstance(parameters, Mapping):
         stacked_parameters(chain.statements[0], parameters)  # says what it should be
-    pairs = list(zip(chain.statements, own, strict=True))
+    pairs = zip(chain.statements, given_of_each(chain.statements, parameters), strict=True)
+    return tuple(stacked_parameters(st, given) for st, given in pairs)
+
+
+def given_of_each(statements: Sequence[Statement], parameters: Mapping[Any, Any]) -> list[dict[str, Any]]:
+    """For each statement the values by name of its parameters and unknowns, from those of all.
+
+    Raises:
+        ProblemError: none has a parameter or unknown of that name.
+    """
+    carried = [{b.name for b in st.matrices} for st in statements]
+    own = [
+        tuple(b.name for b in st.blocks if b.kind in ("parameter", "unknown") and b.name[:-3] not in names)
+        for st, names in zip(statements, carried, strict=True)
+    ]
+    pairs = list(zip(statements, own, strict=True))
     by_name: dict[str, Any] = {}
     for key, value in parameters.items():
-        found = [name for st, names in pairs if (name := name_of(key, st.symbols, tuple(names), missing_ok=True))]
+        found = [name for st, names in pairs if (name := name_of(key, st.symbols, names, missing_ok=True))]
         if not found:
             raise _no_such("parameter", key, [n for names in own for n in names])
         by_name[found[0]] = value
-    return tuple(
-        stacked_parameters(st, {name: value for name, value in by_name.items() if name in names}) for st, names in pairs
-    )
+    return [{name: value for name, value in by_name.items() if name in names} for names in own]
 
 
 def _no_such(what: str, name: Given, known: list[str]) -> ProblemError:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.errors import warn_user
-from covocp.base.expressions import Expr, Given
+from covocp.base.expressions import Expr
 from covocp.export.laws.history import History
 from covocp.export.text.names import identifier
-from covocp.solution.phases import PhasesSolution
-from covocp.statement.names import Limits, name_of, sizes_of, unknown_name
+from covocp.statement.names import Limits
 from covocp.statement.statement import Statement, entry_names
 
 # Share of its size by which a nominal control may lie outside without a word: solvers widen bounds by less.
@@ -27,30 +25,6 @@ def clipped(value: Expr, limits: Limits) -> Any:
         row = ca.fmax(value[i], low) if np.isfinite(low) else value[i]
         rows.append(ca.fmin(row, high) if np.isfinite(high) else row)
     return ca.vertcat(*rows)
-
-
-def limits_of_each(solution: PhasesSolution, limits: Given) -> list[Any]:
-    """Limits of each phase from those of all: of a dict what a phase has controls of.
-
-    Raises:
-        ProblemError: no phase has a control of that name.
-    """
-    if not isinstance(limits, Mapping):
-        return [limits] * len(solution)
-    known = [tuple(block.name for block in phase.blocks if block.kind == "control") for phase in solution]
-    every = {name: 0 for names in known for name in names}
-    result: list[dict[Any, Any]] = [{} for _ in known]
-    for key, value in limits.items():
-        found = [
-            name_of(key, phase.symbols, names, missing_ok=True, sizes=sizes_of(phase.blocks))
-            for phase, names in zip(solution, known, strict=True)
-        ]
-        if not any(found):
-            raise unknown_name(key, tuple(every))
-        for own, name in zip(result, found, strict=True):
-            if name:
-                own[name] = value
-    return list(result)
 
 
 def limits_text(statement: Statement, limits: Limits) -> str:
