@@ -157,7 +157,7 @@ def test_it_is_as_certain_as_it_says_and_the_printed_filter_is_not(inputs):
 @pytest.mark.parametrize("inputs", [1, 2, 3, 4, 6])
 def test_modified_step_is_that_of_the_eigenvalues(inputs):
     """Against LAPACK: curvatures by size, at least the smallest, and no longer than allowed."""
-    for seed in range(20):
+    for seed in range(20 if inputs < 4 else 5):
         M, b, _ = random_quadratic(seed, inputs)
         given = USUAL | {"smallest_curvature": 0.3, "largest_step": 0.7}
         for maximum in (False, True):

@@ -61,7 +61,7 @@ int main(void)
     return 0;
 }}
 """
-SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+SANITIZE = ["-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 # Needs the header and the object code of any package.
 APP = """\
 #include "{name}.h"
@@ -107,7 +107,8 @@ def test_no_nonsense_leads_to_a_crash_or_a_control_that_is_no_number(name, tmp_p
     )
     (tmp_path / "main.c").write_text(text)
     sources = [tmp_path / "main.c", made.directory / f"{name}.c", made.directory / f"{name}_casadi.c"]
-    command = ["cc", "-std=c99", *SANITIZE, f"-I{made.directory}", *sources, "-lm", "-o", tmp_path / "main"]
+    effort = "-O1" if name.endswith("sampled") else "-O0"  # those that run long; the others compile long
+    command = ["cc", "-std=c99", effort, *SANITIZE, f"-I{made.directory}", *sources, "-lm", "-o", tmp_path / "main"]
     built = subprocess.run(command, capture_output=True, text=True)
     if built.returncode and "sanitize" in built.stderr:
         pytest.skip("the compiler has no sanitizers")

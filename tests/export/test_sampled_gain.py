@@ -83,9 +83,9 @@ def test_spread_as_flown_is_that_of_the_compiled_law_in_the_actual_system(steep_
         warnings.simplefilter("ignore", co.CovocpWarning)  # what a tenth of a second loses
         package = co.export_c(steep_end, FOLDER / "steep_tenth", period=0.1)
     assert package.check().ok
-    runs = co.simulate(steep_end, 1500, seed=4, law=package.python(), progress=False)
+    runs = co.simulate(steep_end, 500, seed=4, law=package.python(), progress=False)
     predicted = np.sqrt(np.diagonal(samples.flown[-1]))
-    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 1500))
+    np.testing.assert_allclose(runs.deviation("x")[-1], predicted, rtol=4.0 / np.sqrt(2 * 500))
 
 
 def test_a_sampled_loop_promises_what_it_holds(steep_end):

@@ -33,6 +33,7 @@ from covocp.models import (
 pytestmark = pytest.mark.filterwarnings("ignore::covocp.CovocpWarning")
 
 TIGHT = {"ipopt": {"tol": 1e-11, "bound_relax_factor": 0.0}}
+SILENT = {"print_iter": False, "print_header": False, "print_info": False}
 SAME = 1e-8
 CLOSED_FORM = 1e-9
 
@@ -49,7 +50,7 @@ CASES = {
     "Goddard": (goddard_rocket.problem, 10, {"initial_h": 1.002}),
     "regulator": (lqg_double_integrator.problem, 12, {"initial_position": 1.2}),
     "free time": (free_time_integrator.problem, 10, {"initial_x": 0.1}),
-    "Mars entry": (mars_entry.problem, 10, {"initial_h": 1.02 * 328000.0, "initial_v": 0.98 * 15000.0}),
+    "Mars entry": (mars_entry.problem, 8, {"initial_h": 1.02 * 328000.0, "initial_v": 0.98 * 15000.0}),
 }
 
 
@@ -67,7 +68,8 @@ def moved(problem, starts):
 def test_costs_are_those_of_the_converged_optimum(case):
     make, intervals, changes = CASES[case]
     mesh = {"intervals": intervals, "substeps": 2}
-    made = export_c(make(), FOLDER / f"cost_{list(CASES).index(case)}", **mesh)
+    short = {"qpsol_options": {"max_iter": 150, "error_on_fail": False, **SILENT}} if case == "Goddard" else {}
+    made = export_c(make(), FOLDER / f"cost_{list(CASES).index(case)}", **mesh, plugin_options=short)
     planner = made.reference()
     for given in ({}, changes):
         plan = planner(**given)

@@ -46,7 +46,7 @@ def by_nine_states(first, last):
 
 
 def test_slews_between_random_attitudes_solve_from_the_default_guess():
-    for first, last in pairs(50, seed=1):
+    for first, last in pairs(25, seed=1):
         ocp, *_ = slew(first, last)
         solution = co.solve(ocp, intervals=20)
         assert solution.converged

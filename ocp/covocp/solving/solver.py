@@ -351,12 +351,13 @@ class Solver:
             return _noted(solution, **Classical(missing=str(error).partition("\n")[0]).counts)
         if classical is None:
             return _noted(solution, **Classical(missing="The problem without noise was not solved.").counts)
-        if _is_worse(solution, classical):  # stationary up to a tolerance only, or spurious: going on from there tells
-            solution = self._continued(solution, given)
-        excess, worse = solution.cost - classical, _is_worse(solution, classical)
+        worse, excess = _is_worse(solution, classical), solution.cost - classical
         suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
         if suspicious and is_roundoff(excess, self.statement, self._options, given):
             return _noted(solution, **Classical(cost=classical, same=True).counts)
+        if worse:  # stationary up to a tolerance only, or spurious: going on from there tells
+            solution = self._continued(solution, given)
+            worse = _is_worse(solution, classical)
         if worse:
             warn_user(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
