@@ -181,3 +181,18 @@ def test_interrupted_multistart_says_so(monkeypatch):
     with pytest.raises(co.Interrupted, match="the best of 3 of 11 starts") as caught:
         solve(lag().problem, intervals=20, guess="multistart", starts=10)
     assert caught.value.solution.converged  # one of the two before
+
+
+@pytest.mark.parametrize("power", [2, 4])
+def test_states_that_answer_to_nothing_by_a_power_do_not_make_the_start_vanish(power):
+    """v' = u, y' = -v^n from rest: y has no slope by u there, and nothing else gives its size."""
+    ocp = co.Problem(3.0)
+    v, y = (ocp.state(name, initial=0.0) for name in "vy")
+    u = ocp.control("u")
+    ocp.dynamics(v, u)
+    ocp.dynamics(y, -0.1 * v**power)
+    ocp.minimize(running=(u - 1.0) ** 2)
+    solution = co.solve(ocp, intervals=12, progress=False)
+    assert solution.cost < 1e-20
+    assert solution.stats["iterations"] <= 5
+    assert solution["y"][-1] == pytest.approx(-0.1 * 3.0 ** (power + 1) / (power + 1), rel=1e-4)

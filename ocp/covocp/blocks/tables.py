@@ -1,14 +1,15 @@
 """Tables of one to three variables as expressions: piecewise linear or cubic, with exact derivatives.
 
-A table is a polynomial on each cell of its grid. A small one chooses the cell by comparisons and has an SX form. For a
-large one every cell would be computed each time, so that in MX it looks its cell up in the grid; an expression with
-such a table has no SX form. Seconds of 1000 values with both derivatives, by comparisons and looked up: 65 knots 8e-3
-and 7e-4, 10 001 knots 1.2 and 2e-2.
+A table is a polynomial on each cell of its grid. A small one chooses the cell by comparisons, written out in scalars.
+For a large one every cell would be computed each time, so that it looks its cell up in the grid, by a function that
+stays a call where an expression of MX is written out. Seconds of 1000 values with both derivatives, by comparisons and
+looked up: 65 knots 8e-3 and 7e-4, 10 001 knots 1.2 and 2e-2.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -24,8 +25,10 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 
 KINDS = ("linear", "cubic")
-# Cells up to which a table in MX chooses by comparisons and can be expanded.
+# Cells up to which a table in MX chooses by comparisons and is written out.
 SMALL_CELLS = 64
+# Functions of tables begin so: what reads an expression finds them by it, and their limits in the last argument.
+FUNCTION = "covocp_table_"
 # Knots of each variable that the not-a-knot spline needs: its first two and its last two pieces are one.
 FEWEST = {"linear": 2, "cubic": 4}
 
@@ -73,11 +76,16 @@ class Table:
         if not any(isinstance(value, ca.MX) for value in arguments):
             point = [ca.MX.sym("x") for _ in arguments]
             return float(ca.Function("value", point, [self._looked_up(*point)])(*arguments))
-        given = [ca.MX(value) for value in arguments]
-        if math.prod(knots.size - 1 for knots in self.grid) > SMALL_CELLS:
-            return self._looked_up(*given)
-        symbols = [ca.SX.sym("x") for _ in given]
-        return ca.Function("table", symbols, [self._compared(*symbols)])(*given)
+        small = math.prod(knots.size - 1 for knots in self.grid) <= SMALL_CELLS
+        kind: Any = ca.SX if small else ca.MX
+        symbols = [kind.sym("x") for _ in arguments]
+        value = self._compared(*symbols) if small else self._looked_up(*symbols)
+        limits = ca.DM([[float(knots[0]), float(knots[-1])] for knots in self.grid])
+        unused = kind.sym("limits", *limits.shape)
+        name = FUNCTION + re.sub("_+", "_", re.sub("[^0-9A-Za-z]", "_", self.name)).strip("_")
+        options: dict[str, Any] = {"never_inline": not small, "is_diff_in": [True] * len(symbols) + [False]}
+        function = ca.Function(name.rstrip("_"), [*symbols, unused], [value], options)
+        return function(*(ca.MX(value) for value in arguments), ca.MX(limits))
 
     def _compared(self, *point: Expr) -> Expr:
         """The value where every cell is compared: halves of the cells are chosen between, an axis after the other."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import OF_RANGE, Dense, mapped
 from covocp.extremal.extremal import Extremal
+from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 
@@ -57,11 +60,47 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
     Returns:
         Those that are passed by more than the error of the path.
     """
-    st, mesh = extremal.statement, extremal.mesh
-    names = (*st.state_names, *st.path.names)
+    st = extremal.statement
     if not limited(extremal):
         return ()
-    lower, upper = (np.concatenate(pair) for pair in zip(st.state_bounds, (st.path.lower, st.path.upper), strict=True))
+    names = (*st.state_names, *st.path.names)
+    limits = tuple(np.concatenate(pair) for pair in zip(st.state_bounds, (st.path.lower, st.path.upper), strict=True))
+
+    def values(k: Expr, s: Array) -> Array:
+        x = _before(extremal, dense, k, s)[:, : st.nx]
+        return np.hstack([x, _conditions(extremal, dense, st.path, k, s)]) if st.path.size else x
+
+    return _passed(extremal, dense, points, names, limits, values)
+
+
+def left_tables(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed, ...]:
+    """Tables whose outermost knots the true path passes, the worst first; their argument is what is called a limit.
+
+    Args:
+        extremal: the solution.
+        dense: its path between the nodes, with the matrices.
+        points: equal parts of each interval at whose ends it is looked at.
+    """
+    tables = extremal.statement.tables
+    if tables is None:
+        return ()
+
+    def values(k: Expr, s: Array) -> Array:
+        return _conditions(extremal, dense, tables, k, s)
+
+    return _passed(extremal, dense, points, tables.names, (tables.lower, tables.upper), values)
+
+
+def _passed(
+    extremal: Extremal,
+    dense: Dense,
+    points: int,
+    names: Sequence[str],
+    limits: tuple[Array, ...],
+    values_at: Callable[[Any, Array], Array],
+) -> tuple[Passed, ...]:
+    """Rows that pass their limits along the true path, from what gives them at normalised times of intervals."""
+    mesh, (lower, upper) = extremal.mesh, limits
     worst, largest = np.zeros((2, len(names))), np.zeros(len(names))
     when = np.zeros((2, len(names)))
     inner = dense.knots[~np.isin(dense.knots, mesh.nodes)]
@@ -74,7 +113,7 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
         extra = inner[at[at >= regular] - regular]
         s = np.concatenate([s, extra])
         k = np.concatenate([k, np.searchsorted(mesh.nodes, extra) - 1])
-        values = _values(extremal, dense, k, s)
+        values = values_at(k, s)
         largest = np.maximum(largest, np.abs(values).max(axis=0))
         for side, excess in enumerate((lower - values, values - upper)):
             place = excess.argmax(axis=0)
@@ -108,17 +147,20 @@ def _sizes(lower: Array, upper: Array, largest: Array) -> Array:
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _values(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
-    """States and path constraints at normalised times s of the intervals k, (K, rows)."""
-    st, mesh = extremal.statement, extremal.mesh
-    z, ends = dense.at(s), s == mesh.nodes[k + 1]
+def _before(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
+    """States and half-vectors at normalised times s of the intervals k; at their ends before what happens there."""
+    z, ends = dense.at(s), s == extremal.mesh.nodes[k + 1]
     z[ends] = dense.at(s[ends], before=True)  # what is read at an instant belongs to what follows
-    x = z[:, : st.nx]
-    if not st.path.size:
-        return x
+    return z
+
+
+def _conditions(extremal: Extremal, dense: Dense, rows: Conditions, k: Expr, s: Array) -> Array:
+    """Conditions at normalised times s of the intervals k, (K, rows)."""
+    st, mesh = extremal.statement, extremal.mesh
+    z = _before(extremal, dense, k, s)
     h = np.diff(mesh.nodes)[k]
     controls = extremal.control(k, (s - mesh.nodes[k]) / np.where(h > 0, h, 1.0))
     duration = extremal.trajectory.duration
     fixed = repeated(duration, extremal.parameters, s.size)
-    rows = mapped(st.path.function, x.T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed)[0]
-    return np.hstack([x, rows.T])
+    found = mapped(rows.function, z[:, : st.nx].T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed)[0]
+    return np.asarray(found.T)

@@ -26,6 +26,7 @@ from covocp.problem.measurement_information import check_readings, inverse_densi
 from covocp.problem.rates import process_noise
 from covocp.problem.samples import measured_blocks, samples
 from covocp.problem.stacked import Stacked, stack
+from covocp.problem.table_ranges import table_ranges
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Block, Duration, Loop, Statement, error_names, error_size
 
@@ -76,6 +77,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         information=_information(problem, stacked),
         samples=samples(problem, stacked),
         data=used_data(problem),
+        tables=table_ranges(problem, stacked),
         path=conditions_at(problem, stacked, "path"),
         start=conditions_at(problem, stacked, "initial"),
         end=conditions_at(problem, stacked, "final"),

@@ -33,11 +33,25 @@ def mention_doubts(solution: Solution) -> None:
     else:
         _mention_loop(solution)
     mention_spread(solution)
+    _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         warn_user(
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             "covariance_step='gauss' or more intervals."
         )
+
+
+def _mention_tables(solution: Solution) -> None:
+    """Warn of tables that are read where they have no values."""
+    left = solution.left_tables()
+    if not left:
+        return
+    more = f", and {len(left) - 1} more" if len(left) > 1 else ""
+    warn_user(
+        f"The {left[0].name} is read beyond its knots, by {left[0].by:.3g} at t = {left[0].time:.4g} s{more}: its "
+        "outermost piece goes on there, which no value supports. Give it knots that reach so far, or keep what it "
+        "depends on between them (subject_to)."
+    )
 
 
 def mention_limits(solution: Solution) -> None:

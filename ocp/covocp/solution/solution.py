@@ -29,12 +29,13 @@ from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
-from covocp.extremal.path_limits import Passed, limited, passed_limits
+from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.phase_loops import PhaseLoop
 from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
 from covocp.solution.sample import Sample
+from covocp.statement.conditions import Conditions
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
 from covocp.statement.time_data import TimeData
@@ -519,8 +520,17 @@ class Solution:
         """What `check_path` finds, with the share of the limit and the time, the worst first."""
         if not limited(self.extremal):
             return ()
-        whole = self.stored_dense or "dense" in self.__dict__ or self.extremal.statement.path.uses_matrices
-        return passed_limits(self.extremal, self.dense if whole else self._dense_states, points)
+        return passed_limits(self.extremal, self._dense_for(self.extremal.statement.path), points)
+
+    def left_tables(self, points: int = 10) -> tuple[Passed, ...]:
+        """Tables that are read beyond their outermost knots along the path, by how much and when, the worst first."""
+        tables = self.extremal.statement.tables
+        return () if tables is None else left_tables(self.extremal, self._dense_for(tables), points)
+
+    def _dense_for(self, rows: Conditions) -> Dense:
+        """What some conditions need between the nodes: the states, and the matrices where they read them."""
+        whole = self.stored_dense or "dense" in self.__dict__ or rows.uses_matrices
+        return self.dense if whole else self._dense_states
 
     def plot(self, *names: Any, **options: Any) -> matplotlib.figure.Figure:
         """Draw the solution; see `covocp.plot.figure.plot_solutions`."""

@@ -210,6 +210,7 @@ class Statement:
         chances: conditions on probabilities, which are among those of `path`, `start` and `end`.
         samples: measurements that are taken at instants; None where there are none.
         data: values over time that are in some of these functions.
+        tables: what is looked up in tables along the path, with their outermost knots as limits; None without tables.
         geometry: how the state moves where some of it is no vector.
         expression: a user's expression -> function of the six inputs.
     """
@@ -231,6 +232,7 @@ class Statement:
     information: ca.Function | None
     samples: Samples | None
     data: tuple[TimeData, ...]
+    tables: Conditions | None
     path: Conditions
     start: Conditions
     end: Conditions

@@ -220,15 +220,23 @@ def bend_size(run: Run, flat: Array, bend: Array) -> float:
     """Share of a bend to which the states answer in proportion, measured by their values at all nodes.
 
     1 unless the second half of the bend moves them otherwise than the first: then it is halved, until it does not or is
-    faint.
+    faint. States that answer to a bend of nothing by its square never do: they are left out then.
     """
     if not bend.any():
         return 1.0
     rows = run.statement.moving or list(range(run.statement.nx))  # integrals bend by themselves
-    size, base, scales = 1.0, run.states(flat)[:, rows], run.scale[rows]
-    if not np.isfinite(base).all():
+    if not np.isfinite(run.states(flat)[:, rows]).all():
+        return 1.0
+    size, straight = _halved(run, flat, bend, rows)
+    if straight is None or straight == rows:
         return size
-    full = run.states(run.clip(flat + bend))[:, rows]
+    return _halved(run, flat, bend, straight)[0] if straight else 1.0
+
+
+def _halved(run: Run, flat: Array, bend: Array, rows: list[int]) -> tuple[float, list[int] | None]:
+    """The share of a bend by some states; where they never answered in proportion, those that did so in the end."""
+    size, base, scales = 1.0, run.states(flat)[:, rows], run.scale[rows]
+    full, straight = run.states(run.clip(flat + bend))[:, rows], rows
     for _ in range(HALVINGS):
         half = run.states(run.clip(flat + 0.5 * size * bend))[:, rows]
         if np.isfinite(full).all() and np.isfinite(half).all():
@@ -236,11 +244,13 @@ def bend_size(run: Run, flat: Array, bend: Array) -> float:
             largest = np.abs(moved).max(axis=0)
             scale = np.where(scales > 0, scales, _of_vectors(run.statement, rows, largest))
             if 2.0 * np.linalg.norm(bow / scale) <= CURVED * np.linalg.norm(moved / scale):
-                return size
+                return size, None
             if (largest / scale).max() <= FAINT:
-                return size
+                return size, None
+            in_proportion = 2.0 * np.abs(bow).max(axis=0) <= CURVED * largest
+            straight = [row for row, own in zip(rows, in_proportion, strict=True) if own]
         size, full = 0.5 * size, half
-    return size
+    return size, straight
 
 
 def _of_vectors(statement: Statement, rows: list[int], sizes: Array) -> Array:
