@@ -35,6 +35,8 @@ ACTIVE = 1e-5
 NO_COST = 1e-12
 # Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
 QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
+# Weights of the integral over [0, 1] of a value at 0, 1/2 and 1.
+SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,7 +274,8 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
-    (not `free`, of each interval) do not count; nan where H_uu is not positive definite.
+    (not `free`, of each interval) do not count. Intervals in which H_uu is not positive definite count with what the
+    Hamiltonian is above its value with the control of one of their ends, by Simpson's rule.
     """
     points = extremal.mesh.points
     if points > 1:  # costates jump inside the intervals
@@ -285,8 +288,8 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     middle = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
     u = extremal.controls
     ends = u[:-1] if mesh.control == "constant" else u[1:]
-    function = hamiltonian(st)("point", lambda v, x, w, e, t: [ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
-    slopes, curvatures = [], []
+    function = hamiltonian(st)("point", lambda v, x, w, e, t: [v, ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
+    slopes, curvatures, above = [], [], np.zeros((3, n))
     for j, costate in enumerate((after[:-1], middle, after[1:])):
         z = values[:, j * mesh.substeps, :]
         arguments = (
@@ -298,14 +301,17 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
             costate[:, : st.nx].T,
             costate[:, st.nx :].T,
         )
-        slope, curvature = (stacked(v, n) for v in function(*arguments))
+        value, slope, curvature = (stacked(v, n) for v in function(*arguments))
+        held = [stacked(function(arguments[0], w.T, *arguments[2:])[0], n) for w in (u[:-1], ends)]
+        above[j] = (value - np.minimum(np.minimum(*held), value)).ravel()
         slopes.append(np.where(free, slope[:, :, 0], 0.0))
         curvatures.append(curvature)
-    if (np.linalg.eigvalsh(curvatures)[..., 0] <= 0).any():
-        return float("nan")
-    steps = np.linalg.solve(curvatures[1], np.array(slopes)[..., None])[..., 0]
-    total = np.einsum("jk,jni,kni,n->", QUADRATIC_PRODUCTS, slopes, steps, h[:, 0])
-    return float(0.5 * total / max(_absolute_cost(extremal) + others, np.finfo(float).tiny))
+    definite = (np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0)
+    curvature = np.where(definite[:, None, None], curvatures[1], np.eye(st.nu))
+    steps = np.linalg.solve(curvature, np.array(slopes)[..., None])[..., 0]
+    gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)
+    total = h[:, 0] @ np.where(definite, gained, SIMPSON @ above)
+    return float(total / max(_absolute_cost(extremal) + others, np.finfo(float).tiny))
 
 
 def _absolute_cost(extremal: Extremal) -> float:

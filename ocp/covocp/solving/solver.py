@@ -47,6 +47,7 @@ from covocp.solving.gain_start import meeting_conditions, with_best_gain_problem
 from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
+from covocp.solving.turns import unwound
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -259,6 +260,7 @@ class Solver:
                 else:
                     outcome, start = self._from_start(values, guess, first, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start) if assess else outcome
+                outcome = self._unwound(outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
@@ -422,6 +424,16 @@ class Solver:
             "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
         )
         return with_stats(min(better, key=cost_of), left_saddle=True)
+
+    def _unwound(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+        """Solved again without the turns that angles make between nodes, where that is cheaper."""
+        straight = unwound(outcome.extremal) if outcome.converged and not reporter.stop else None
+        if straight is None:
+            return outcome
+        again = self._prepared.solve(values, Guess(trajectory=straight), reporter)
+        if not again.converged or not cost_of(again) < cost_of(outcome):
+            return outcome
+        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
 
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
