@@ -141,9 +141,7 @@ def statement_of(problem: Declarations) -> Statement:
     return freeze(problem)
 
 
-def derive(
-    problem: Declarations, *, part: bool = False, later: Expr = None, gain: Gain | None = None
-) -> Declarations:
+def derive(problem: Declarations, *, part: bool = False, later: Expr = None, gain: Gain | None = None) -> Declarations:
     """The deterministic vector-matrix problem of a problem with an expected cost.
 
     Args:
