@@ -16,6 +16,7 @@ condition costs, which no S knows. Then E and Xhat run forward through all phase
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import casadi as ca
@@ -24,7 +25,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, unpack_symbolic
-from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain
+from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain, reasons
 from covocp.problem.declarations import Declarations, Gain, Parameter
 from covocp.problem.expansion import slope_by
 from covocp.problem.expected_cost import FEEDBACK, check_random, derive
@@ -53,7 +54,7 @@ def with_feedback(phases: Sequence[Declarations], jumps: Sequence[Jumps]) -> lis
     for phase in phases:
         _check_feedback(phase)
     check_random(phases)
-    gains = gains_of(phases)
+    gains, shared = gains_of(phases), shares_gains(phases)
     result = []
     for k, phase in enumerate(phases):
         later = None
@@ -63,10 +64,19 @@ def with_feedback(phases: Sequence[Declarations], jumps: Sequence[Jumps]) -> lis
             J = tangent(phase, phases[k + 1], jumps[k + 1])[1]
             later = J.T @ J  # what goes on: its pattern alone counts
         try:
-            result.append(derive(phase, part=True, later=later, gain=None if gains is None else gains[k]))
+            own = derive(phase, part=True, later=later, gain=None if gains is None else gains[k])
         except ProblemError as error:
             raise in_phase(phase, error) from error
+        assert own.expansion is not None
+        result.append(replace(own, expansion=replace(own.expansion, shared=shared)))
     return result
+
+
+def shares_gains(phases: Sequence[Declarations]) -> bool:
+    """Whether some gain is optimised that no `Gain` of its phase describes: then all of them start from the best."""
+    if any(phase.expected is None for phase in phases) or gains_of(phases) is None:
+        return False
+    return any(phase.expected is not None and (phase.expected.gain is None or reasons(phase)) for phase in phases)
 
 
 def gains_of(phases: Sequence[Declarations]) -> tuple[Gain, ...] | None:

@@ -19,7 +19,7 @@ from covocp.extremal.phase_loops import phase_loops
 from covocp.problem.closed_loop_covariance import reasons, with_best_gain
 from covocp.problem.declarations import Declarations
 from covocp.problem.phase_chances import with_phase_chances
-from covocp.problem.phase_feedback import gains_of
+from covocp.problem.phase_feedback import shares_gains
 from covocp.problem.phases import Phases
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import ASKED
@@ -39,13 +39,6 @@ def declared(phases: Phases) -> list[Declarations]:
     return with_phase_chances([problem.stated for problem in phases.problems], phases.jumps)
 
 
-def asks(own: Sequence[Declarations]) -> bool:
-    """Whether some gain is optimised that no `Gain` of its phase describes: then all of them start from the best."""
-    if any(phase.expected is None for phase in own) or gains_of(own) is None:
-        return False
-    return any(phase.expected is not None and (phase.expected.gain is None or reasons(phase)) for phase in own)
-
-
 def best_gains(phases: Phases, solve: Solve) -> PhasesSolution | None:
     """The solution with the best gains; None where no gain is optimised that asks for it, or there is none.
 
@@ -54,7 +47,7 @@ def best_gains(phases: Phases, solve: Solve) -> PhasesSolution | None:
         solve: solves others from the same guess on the same meshes, without raising where it does not converge.
     """
     own = declared(phases)
-    if not asks(own):
+    if not shares_gains(own):
         return None
     for conditions in (True, False):
         if not conditions and not any(reasons(phase) for phase in own):
