@@ -11,7 +11,6 @@ from typing import Any
 from covocp.base.errors import ProblemError, SolveError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
-from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
@@ -91,12 +90,12 @@ def solve_phases(
             mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase)
     values = values_of(chain, {} if parameters is None else parameters)
     best = None
-    if random is None and all(map(_starts_nothing, guesses)):
+    if random is None:
         mesh = {name: value for name, value in given.items() if name != "refine"}
-        counts = [own.intervals for own in asked]
         run = {"nominal": nominal, "progress": False, "allow_failure": True, "parameters": parameters, **mesh}
-        solve_best = partial(solve_phases, method=BEST, module=METHODS[BEST], intervals=counts, guess=guess, **run)
-        best = best_gains(phases, solve_best)
+        counts = [entry.intervals for entry in asked]
+        run |= {"method": BEST, "module": METHODS[BEST], "intervals": counts, "guess": guess}
+        best = best_gains(phases, guesses, partial(solve_phases, **run))
     if best is not None:
         asked = graded_for(best, asked)
         guesses = list(meeting_conditions(phases, best, parameters or {}))
@@ -106,12 +105,6 @@ def solve_phases(
         if reporter.stop:
             raise interrupted(solution)
     return _finished(solution, allow_failure)
-
-
-def _starts_nothing(guess: Given) -> bool:
-    """Whether a guess says nothing of the gain and what is estimated, so that these start from the best gain."""
-    named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
-    return guess is None or named
 
 
 def _asked(chain: Chain, method: str, nominal: str, intervals: Given, options: dict[str, Any]) -> tuple[Options, ...]:

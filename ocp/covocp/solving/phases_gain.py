@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import CovocpError, without_warnings
+from covocp.base.errors import CovocpError, Interrupted, without_warnings
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.extremal.phase_loops import phase_loops
 from covocp.problem.closed_loop_covariance import reasons, with_best_gain
 from covocp.problem.declarations import Declarations
+from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import shares_gains
 from covocp.problem.phases import Phases
@@ -39,15 +41,19 @@ def declared(phases: Phases) -> list[Declarations]:
     return with_phase_chances([problem.stated for problem in phases.problems], phases.jumps)
 
 
-def best_gains(phases: Phases, solve: Solve) -> PhasesSolution | None:
-    """The solution with the best gains; None where no gain is optimised that asks for it, or there is none.
+def best_gains(phases: Phases, guesses: Sequence[Any], solve: Solve) -> PhasesSolution | None:
+    """The solution with the best gains; None where no gain asks for it, a guess says what it is, or there is none.
 
     Args:
         phases: that are to be solved.
+        guesses: of the phases.
         solve: solves others from the same guess on the same meshes, without raising where it does not converge.
+
+    Raises:
+        Interrupted: after Ctrl-C (carries what was found of the best gains until then).
     """
     own = declared(phases)
-    if not shares_gains(own):
+    if not shares_gains(own) or not all(map(_leaves_open, guesses)):
         return None
     for conditions in (True, False):
         if not conditions and not any(reasons(phase) for phase in own):
@@ -58,9 +64,17 @@ def best_gains(phases: Phases, solve: Solve) -> PhasesSolution | None:
                 found = solve(Phases.of(phases, best))
         except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
             continue
+        except Interrupted as error:
+            text = f"{error} It has the best gain in all phases, from which the one that was asked for was to start."
+            raise Interrupted(text, solution=error.solution) from None
         if found.converged:
             return found
     return None
+
+
+def _leaves_open(guess: Given) -> bool:
+    """Whether a guess says nothing of the gain and of what is estimated."""
+    return guess is None or (isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess))
 
 
 def meeting_conditions(phases: Phases, best: PhasesSolution, parameters: Mapping[str, Any]) -> PhasesSolution:
