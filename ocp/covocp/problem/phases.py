@@ -78,13 +78,6 @@ class Phases:
         self._jumps: tuple[Jump, ...] = ()
         self._chain: tuple[tuple[Any, ...], Chain] | None = None
 
-    @classmethod
-    def of(cls, phases: Phases, declarations: Sequence[Declarations]) -> Phases:
-        """Phases with other declarations on the same symbols, and the same jumps."""
-        result = cls([Problem.of(own) for own in declarations], phases.name)
-        result._jumps = phases.jumps
-        return result
-
     @property
     def problems(self) -> tuple[Problem, ...]:
         """The phases in their order."""
@@ -185,3 +178,10 @@ class Phases:
             received=str(x)[:100],
             remedy="give the symbol itself, not its name: several phases may have that name",
         )
+
+
+def with_declarations(phases: Phases, declarations: Sequence[Declarations]) -> Phases:
+    """Phases with other declarations on the same symbols, and the same jumps."""
+    result = Phases([Problem.of(own) for own in declarations], phases.name)
+    result._jumps = phases.jumps
+    return result

@@ -22,7 +22,7 @@ from covocp.problem.declarations import Declarations
 from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import shares_gains
-from covocp.problem.phases import Phases
+from covocp.problem.phases import Phases, with_declarations
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import ASKED
 from covocp.solving.gain_start import ROUNDS, Row, beyond, close_enough, ended, raised, rows_of, spread_halves, weighted
@@ -61,7 +61,7 @@ def best_gains(phases: Phases, guesses: Sequence[Any], solve: Solve) -> PhasesSo
         best = [_best(phase, conditions=conditions) for phase in own]
         try:
             with without_warnings():  # they concern another solution
-                found = solve(Phases.of(phases, best))
+                found = solve(with_declarations(phases, best))
         except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
             continue
         except Interrupted as error:
@@ -95,7 +95,7 @@ def meeting_conditions(phases: Phases, best: PhasesSolution, parameters: Mapping
     ]
     try:
         with without_warnings():
-            return _searched(Phases.of(phases, parts), rows, best, parameters)
+            return _searched(with_declarations(phases, parts), rows, best, parameters)
     except (CovocpError, RuntimeError):  # a weight that no gain exists for: the best gain is a start as well
         return best
 
