@@ -112,11 +112,13 @@ def told(phases: Phases, solution: PhasesSolution, best: PhasesSolution | None) 
     asked = [reasons(phase) for phase in own]
     if not any(asked):
         return solution
-    named = [
-        ", ".join(listed) if listed else "conditions or costs of " + _others(solution, asked, k)
-        for k, listed in enumerate(asked)
-    ]
-    changed = [replace(phase, stats={**phase.stats, ASKED: text}) for phase, text in zip(solution, named, strict=True)]
+    changed = []
+    for k, (phase, listed) in enumerate(zip(own, asked, strict=True)):
+        text = ", ".join(listed) or "conditions or costs of " + _others(solution, asked, k)
+        free = listed or (
+            phase.expected is not None and phase.expected.gain is None
+        )  # a Gain of its own says what it is
+        changed.append(replace(solution[k], stats={**solution[k].stats, **({ASKED: text} if free else {})}))
     result = replace(solution, phases=tuple(changed))
     if solution.converged or best is None:
         return result
