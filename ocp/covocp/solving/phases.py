@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -75,12 +75,7 @@ def solve_phases(
     chain = phases.chain()
     for statement in chain.statements:
         check_between(statement, method)
-    known = [field.name for field in fields(Options)]
-    own = {name: value for name, value in options.items() if name in _method_options(prepare)}
-    for name in options:
-        if name not in known and name not in own:
-            raise no_option(f"The method '{method}'", name, options[name], [*known, *_method_options(prepare)], ())
-    given = {k: v for k, v in options.items() if k in known}
+    given, own = _divided(method, _method_options(prepare), options)
     asked = _asked(chain, method, nominal, intervals, given)
     if asked[0].refine is not None:
         own = adapted(method_options(method), own, asked[0].refine)
@@ -89,13 +84,8 @@ def solve_phases(
         if isinstance(entry, Mapping):
             mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase)
     values = values_of(chain, {} if parameters is None else parameters)
-    best = None
-    if random is None:
-        mesh = {name: value for name, value in given.items() if name != "refine"}
-        run = {"nominal": nominal, "progress": False, "allow_failure": True, "parameters": parameters, **mesh}
-        counts = [entry.intervals for entry in asked]
-        run |= {"method": BEST, "module": METHODS[BEST], "intervals": counts, "guess": guess}
-        best = best_gains(phases, guesses, partial(solve_phases, **run))
+    run = {"guess": guess, "parameters": parameters, **{name: v for name, v in given.items() if name != "refine"}}
+    best = None if random is not None else best_gains(phases, guesses, _best_solver(asked, run))
     if best is not None:
         asked = graded_for(best, asked)
         guesses = list(meeting_conditions(phases, best, parameters or {}))
@@ -105,6 +95,27 @@ def solve_phases(
         if reporter.stop:
             raise interrupted(solution)
     return _finished(solution, allow_failure)
+
+
+def _divided(method: str, of_method: Sequence[str], options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of the mesh, and those of the method.
+
+    Raises:
+        ProblemError: one that neither has.
+    """
+    known = [field.name for field in fields(Options)]
+    for name in options:
+        if name not in known and name not in of_method:
+            raise no_option(f"The method '{method}'", name, options[name], [*known, *of_method], ())
+    of_mesh = {name: value for name, value in options.items() if name in known}
+    return of_mesh, {name: value for name, value in options.items() if name in of_method}
+
+
+def _best_solver(asked: tuple[Options, ...], run: dict[str, Any]) -> Callable[[Phases], PhasesSolution]:
+    """Solves other phases on the meshes that are asked for, quietly, and with these arguments besides."""
+    counts = [own.intervals for own in asked]
+    quiet: dict[str, Any] = {"nominal": "combined", "progress": False, "allow_failure": True}
+    return partial(solve_phases, method=BEST, module=METHODS[BEST], intervals=counts, **quiet, **run)
 
 
 def _asked(chain: Chain, method: str, nominal: str, intervals: Given, options: dict[str, Any]) -> tuple[Options, ...]:

@@ -115,9 +115,8 @@ def told(phases: Phases, solution: PhasesSolution, best: PhasesSolution | None) 
     changed = []
     for k, (phase, listed) in enumerate(zip(own, asked, strict=True)):
         text = ", ".join(listed) or "conditions or costs of " + _others(solution, asked, k)
-        free = listed or (
-            phase.expected is not None and phase.expected.gain is None
-        )  # a Gain of its own says what it is
+        assert phase.expected is not None
+        free = listed or phase.expected.gain is None  # else a Gain says what it is
         changed.append(replace(solution[k], stats={**solution[k].stats, **({ASKED: text} if free else {})}))
     result = replace(solution, phases=tuple(changed))
     if solution.converged or best is None:
