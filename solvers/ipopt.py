@@ -185,6 +185,7 @@ def _gain_kind(statement: Statement) -> str:
     if statement.behind:
         return "best gain"
     asked = any(entry.realised is not None for entry in statement.conditions)
+    asked = asked or (statement.loop is not None and statement.loop.shared)
     asked = asked or (statement.loop is not None and statement.loop.spread is not None)
     return "asked gain" if asked else "free gain"
 

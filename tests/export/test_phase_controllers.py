@@ -42,7 +42,9 @@ def control(t: Any) -> Any:
     return 0.3 * np.sin(t) + 0.1
 
 
-def _lag(duration: float, name: str, at: list[float], *, first: bool = True, last: bool = True) -> co.Problem:
+def _lag(
+    duration: float, name: str, at: list[float], *, first: bool = True, last: bool = True, gain: Any = None
+) -> co.Problem:
     """The lag, or one part of it, that is measured and also read at instants."""
     ocp = co.Problem(duration, name=name)
     x = ocp.state("x", initial=0.0 if first else None, final=1.0 if last else None, variance=1.0 if first else None)
@@ -51,8 +53,42 @@ def _lag(duration: float, name: str, at: list[float], *, first: bool = True, las
     ocp.dynamics(x, -b * x + u, noise=1.0)
     ocp.measurement("position", x, noise=1.0)
     ocp.measurement("fix", x, noise=0.1, at=at)
-    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0} if last else None)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0} if last else None, gain=gain)
     return ocp
+
+
+def _gain(t: Any) -> Any:
+    """Of the lag, by x and b."""
+    return np.array([0.4 + 0.05 * t, 0.1 - 0.02 * t])
+
+
+def test_gains_that_are_optimised_are_flown_through_the_phases() -> None:
+    """The same readings give the same controls as in the whole, whatever the gains are."""
+    own = {"gain": co.Gain()}
+    whole = co.evaluate(
+        _lag(10.0, "whole", [2, 4, 7], **own),
+        nominal={"u": lambda s: control(10 * s), "C": lambda s: _gain(10 * s)},
+        grid=np.linspace(0, 1, 51),
+        substeps=8,
+    )
+    parts = co.Phases([_lag(4.0, "A", [2, 4], last=False, **own), _lag(6.0, "B", [3], first=False, **own)])
+    cut = co.evaluate(
+        parts,
+        nominal=[
+            {"u": lambda s: control(4 * s), "C": lambda s: _gain(4 * s)},
+            {"u": lambda s: control(4 + 6 * s), "C": lambda s: _gain(4 + 6 * s)},
+        ],
+        intervals=[20, 30],
+        substeps=8,
+    )
+    one, other = (
+        export_c(s, FOLDER / f"given_{s.name or 'parts'}", largest_spread=np.inf).reference() for s in (whole, cut)
+    )
+    for k in range(1, 51):
+        reading = [float(np.sin(k)), 0.5 if k in (10, 20, 35) else np.nan]
+        known, found = one.step(reading, 0.2 * k), other.step(reading, 0.2 * k)
+        assert (one.status, other.status) == ("OK", "OK")
+        np.testing.assert_allclose(found, known, rtol=1e-8, atol=1e-9, err_msg=f"{0.2 * k}")
 
 
 def test_the_controller_of_a_problem_cut_in_two_is_that_of_the_whole() -> None:

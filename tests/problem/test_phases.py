@@ -61,13 +61,6 @@ def ending(final: float | None) -> list[co.Problem]:
     return [one, two]
 
 
-def spread_limit() -> co.Problem:
-    ocp = closed()
-    X = ocp.closed_loop_covariance()
-    ocp.subject_to(X[ocp.states[0].symbol, ocp.states[0].symbol], upper=1.0, name="spread")
-    return ocp
-
-
 WRONG: dict[str, tuple[Callable[[], list[co.Problem]], str]] = {
     "initial": (lambda: [first(), part(initial=1.0)], "goes on from 'first' to 'second' and has an initial value too"),
     "variance": (lambda: [first(), part(variance=1.0)], "goes on from 'first' to 'second' and has a variance too"),
@@ -85,8 +78,7 @@ WRONG: dict[str, tuple[Callable[[], list[co.Problem]], str]] = {
     "unused": (lambda: [first(decision=True), part(decision=True)], "Nothing depends on the decision 'd'"),
     "attitude": (lambda: [first(), attitude()], "The phase 'turning' has the attitude 'C'"),
     "mixed": (lambda: [first(), closed()], "The phase 'first' has no expected cost, and others have one"),
-    "gain": (lambda: [closed("open"), closed(gain=co.Gain())], "The gain of the phase 'closed' is not the best one"),
-    "spread": (lambda: [closed("open"), spread_limit()], "The gain of the phase 'closed' is not the best one"),
+    "gain": (lambda: [closed("open"), closed(gain=co.Gain(structure=[[1, 1]]))], "structure of the gain does not fit"),
     "certain": (lambda: [closed("open", noise=0.0), closed(noise=0.0)], "nothing in the system is uncertain"),
     "missed": (lambda: [closed("open"), closed(final=1.0)], "In the phase 'closed': The final value of 'x' is presc"),
     "missed before": (lambda: ending(1.0), "In the phase 'open': The final value of 'y' is prescribed"),

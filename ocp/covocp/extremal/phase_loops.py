@@ -108,7 +108,9 @@ def _added(link: Link, before: Extremal, parameters: Array, later: Array) -> Arr
 
 
 def _fed(extremal: Extremal, start: Array) -> float:
-    """1/2 tr S Xhat at the start."""
+    """1/2 tr S Xhat at the start; zero where the gain is optimised, and the cost is the expected one in each phase."""
+    if not extremal.statement.behind:
+        return 0.0
     st, size = extremal.statement, start.shape[0] // 2
     S = unpack(extremal.trajectory.e[0, st.matrices[st.behind[0]].span], size)
     return 0.5 * float(np.sum(S * start[size:, size:]))

@@ -159,15 +159,25 @@ def with_chance_conditions(own: Declarations) -> Declarations:
     missing = any(state.name not in own.rates for state in own.states if state.role == "moving")
     if not own.chances or missing or (own.cost is None and own.expected is None):
         return own
-    fed_back = own.expected is not None
+    if own.expected is not None:
+        return with_loop_chances(own)
     chances, own = own.chances, replace(own, chances=())
-    if fed_back:
-        own = with_closed_loop(own) if own.spread is None else own
-        assert own.spread is not None
-        covariance, name = own.spread.matrix, None
-    else:
-        own, covariance, name = with_open_loop(own, bool(own.measurements))
+    own, covariance, name = with_open_loop(own, bool(own.measurements))
     return with_conditions(own, chances, covariance, name)
+
+
+def with_loop_chances(own: Declarations) -> Declarations:
+    """The declarations of an expected cost with its conditions on probabilities as those on the closed loop.
+
+    Raises:
+        ProblemError: nothing scatters in one of them, a name is taken.
+    """
+    chances, own = own.chances, replace(own, chances=())
+    if not chances:
+        return own
+    own = with_closed_loop(own) if own.spread is None else own
+    assert own.spread is not None
+    return with_conditions(own, chances, own.spread.matrix, None)
 
 
 def with_conditions(own: Declarations, chances: tuple[Chance, ...], covariance: Any, name: str | None) -> Declarations:

@@ -141,13 +141,14 @@ def statement_of(problem: Declarations) -> Statement:
     return freeze(problem)
 
 
-def derive(problem: Declarations, *, part: bool = False, later: Expr = None) -> Declarations:
+def derive(problem: Declarations, *, part: bool = False, later: Expr = None, gain: Gain | None = None) -> Declarations:
     """The deterministic vector-matrix problem of a problem with an expected cost.
 
     Args:
         problem: with `minimize_expected`.
         part: whether it is one of several phases: what is uncertain may then come from another one.
         later: weight of the deviations at its end, (n, n), that the phases after it ask for; None: nothing follows.
+        gain: that is optimised because another phase asks for one; None: what the problem itself asks for.
 
     Returns:
         Declarations on the same symbols, with E and S (or E, Xhat and the gain) and the deterministic cost.
@@ -163,7 +164,7 @@ def derive(problem: Declarations, *, part: bool = False, later: Expr = None) -> 
     _check_contents(problem, expected)
     check_expected(problem, [expected.running, expected.terminal])
     check_order(problem)
-    gain = free_gain(problem)
+    gain = free_gain(problem) if gain is None else gain
     problem, *spread = split_cost(problem)
     derived = replace(problem, expected=None)
     if not any(matrix.estimation for matrix in derived.matrices):

@@ -359,6 +359,7 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
         by_parts=by_parts,
         spread=spread,
         spread_end=spread_end,
+        shared=v.shared,
     )
 
 

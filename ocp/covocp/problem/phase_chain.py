@@ -15,6 +15,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, pack_symbolic
 from covocp.problem.decisions import decisions_of, matters
 from covocp.problem.declarations import Declarations, Matrix, Parameter
+from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.freeze import freeze
 from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import WEIGHT, deviations, in_phase, tangent, with_feedback
@@ -245,9 +246,8 @@ def _check_pair(before: Declarations, after: Declarations, jumps: dict[str, Any]
                 f"none in '{before.name}'",
                 "call estimation_covariance() there too: what is not measured there grows with its noise",
             )
-        plain = (
-            not matrix.of_deviations and matrix.role == "moving" and matrix.name in names and matrix.backward is None
-        )
+        passes = matrix.of_deviations or _of_estimate(after, matrix)
+        plain = not passes and matrix.role == "moving" and matrix.name in names and matrix.backward is None
         if plain and not _free_matrix(matrix):
             _refuse(
                 f"The matrix '{matrix.name}' goes on {pair} and has an initial value too.",
@@ -262,6 +262,11 @@ def _check_pair(before: Declarations, after: Declarations, jumps: dict[str, Any]
                 str(matrix.initial)[:100],
                 "remove it; the variance of a state that appears is its variance=",
             )
+
+
+def _of_estimate(phase: Declarations, matrix: Matrix) -> bool:
+    """Whether a matrix is the covariance of the estimate in a loop whose gain is optimised."""
+    return phase.expansion is not None and matrix.name == ESTIMATE
 
 
 def _free_matrix(matrix: Matrix) -> bool:
@@ -308,7 +313,9 @@ def _link(
     before: Declarations, after: Declarations, carried: list[tuple[Matrix, Parameter]], jumps: dict[str, Any]
 ) -> Link:
     """What passes from one phase to the next."""
-    known = {s.name: s for s in before.states if s.role != "integral"}
+    expected = before.expansion is not None
+    own = (GAIN,) if expected else ()  # each phase has a gain of its own, also where it is constant
+    known = {s.name: s for s in before.states if s.role != "integral" and s.name not in own}
     values: list[Any] = []
     entries: list[int] = []
     names: list[str] = []
@@ -332,11 +339,9 @@ def _link(
         offset = span.stop
         if matrix.name not in going:
             continue
-        after_jump = _covariance(before, after, earlier[matrix.name], jumps) if matrix.of_deviations else None
-        halves.append(earlier[matrix.name].symbol if after_jump is None else pack_symbolic(after_jump))
+        halves.append(_passed(before, after, earlier[matrix.name], jumps))
         places += span
         names += [f"continuity of {name} from '{before.name}' to '{after.name}'" for name in entries_of(matrix)]
-    expected = before.expansion is not None
     size = sum(error_size(entry) for entry in before.augmented)
     covariance = ca.MX.sym("X", size, size)
     first = sum(p.size for p in after.parameters) - sum(p.size for _, p in carried)
@@ -353,10 +358,18 @@ def _link(
     )
 
 
-def _covariance(before: Declarations, after: Declarations, E: Matrix, jumps: dict[str, Any]) -> Any:
-    """J E J' + N: by the tangents of the jumps, with the variances of what appears and the noise of the jumps."""
+def _passed(before: Declarations, after: Declarations, matrix: Matrix, jumps: dict[str, Any]) -> Any:
+    """The half-vector that a matrix goes on with.
+
+    A covariance of deviations by the tangents of the jumps, J E J' + N, with the variances of what appears and the
+    noise of the jumps; that of their estimate by J Xhat J', since nobody knows these; others as they are.
+    """
+    estimate = _of_estimate(before, matrix)
+    if not (matrix.of_deviations or estimate):
+        return matrix.symbol
     _, J, added = tangent(before, after, jumps)
-    return J @ E.matrix @ J.T + added
+    moved = J @ matrix.matrix @ J.T
+    return pack_symbolic(moved if estimate else moved + added)
 
 
 def _function(

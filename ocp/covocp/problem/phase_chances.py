@@ -1,7 +1,9 @@
-"""Conditions on probabilities in phases without feedback: what scatters there began to do so in the first phase.
+"""Conditions on probabilities in phases: what scatters there began to do so in the first phase.
 
-The covariance of the actual system goes through all phases up to the last that has such a condition, as E does, by
-X+ = J X J' + N. It is a matrix "X" of its own where something is measured in one of them, else E itself.
+With feedback they are conditions on the covariance of the closed loop, whose gain is then optimised in all phases
+(`phase_feedback`). Without it the covariance of the actual system goes through all phases up to the last that has such
+a condition, as E does, by X+ = J X J' + N. It is a matrix "X" of its own where something is measured in one of them,
+else E itself.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from covocp.base.errors import ProblemError
-from covocp.problem.chances import check_uncertain, uncertainties, with_conditions, with_open_loop
+from covocp.problem.chances import check_uncertain, uncertainties, with_conditions, with_loop_chances, with_open_loop
 from covocp.problem.checks import check_name
 from covocp.problem.closed_loop_covariance import SPREAD
 from covocp.problem.declarations import Declarations
@@ -26,20 +28,12 @@ def with_phase_chances(phases: Sequence[Declarations], jumps: Sequence[Any]) -> 
         jumps: `Jump` records.
 
     Raises:
-        ProblemError: a phase with feedback has one, nothing scatters in one, a name is taken.
+        ProblemError: nothing scatters in one, a name is taken.
     """
     last = max((k for k, phase in enumerate(phases) if phase.chances), default=-1)
     missing = any(s.name not in phase.rates for phase in phases for s in phase.states if s.role == "moving")
-    for phase in phases:
-        if phase.chances and phase.expected is not None:
-            raise ProblemError(
-                f"The phase '{phase.name}' has the chance condition '{phase.chances[0].name}' on a closed loop.",
-                expected="chance() in phases with minimize(), where nothing is fed back: the gain in phases is best "
-                "for their expected cost, and such a condition would change it",
-                received="chance() beside minimize_expected()",
-                remedy="weigh deviations in the expected cost instead, or solve one Problem by itself",
-            )
-    if missing or any(phase.expected is not None for phase in phases):
+    fed_back = any(phase.expected is not None for phase in phases)
+    if missing:
         return list(phases)  # what is wrong with them is said where they are joined and frozen
     measured = any(phase.measurements for phase in phases[: last + 1])
     uncertain: list[Any] = []
@@ -47,7 +41,12 @@ def with_phase_chances(phases: Sequence[Declarations], jumps: Sequence[Any]) -> 
     for k, phase in enumerate(phases if last >= 0 else ()):
         uncertain += [*uncertainties(phase), *(jump.noise for jump in jumps if jump.phase == k)]
         try:
-            if k > last and measured:  # what has the same name goes on
+            if fed_back and k <= last and phase.expected is not None:
+                check_uncertain(phase.chances, uncertain)
+                result[k] = with_loop_chances(phase)
+            elif fed_back:
+                continue  # phases of which only some have an expected cost are refused where they are joined
+            elif k > last and measured:  # what has the same name goes on
                 check_name(SPREAD, list(phase.taken))
             elif k <= last:
                 check_uncertain(phase.chances, uncertain)

@@ -7,11 +7,16 @@ E+ = J_x E J_x' + N, Xhat+ = J_x Xhat J_x', and what deviations before the jump 
 
 The noise of a jump costs 1/2 tr S+ N, which E+ already contains. In the form of the cost that is optimised (the third
 one of `expected_cost`) each phase has 1/2 tr (k_xx + weights) E at its end, its own integral, and nothing of the jump.
+
+Where one phase asks for a gain that is no best one (`gain=`, or a condition or a nonlinear cost of the covariance of
+the closed loop), that of every phase is optimised: what feedback before it and after it is worth depends on what the
+condition costs, which no S knows. Then E and Xhat run forward through all phases, and the cost is the sum of (E-1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import casadi as ca
@@ -20,8 +25,8 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, unpack_symbolic
-from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain
-from covocp.problem.declarations import Declarations, Parameter
+from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain, reasons
+from covocp.problem.declarations import Declarations, Gain, Parameter
 from covocp.problem.expansion import slope_by
 from covocp.problem.expected_cost import FEEDBACK, check_random, derive
 from covocp.statement.statement import Statement, error_size
@@ -39,8 +44,7 @@ def with_feedback(phases: Sequence[Declarations], jumps: Sequence[Jumps]) -> lis
         jumps: by name of the state, those into each phase.
 
     Raises:
-        ProblemError: some phases have an expected cost and others not, gains are constrained or free, or what `derive`
-            says of a phase.
+        ProblemError: some phases have an expected cost and others not, or what `derive` says of a phase.
     """
     expected = [phase.expected is not None for phase in phases]
     if not any(expected):
@@ -50,16 +54,37 @@ def with_feedback(phases: Sequence[Declarations], jumps: Sequence[Jumps]) -> lis
     for phase in phases:
         _check_feedback(phase)
     check_random(phases)
+    gains, shared = gains_of(phases), shares_gains(phases)
     result = []
     for k, phase in enumerate(phases):
         later = None
-        if k + 1 < len(phases):
+        if k + 1 < len(phases) and gains is None:
             phase, later = _followed(phase, phases[k + 1], jumps[k + 1])
+        elif k + 1 < len(phases):
+            J = tangent(phase, phases[k + 1], jumps[k + 1])[1]
+            later = J.T @ J  # what goes on: its pattern alone counts
         try:
-            result.append(derive(phase, part=True, later=later))
+            own = derive(phase, part=True, later=later, gain=None if gains is None else gains[k])
         except ProblemError as error:
             raise in_phase(phase, error) from error
+        assert own.expansion is not None
+        result.append(replace(own, expansion=replace(own.expansion, shared=shared)))
     return result
+
+
+def shares_gains(phases: Sequence[Declarations]) -> bool:
+    """Whether some gain is optimised that no `Gain` of its phase describes: then all of them start from the best."""
+    if any(phase.expected is None for phase in phases) or gains_of(phases) is None:
+        return False
+    return any(phase.expected is not None and (phase.expected.gain is None or reasons(phase)) for phase in phases)
+
+
+def gains_of(phases: Sequence[Declarations]) -> tuple[Gain, ...] | None:
+    """The gain of each phase, all of them optimised where one phase asks for it; None for the best one in all."""
+    gains = [free_gain(phase) for phase in phases]
+    if all(gain is None for gain in gains):
+        return None
+    return tuple(Gain() if gain is None else gain for gain in gains)
 
 
 def in_phase(phase: Declarations | Statement, error: ProblemError) -> ProblemError:
@@ -69,7 +94,7 @@ def in_phase(phase: Declarations | Statement, error: ProblemError) -> ProblemErr
 
 
 def _check_feedback(phase: Declarations) -> None:
-    """One kind of cost in all phases, and the best gain in each."""
+    """One kind of cost in all phases."""
     if phase.expected is None:
         stated = "minimize()" if phase.cost is not None else "no cost"
         _refuse(
@@ -77,14 +102,6 @@ def _check_feedback(phase: Declarations) -> None:
             "minimize_expected() in every phase, or minimize() in all of them",
             stated,
             f"state what control and deviations cost in '{phase.name}' by minimize_expected()",
-        )
-    if free_gain(phase) is not None:
-        given = phase.expected.gain if phase.expected is not None else None
-        _refuse(
-            f"The gain of the phase '{phase.name}' is not the best one of its expected cost.",
-            "minimize_expected() without gain=, and closed_loop_covariance() in linear terms of the cost only",
-            str(given) if given is not None else "conditions or nonlinear costs of closed_loop_covariance()",
-            "leave them out, or solve one Problem by itself",
         )
 
 

@@ -15,7 +15,7 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.builder import Problem
 from covocp.problem.checks import column_expression
-from covocp.problem.declarations import State
+from covocp.problem.declarations import Declarations, State
 from covocp.problem.phase_chain import chain_of
 from covocp.statement.chain import Chain
 
@@ -178,3 +178,10 @@ class Phases:
             received=str(x)[:100],
             remedy="give the symbol itself, not its name: several phases may have that name",
         )
+
+
+def with_declarations(phases: Phases, declarations: Sequence[Declarations]) -> Phases:
+    """Phases with other declarations on the same symbols, and the same jumps."""
+    result = Phases([Problem.of(own) for own in declarations], phases.name)
+    result._jumps = phases.jumps
+    return result

@@ -20,7 +20,7 @@ from covocp.simulation.stretch import in_words
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
-from covocp.solving.phases import given_of_each
+from covocp.solving.phases_given import given_of_each
 from covocp.statement.chain import Link
 
 Made = TypeVar("Made")

@@ -46,8 +46,8 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 if TYPE_CHECKING:
     import matplotlib.figure
 
-# Share of its largest eigenvalue up to which the covariance of the estimate is known where it is a variable of the
-# program: after few readings it is singular, before them zero.
+# Share of the largest eigenvalue of X up to which the covariance of the estimate is known where it is a variable of
+# the program: after few readings it is singular, before them zero.
 ITERATED = 1e-9
 
 
@@ -265,13 +265,12 @@ class Solution:
     @cached
     def semidefinite(self) -> bool:
         """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-        estimates = [self.values.get(ESTIMATE), None if self.loop is None else self.loop.Xhat]
-        return all(
-            is_semidefinite(
-                matrix, 0.0 if self.mesh.eliminated or all(matrix is not own for own in estimates) else ITERATED
-            )
-            for matrix in self._all_covariances()
-        )
+        if self.loop is None or self.mesh.eliminated:
+            return all(map(is_semidefinite, self._all_covariances()))
+        estimates = [self.values.get(ESTIMATE), self.loop.Xhat]
+        others = [matrix for matrix in self._all_covariances() if all(matrix is not own for own in estimates)]
+        iterated = [np.concatenate([own, self.loop.X]) for own in estimates if own is not None]
+        return all(map(is_semidefinite, others)) and all(is_semidefinite(own, ITERATED) for own in iterated)
 
     def _all_covariances(self) -> list[Array]:
         loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]

@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import CovocpError
-from covocp.base.expressions import Given
 from covocp.base.matrices import Array, pack
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
@@ -62,23 +61,30 @@ def with_gain_told(problem: Problem, outcome: Outcome, best: Solution | None) ->
     if not asked:
         return outcome
     outcome = with_stats(outcome, **{ASKED: ", ".join(asked)})
-    if outcome.converged or best is None or best.loop is None:
+    if outcome.converged:
         return outcome
-    least, t, p = _spread_halves(best.loop, fed=False), best.t, best.parameters
+    return replace(outcome, message=ended(outcome.message, beyond(problem.declarations, best)))
+
+
+def ended(message: str, more: str) -> str:
+    """A message with more at its end."""
+    return message.rstrip(".") + more if more else message
+
+
+def beyond(own: Declarations, best: Solution | None) -> str:
+    """Which limits of X no gain may keep along the nominal of the best gain, as the end of a message; or nothing."""
+    if best is None or best.loop is None or own.spread is None:
+        return ""
+    least = spread_halves(best.loop, fed=False)
     told = []
-    for row in _rows(problem.declarations):
-        at = slice(None) if row.place == "path" else slice(-1, None)
-        floor = row.over(t[at], p, least[at])[0]
+    for row in rows_of(own):
+        floor = row.over(best, least)[0]
         k = int(np.argmax(floor))
         if floor[k] > row.limit:
-            told.append(
-                f"'{row.name}' is {floor[k]:.4g} at {t[at][k]:.4g} s with E for X, above its limit {row.limit:.4g}"
-            )
-    if not told:
-        return outcome
+            t = best.t[-floor.size :][k]
+            told.append(f"'{row.name}' is {floor[k]:.4g} at {t:.4g} s with E for X, above its limit {row.limit:.4g}")
     listed = "; ".join(told)
-    text = f"{outcome.message.rstrip('.')}; no feedback takes X below E: along the nominal of the best gain {listed}"
-    return replace(outcome, message=text)
+    return f"; no feedback takes X below E: along the nominal of the best gain {listed}" if told else ""
 
 
 def free_gain_block(statement: Statement) -> Block | None:
@@ -105,21 +111,26 @@ def gain_entries(statement: Statement, block: Block, solution: Solution, at: Arr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Row:
+class Row:
     """A condition on X alone, g(X) <= limit, and its name.
 
-    function: (time, parameters, half-vector of X) -> g, its slope by X.
+    known: names of the parameters and unknowns; function: (time, these, half-vector of X) -> g, its slope by X.
     """
 
     name: str
     place: Place
     limit: float
+    known: tuple[str, ...]
     function: ca.Function
 
     __repr__ = short_repr
 
-    def over(self, time: Array, parameters: Given, halves: Array) -> tuple[Array, Array]:
-        """g and its slopes at some times, (K,) and (K, entries)."""
+    def over(self, along: Solution, halves: Array) -> tuple[Array, Array]:
+        """g and its slopes where it holds along a solution, (K,) and (K, entries)."""
+        at = slice(None) if self.place == "path" else slice(-1, None)
+        time, halves = along.t[at], halves[at]
+        given = {b.name: along.parameters[b.span] for b in along.blocks if b.kind in ("parameter", "unknown")}
+        parameters = np.concatenate([np.zeros(0), *(given[name] for name in self.known)])
         columns = (time[None, :], np.tile(parameters[:, None], (1, time.size)), halves.T)
         value, slope = (np.asarray(v.full()) for v in self.function.map(time.size)(*columns))
         return value.ravel(), slope.reshape(time.size, -1)
@@ -134,20 +145,21 @@ def meeting_conditions(problem: Problem, best: Solution, parameters: Mapping[str
         parameters: values of parameters other than the declared ones, by name.
     """
     own = problem.declarations
-    rows = _rows(own)
+    rows = rows_of(own)
     if not rows or best.loop is None:
         return best
     try:
-        statement = statement_of(_weighted(own))
+        statement = statement_of(weighted(own))
         found = _searched(statement, rows, best, parameters)
     except (CovocpError, RuntimeError):  # a weight that no gain exists for: the best gain is a start as well
         return best
     return best if found is None else found
 
 
-def _rows(own: Declarations) -> list[_Row]:
+def rows_of(own: Declarations) -> list[Row]:
     """The conditions on X alone that have an upper limit, row by row."""
-    assert own.spread is not None
+    if own.spread is None:
+        return []
     constants: list[Any] = [*own.parameters, *own.unknowns]
     known = [entry.symbol for entry in constants]
     p, half = ca.vertcat(ca.MX(0, 1), *known), own.spread.symbol
@@ -165,12 +177,13 @@ def _rows(own: Declarations) -> list[_Row]:
             arguments = [own.time, stacked, half]
             function = ca.Function("row", arguments, inner.call([own.time, *parts, half]))
             name = c.name if c.lower.size == 1 else f"{c.name}[{i}]"
-            rows.append(_Row(name=name, place=c.at, limit=float(c.upper[i]), function=function))
+            own_names = tuple(entry.name for entry in constants)
+            rows.append(Row(name=name, place=c.at, limit=float(c.upper[i]), known=own_names, function=function))
     return rows
 
 
-def _weighted(own: Declarations) -> Declarations:
-    """The problem with the best gain and weights of X that are parameters."""
+def weighted(own: Declarations, of: str = "") -> Declarations:
+    """A problem with the best gain and weights of X that are parameters; with `of` at the end of their names."""
     result = with_best_gain(own, conditions=False)
     assert result is not None
     assert result.expected is not None
@@ -180,7 +193,7 @@ def _weighted(own: Declarations) -> Declarations:
     for place, name in WEIGHTS.items():
         size = spread.symbol.shape[0]
         symbol = ca.MX.sym(name, size)
-        entry = Parameter(name=name, symbol=symbol, size=size, where="", unit="", value=np.zeros(size))
+        entry = Parameter(name=name + of, symbol=symbol, size=size, where="", unit="", value=np.zeros(size))
         result = result.adding(parameters=entry)
         kept = ca.DM.ones(size) if place == "path" else ca.DM(pack(np.pad(np.ones((n, n)), (0, spread.size - n))))
         costs[place] = ca.dot(ca.sparsify(kept) * symbol, spread.symbol)
@@ -193,23 +206,23 @@ def _weighted(own: Declarations) -> Declarations:
     return replace(result, expected=expected)
 
 
-def _searched(statement: Statement, rows: list[_Row], best: Solution, parameters: Mapping[str, Any]) -> Solution | None:
+def _searched(statement: Statement, rows: list[Row], best: Solution, parameters: Mapping[str, Any]) -> Solution | None:
     """The solution along the nominal of `best` with weights of X that come closest to the conditions; None: no need."""
     options = Options(grid=np.unique(best.mesh.nodes), control=best.mesh.control)  # type: ignore[arg-type]
     assert best.loop is not None
     loop = best.loop
     outcome: Outcome | None = None
-    least = _spread_halves(loop, fed=False)
+    least = spread_halves(loop, fed=False)
     weights = np.zeros(len(rows))
     closest, found = np.inf, outcome
     for turn in range(ROUNDS):
-        shares, weights, slopes = _raised(rows, weights, best, _spread_halves(loop, fed=True), least)
+        shares, weights, slopes = raised(rows, weights, best, spread_halves(loop, fed=True), least)
         worst = max(shares)
         if turn == 0 and worst <= 1.0:
             return None
         if outcome is not None and worst < closest:
             closest, found = worst, outcome
-        if not np.isfinite(worst) or (turn and worst <= 1.0 + MET and (worst >= 1.0 - MET or turn > ROUNDS // 2)):
+        if close_enough(worst, turn):
             break
         values = stacked_parameters(statement, {**parameters, **slopes})
         mesh = evaluation_mesh(statement, options, values)
@@ -221,8 +234,13 @@ def _searched(statement: Statement, rows: list[_Row], best: Solution, parameters
     return None if found is None else Solution.of(found, METHOD)
 
 
-def _raised(
-    rows: list[_Row], weights: Array, best: Solution, halves: Array, least: Array
+def close_enough(worst: float, turn: int) -> bool:
+    """Whether weights with which the worst condition leaves so much are near enough in a round, or are no use."""
+    return not np.isfinite(worst) or (turn > 0 and worst <= 1.0 + MET and (worst >= 1.0 - MET or turn > ROUNDS // 2))
+
+
+def raised(
+    rows: list[Row], weights: Array, best: Solution, halves: Array, least: Array
 ) -> tuple[list[float], Array, dict[str, Array]]:
     """Of each condition what feedback leaves, as a share of what it may leave; other weights, and the weights of X.
 
@@ -233,14 +251,13 @@ def _raised(
         halves: half-vectors of X at the nodes.
         least: those that no feedback can better, E.
     """
-    t, p, after = best.t, best.parameters, weights.copy()
+    t, after = best.t, weights.copy()
     unit = abs(best.cost) if best.cost else 1.0
     shares = []
     slopes = {name: np.zeros(halves.shape[1]) for name in WEIGHTS.values()}
     for i, row in enumerate(rows):
-        at = slice(None) if row.place == "path" else slice(-1, None)
-        value, slope = row.over(t[at], p, halves[at])
-        floor = row.over(t[at], p, least[at])[0]
+        value, slope = row.over(best, halves)
+        floor = row.over(best, least)[0]
         room = np.maximum(row.limit - floor, MET * np.abs(row.limit - value) + np.finfo(float).tiny)
         share = (value - floor) / room
         k = int(np.argmax(share))
@@ -254,7 +271,7 @@ def _raised(
     return shares, after, slopes
 
 
-def _spread_halves(loop: ClosedLoop, *, fed: bool) -> Array:
+def spread_halves(loop: ClosedLoop, *, fed: bool) -> Array:
     """Half-vectors of the covariance of states, unknowns and controls at the nodes; with or without the feedback."""
     moved = loop.gain @ loop.Xhat if fed else 0.0 * loop.gain
     inner = loop.X if fed else loop.E

@@ -28,7 +28,7 @@ from covocp.problem.phases import Phases
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.evaluation import SAME, check_same, first_options, run_along, statistics_along, told
-from covocp.solving.phases import intervals_of, of_each, values_of
+from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.statement.chain import Chain
 from covocp.transcription.grading import graded
@@ -70,7 +70,7 @@ def evaluate_phases(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Runs:
+class Runs:
     """One run along a nominal through all phases: what came out, parameters with what passes, options of the meshes."""
 
     outcomes: tuple[Outcome, ...]
@@ -90,9 +90,9 @@ def _along(
     counts = intervals_of(chain, intervals)
     asked = tuple(first_options(own, n, options) for own, n in zip(nominals, counts, strict=True))
     values = values_of(chain, {} if parameters is None else parameters)
-    runs = _run(chain, nominals, asked, values)
+    runs = run_all(chain, nominals, asked, values)
     if any(link.weights for link in chain.links):  # meshes are graded for S of the phases behind
-        runs = _run(chain, nominals, asked, runs.parameters)
+        runs = run_all(chain, nominals, asked, runs.parameters)
     automatic = [own.substeps == "auto" for own in asked]
     while True:
         pairs = zip(runs.outcomes, runs.options, automatic, strict=True)
@@ -100,13 +100,13 @@ def _along(
         if all(a is b for a, b in zip(finer, runs.options, strict=True)):
             break
         try:
-            runs = _run(chain, nominals, finer, runs.parameters)
+            runs = run_all(chain, nominals, finer, runs.parameters)
         except SolveError:  # what the steps are off is told with the solution that there is
             break
-    return _solved(chain, runs)
+    return solved(chain, runs)
 
 
-def _run(chain: Chain, nominals: list[Any], options: tuple[Options, ...], values: Arrays) -> _Runs:
+def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], values: Arrays) -> Runs:
     """States and matrices that run forward, from the first phase to the last; then those that run backward."""
     outcomes: list[Outcome] = []
     filled: list[Array] = []
@@ -133,7 +133,7 @@ def _run(chain: Chain, nominals: list[Any], options: tuple[Options, ...], values
             linked = {entry: given[entry] for entry in chain.links[i - 1].states} if i else {}
             outcomes[i] = run_along(chain.statements[i], nominals[i], fine[i], filled[i], linked)
             _check_finite(chain.statements[i].name, outcomes[i])
-    return _Runs(outcomes=tuple(outcomes), parameters=tuple(filled), options=tuple(fine))
+    return Runs(outcomes=tuple(outcomes), parameters=tuple(filled), options=tuple(fine))
 
 
 def _check_finite(name: str, outcome: Outcome) -> None:
@@ -146,7 +146,7 @@ def _check_finite(name: str, outcome: Outcome) -> None:
         raise SolveError(f"The phase '{name}' becomes NaN or inf along this nominal: give another one, or bounds.")
 
 
-def _solved(chain: Chain, runs: _Runs) -> PhasesSolution:
+def solved(chain: Chain, runs: Runs) -> PhasesSolution:
     """A run as solutions of the phases; what the user must know about them is said."""
     extremals = []
     for outcome, values in zip(runs.outcomes, runs.parameters, strict=True):

@@ -123,6 +123,7 @@ class Loop:
     spread: (state, control, time, duration, parameters, half-vector of the covariance of augmented state and controls)
         -> what terms that are not linear in that covariance add to the running cost; None without them.
     spread_end: (state, duration, parameters, that half-vector) -> the same of the terminal cost.
+    shared: whether the gain is optimised because of what some phase of several asks for.
     """
 
     expansion: ca.Function
@@ -133,6 +134,7 @@ class Loop:
     by_parts: ca.Function | None
     spread: ca.Function | None = None
     spread_end: ca.Function | None = None
+    shared: bool = False
 
     __repr__ = short_repr
 

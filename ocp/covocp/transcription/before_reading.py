@@ -49,14 +49,16 @@ def unfed(statement: Statement, mesh: Mesh, start: Array) -> Unfed | None:
         mesh: with its instants.
         start: half-vectors at time zero, (ne,); NaN where they are free.
     """
-    if not waits(statement) or not mesh.readings.any():
+    if not waits(statement):
         return None
     gain = next(block.span for block in statement.controls if block.name == GAIN)
     estimate = next(block.span for block in statement.matrices if block.name == ESTIMATE)
     if not (start[estimate] == 0.0).all():
         return None
-    first = int(np.flatnonzero(mesh.readings.any(axis=0))[0])
-    return Unfed(nodes=first + 1, controls=gain, matrices=estimate)
+    read = np.flatnonzero(
+        mesh.readings.any(axis=0)
+    )  # nowhere where nothing is measured at all, as before a sensor is on
+    return Unfed(nodes=int(read[0]) + 1 if read.size else mesh.nodes.size, controls=gain, matrices=estimate)
 
 
 def hold(own: Unfed, lower: Array, upper: Array) -> None:

@@ -334,6 +334,8 @@ def _choose_points(statement: Statement, options: Options, substeps: int, group:
     Raises:
         ProblemError: given substeps that do not end at the given points.
     """
+    if statement.loop is not None and statement.loop.shared and options.substeps == "auto":
+        substeps = max(substeps, 2 * group)  # as below, also where the limits are those of another phase
     if not (statement.path.size or statement.bounded_states):
         return substeps, 1
     if options.points == "auto":

@@ -13,6 +13,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.chain import Chain, Link
+from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.nlp import NLP, VIOLATION, Rows, Scales, check_costs
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -137,7 +138,11 @@ class Program:
                 continue
             offset = len(part.mesh.starts) * part.statement.nx  # matrices at the start: rows give them
             places = [offset + k for k in entries]
-            found[i + 1]["lbx"][places] = part.statement.matrix_lower[entries] / part.scales.e[entries]
+            lower = part.statement.matrix_lower.copy()
+            for block in part.statement.matrices:  # given by what is semidefinite, and zero where a state appears
+                if part.statement.loop is not None and block.name == ESTIMATE:
+                    lower[block.span] = -np.inf
+            found[i + 1]["lbx"][places] = lower[entries] / part.scales.e[entries]
             found[i + 1]["ubx"][places] = np.inf
         joined = {name: np.concatenate([entry[name] for entry in found]) for name in found[0]}
         zero = np.zeros(sum(rows.lower.size for rows in self.link_rows))
