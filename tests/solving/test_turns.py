@@ -15,7 +15,7 @@ FROM = (3.66, -1.86)
 
 
 def crossing(turn=2 * np.pi, **bounds):
-    """A boat of speed 1 in a current of y/2 along x, to the origin in the least time; the heading in units of a turn."""
+    """A boat of speed 1 in a current of y/2 along x, to the origin; the heading in parts of a turn."""
     ocp = co.Problem(co.Free(5.0, 1.0, 20.0), name="crossing")
     x, y = (ocp.state(name, initial=value, final=0.0) for name, value in zip("xy", FROM, strict=True))
     heading = ocp.control("heading", **bounds)

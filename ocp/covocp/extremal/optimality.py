@@ -306,7 +306,7 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
         above[j] = (value - np.minimum(np.minimum(*held), value)).ravel()
         slopes.append(np.where(free, slope[:, :, 0], 0.0))
         curvatures.append(curvature)
-    definite = (np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0)
+    definite = np.asarray((np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0))
     curvature = np.where(definite[:, None, None], curvatures[1], np.eye(st.nu))
     steps = np.linalg.solve(curvature, np.array(slopes)[..., None])[..., 0]
     gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)

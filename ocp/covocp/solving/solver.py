@@ -44,6 +44,7 @@ from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
+from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
 from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
@@ -159,6 +160,10 @@ class Solver:
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
+        patient = "max_iterations" in self._own or "max_iterations" not in own
+        self._loosened = bool(self._best) and can_be_loosened(solved) and not patient
+        if self._loosened:  # there is another way
+            self._own["max_iterations"] = PATIENCE
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = self._prepare(solved, self._options, **self._own)
@@ -311,7 +316,24 @@ class Solver:
             outcome, start = from_starts(self._prepared, values, several, reporter)
             if outcome.converged or reporter.stop:
                 break
+        outcome = outcome if outcome.converged or best is None else self._tightened(outcome, values, best, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
+
+    def _tightened(self, failed: Outcome, values: Array, best: Solution, reporter: Progress) -> Outcome:
+        """Solved by way of loosened limits of the spread, from the best gain; else as it failed."""
+        if reporter.stop or not self._loosened:
+            return failed
+        mesh = self._prepared.mesh
+        begin = make_guess(self._solved, mesh, values, best)
+
+        def run(statement: Statement, last: Outcome | None, most: int) -> Outcome:
+            prepared = self._prepare(statement, self._options, **{**self._own, "max_iterations": most})
+            start = begin if last is None else make_guess(statement, mesh, values, Solution.of(last, self.method))
+            outcome: Outcome = prepared.solve(values, start, reporter)
+            return outcome
+
+        found = tightened(self._solved, begin.trajectory, mesh, values, run, lambda: reporter.stop)
+        return failed if found is None else with_stats(found, **counted(failed, found))
 
     def _closed(self, outcome: Outcome) -> Outcome:
         """Filter and feedback around the nominal of the deterministic cost."""

@@ -1,8 +1,8 @@
 """Angles that turn full circle between two nodes: local minima that the piecewise form of a control makes.
 
-Where a control is an angle, its values at two neighbouring nodes may belong to one course and yet differ by a turn: what
-lies between them runs through all directions. As long as the interval is short this costs little, so that no small
-change of the nodes gains anything; the cost is off by the length of the interval all the same.
+Where a control is an angle, its values at two neighbouring nodes may belong to one course and yet differ by a turn:
+what lies between them runs through all directions. As long as the interval is short this costs little, so that no
+small change of the nodes gains anything; the cost is off by the length of the interval all the same.
 """
 
 from __future__ import annotations

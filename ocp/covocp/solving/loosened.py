@@ -1,0 +1,105 @@
+"""Conditions on the spread that a run does not find its way to: loosened first, then tightened step by step.
+
+A gain that is a control meets limits of X only together with the nominal, and from a start that is far from them the
+method may wander. Where the limits are as wide as the start needs, it converges; each solution starts the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from covocp.base.errors import CovocpError
+from covocp.base.matrices import Array
+from covocp.extremal.extremal import Outcome
+from covocp.solving.attempts import counted, with_stats
+from covocp.statement.conditions import Conditions
+from covocp.statement.interval import repeated
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Trajectory
+
+# Iterations after which a run gives up where there is this other way; of each step of it, and of the last.
+PATIENCE, PATIENCE_OF_STEPS = 400, 150
+# First step of the share by which limits are loosened, the smallest one, and the most steps.
+FIRST, SMALLEST, MOST = 0.5, 0.02, 20
+# What the start misses of a limit is allowed with so much more.
+ROOM = 1.1
+
+# A run: the statement, the outcome where to start or None for the start itself, iterations at most -> the outcome.
+Run = Callable[[Statement, Outcome | None, int], Outcome]
+
+
+def can_be_loosened(statement: Statement) -> bool:
+    """Whether there are limits along the path or at the end that contain the covariance of the closed loop."""
+    return statement.loop is not None and any(
+        own.realised is not None and not own.equations.all() for own in (statement.path, statement.end)
+    )
+
+
+def tightened(
+    statement: Statement, start: Trajectory, mesh: Mesh, parameters: Array, run: Run, stopped: Callable[[], bool]
+) -> Outcome | None:
+    """The outcome of a sequence of problems whose limits are loosened less and less, the last one not at all.
+
+    Args:
+        statement: the problem.
+        start: what its limits are loosened for.
+        mesh: of the start.
+        parameters: stacked.
+        run: solves a statement.
+        stopped: whether to stop.
+
+    Returns:
+        The outcome of the problem itself; None where the steps became too small before.
+    """
+    missed = {name: _missed(getattr(statement, name), name, start, mesh, parameters) for name in ("path", "end")}
+    if not any(np.any(own > 0) for own in missed.values()):
+        return None
+    share, step, last = 1.0, 0.0, None
+    for _ in range(MOST):
+        if stopped():
+            return None
+        wanted = share - step if share - step > SMALLEST / 2 else 0.0
+        problem = statement if wanted == 0.0 else _loosened(statement, missed, wanted)
+        try:
+            found = run(problem, last, PATIENCE if wanted == 0.0 else PATIENCE_OF_STEPS)
+        except CovocpError:
+            return None
+        found = found if last is None else with_stats(found, **counted(last, found))
+        if found.converged:
+            if wanted == 0.0:
+                return found
+            step = FIRST if last is None else min(1.5 * step, FIRST)
+            share, last = wanted, found
+        elif last is None or step <= SMALLEST:
+            return None
+        else:
+            step = 0.5 * step
+    return None
+
+
+def _missed(rows: Conditions, name: str, start: Trajectory, mesh: Mesh, parameters: Array) -> Array:
+    """By how much the start passes the limits of each row that contains X, (rows,); 0 of the others."""
+    if rows.realised is None:
+        return np.zeros(rows.size)
+    count = start.x.shape[0]
+    controls = start.u if start.u.shape[0] == count else np.vstack([start.u, start.u[-1:]])
+    columns = [start.x.T, controls.T, start.e.T, start.duration * mesh.nodes[None, :]]
+    columns += [np.asarray(column) for column in repeated(start.duration, parameters, count)]
+    columns = [column[:, -1:] for column in columns] if name == "end" else columns
+    values = np.asarray(rows.function.map(columns[0].shape[1])(*columns))
+    over = np.maximum(values - rows.upper[:, None], rows.lower[:, None] - values).max(axis=1)
+    return np.where(np.isfinite(over) & ~rows.equations, ROOM * np.maximum(over, 0.0), 0.0)
+
+
+def _loosened(statement: Statement, missed: dict[str, Array], share: float) -> Statement:
+    """The statement with limits that are wider by a share of what the start missed of them."""
+    wider: dict[str, Any] = {}
+    for name, by in missed.items():
+        rows: Conditions = getattr(statement, name)
+        wider[name] = replace(rows, lower=rows.lower - share * by, upper=rows.upper + share * by)
+    return replace(statement, **wider)

@@ -1,0 +1,37 @@
+"""Limits of the spread that a run does not find its way to are tightened step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.solving import solver
+
+
+def brisk(limit=1.2):
+    """Five metres in eight seconds with a speed that 98 % of the runs keep below a limit."""
+    ocp = co.Problem(8.0, name="brisk")
+    x = ocp.state("x", initial=0.0, final=5.0, variance=0.2)
+    v = ocp.state("v", initial=0.0, final=0.0, variance=0.05)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u, noise=0.02)
+    ocp.measurement("m", x, noise=0.02)
+    ocp.minimize_expected(running=u**2, terminal_weight={x: 10.0, v: 1.0})
+    ocp.chance(v, upper=limit, probability=0.98, name="speed")
+    return ocp
+
+
+def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
+    """On 100 intervals a run from the start alone takes more than a thousand iterations; here it may take twelve."""
+    options = {"intervals": 30, "progress": False}
+    with pytest.raises(co.SolveError, match="largest number of iterations"):
+        co.solve(brisk(), max_iterations=12, **options)  # as asked: nothing is tried beyond
+    alone = co.solve(brisk(), **options)
+    monkeypatch.setattr(solver, "PATIENCE", 12)
+    found = co.solve(brisk(), **options)
+    assert found.cost == pytest.approx(alone.cost, rel=1e-6)
+    assert found.stats["iterations"] > alone.stats["iterations"]
+    largest = found["v"] + 2.0537489 * np.ravel(found.deviation("v"))  # the quantile of 98 %
+    assert largest.max() == pytest.approx(1.2, abs=1e-6)
