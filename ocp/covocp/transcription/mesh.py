@@ -37,6 +37,10 @@ EXPLICIT_SUBSTEPS = 8
 # 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
 IMPLICIT_SUBSTEPS = 4
 
+# Gauss steps an interval, at least, where a gain is a control and the estimate learns all the time: by two of them a
+# large gain while little is estimated costs nothing where the rule of the running cost does not look.
+FED_SUBSTEPS = 4
+
 # Share of the terminal time by which a time may miss an instant and mean it.
 SAME_TIME = 1e-9
 # The same of a node: what dividing and multiplying by the terminal time leave.
@@ -303,6 +307,8 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
     if step != "rodas" and stiffness.decaying > STABILITY_LIMIT * substeps:
         raise _too_few_substeps(substeps, stiffness.decaying)
     paired = statement.running_uses_matrices and (step != "rk4" or bool(statement.behind))
+    if paired and statement.fed and options.substeps == "auto":
+        substeps = max(substeps, FED_SUBSTEPS)
     if paired and substeps % 2:
         substeps += 1  # Simpson's rule for the running cost takes them in pairs
     substeps, points = _choose_points(statement, options, substeps, 2 if paired else 1)

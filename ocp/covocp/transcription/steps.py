@@ -338,8 +338,8 @@ def fed_step(
     """`moving_step` where one of the matrices, Xhat, has the rate A Xhat + Xhat A' + Q + E W E, E another of them.
 
     E takes three steps, to the two Gauss points and to the end, so that it is known there to the order of a step. Then
-    Xhat+ = Phi Xhat Phi' + 1/2 sum_i Psi_i h (Q + E W E)_i Psi_i', Phi and Psi_i the transitions of the Gauss method from
-    the start and from the points to the end: a sum of congruences, positive semidefinite whatever A and h are.
+    Xhat+ = Phi Xhat Phi' + 1/2 sum_i Psi_i h (Q + E W E)_i Psi_i', Phi and Psi_i the transitions of the Gauss method
+    from the start and from the points to the end: a sum of congruences, positive semidefinite whatever A and h are.
     """
     xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
     interval = Interval.symbols(statement, ca.MX)
@@ -371,7 +371,16 @@ def _fed_half(
     interval: Interval,
     solver: str,
 ) -> Any:
-    """Half-vector of Xhat after a step: which matrices Xhat and E are, Xhat before, E and the nominal at both points."""
+    """Half-vector of Xhat after a step.
+
+    Args:
+        statement: the problem.
+        which: positions of Xhat and E.
+        halves: half-vectors of Xhat before the step, of E at both Gauss points.
+        inside: the nominal there.
+        interval: of the step.
+        solver: of linear systems.
+    """
     size = statement.matrices[which[0]].size
     drifts, gained = [], []
     for j, c in enumerate(GAUSS_NODES):
