@@ -391,12 +391,14 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
     """
     covariance = _choose_covariance_step(statement, options, stiffness)
     riccati = statement.riccati_forms
-    possible = riccati and options.covariance_step in ("auto", "gauss")
+    possible = riccati and not statement.fed and options.covariance_step in ("auto", "gauss")
     if options.step == "rodas" and not possible:
         raise ProblemError(
             "step='rodas' does not apply: it goes with gauss steps of the covariances.",
             expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
-            received=f"covariance_step='{options.covariance_step}'"
+            received="a gain that is a control, and an estimate that learns all the time"
+            if statement.fed
+            else f"covariance_step='{options.covariance_step}'"
             if riccati
             else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
             remedy="leave step='auto', with more substeps= where the system is stiff",
@@ -417,13 +419,16 @@ def _choose_covariance_step(statement: Statement, options: Options, stiffness: S
 
     Where a gain is a control and all is measured all the time, few steps of rk4 are cheaper than those that keep Xhat
     semidefinite, and do: a wall of a double integrator takes a third of the time. Readings make it as narrow as can be.
+    So many steps as a stiff nominal needs are too many to be written out.
     """
     riccati = statement.riccati_forms
     if options.covariance_step == "auto":
         small = statement.ne <= SCALAR_ENTRIES
         stated = bool(statement.behind) and small and not _choose_eliminated(statement, options)
-        if statement.fed and statement.samples is None:
-            stated = explicit_substeps(stiffness.matrices) <= EXPLICIT_SUBSTEPS
+        if statement.fed:
+            many = explicit_substeps(stiffness.matrices) > EXPLICIT_SUBSTEPS
+            stiff = explicit_substeps(stiffness.nominal) > EXPLICIT_SUBSTEPS
+            stated = stiff or (statement.samples is None and not many)
         return "gauss" if riccati and not stated else "rk4"
     if options.covariance_step != "rk4" and not riccati:
         pairs = zip(statement.matrices, statement.riccati, strict=True)

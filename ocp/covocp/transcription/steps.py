@@ -310,7 +310,7 @@ def moving_step(
         (their half-vectors stacked, x at the start, x at the end, *interval) -> their half-vectors at the end.
     """
     if fed(statement, positions):
-        return fed_step(statement, positions, step, _scalar(statement, positions, step, solver))
+        return fed_step(statement, positions, step, _scalar(statement, positions, solver))
     xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
     interval = Interval.symbols(statement, ca.MX)
     e = ca.MX.sym("e", len(statement.entries(positions)))
@@ -324,9 +324,9 @@ def fed(statement: Statement, positions: tuple[int, ...]) -> bool:
     return any(statement.sources[i] is not None for i in positions)
 
 
-def _scalar(statement: Statement, positions: tuple[int, ...], step: StepKind, solver: str) -> str:
+def _scalar(statement: Statement, positions: tuple[int, ...], solver: str) -> str:
     """The linear solver of a step, that of scalars where all is written out in them."""
-    written = statement.symbolic is ca.SX and step != "rodas" and fed(statement, positions)
+    written = statement.symbolic is ca.SX and fed(statement, positions)
     small = written and max(statement.matrices[i].size for i in positions) <= SCALAR_ROWS
     return SCALAR_SOLVER if small else solver
 
@@ -346,7 +346,7 @@ def fed_step(
     ends = np.cumsum([0, *(statement.matrices[i].length for i in positions)]).tolist()
     e = ca.MX.sym("e", ends[-1])
     own = {i: e[j:k] for i, j, k in zip(positions, ends, ends[1:], strict=False)}
-    inside = _inside_points(statement, step)(xa, xb, *interval)
+    inside = _inside_points(statement)(xa, xb, *interval)
     places, states = (0.0, *GAUSS_NODES, 1.0), (xa, inside[:, 0], inside[:, 1], xb)
     after: dict[int, Any] = {}
     for i in sorted(positions, key=lambda i: statement.sources[i] is not None):
@@ -397,10 +397,8 @@ def _fed_half(
 
 
 @lru_cache(maxsize=KEPT)
-def _inside_points(statement: Statement, step: StepKind) -> ca.Function:
-    """The nominal at the Gauss points of a step, by its own polynomial, (nx, 2)."""
-    if step == "rodas":
-        return between(statement, GAUSS_NODES)
+def _inside_points(statement: Statement) -> ca.Function:
+    """The nominal at the Gauss points of a step, (nx, 2)."""
     symbolic: Any = statement.symbolic
     xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
     interval = Interval.symbols(statement)
@@ -508,7 +506,7 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     fine = ca.vertcat(states, halves)
     options = _slopes(statement, 1)
     function = ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], options)
-    scalar = _scalar(statement, stepped, step, solver) == SCALAR_SOLVER
+    scalar = _scalar(statement, stepped, solver) == SCALAR_SOLVER
     return function.expand("full_interval", options | {"cse": True}) if scalar else function
 
 
