@@ -135,3 +135,54 @@ def ellipse_read_by_duality(limits: tuple[float, float]) -> float:
         return total
 
     return -float(minimize(lambda w: -cost(np.exp(w)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6}).fun)
+
+
+SPEED = 0.1
+
+
+def ellipse_mixed(limits: tuple[float, float], variance: float) -> co.Problem:
+    """The ellipse where the speed is measured all the time and the position read each second."""
+    ocp = co.Problem(TIME, "ellipse, measured and read")
+    x = ocp.state("x", initial=1.0, final=0.0, variance=START[0, 0])
+    v = ocp.state("v", initial=0.0, final=0.0, variance=START[1, 1])
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u, noise=NOISE)
+    ocp.measurement("speed", v, noise=SPEED)
+    ocp.measurement("position", x, noise=variance, every=1.0)
+    ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 0.0, v: 0.0})
+    X = ocp.closed_loop_covariance()
+    ocp.subject_to(ca.diag(X.matrix) / np.array(limits), upper=1.0, at="final", name="ellipse")
+    return ocp
+
+
+def ellipse_mixed_by_duality(limits: tuple[float, float], variance: float) -> float:
+    """Its least expected cost, as `ellipse_read_by_duality`; what is learnt between the readings costs tr S E W E/2."""
+    information = np.diag([0.0, 1.0 / SPEED])
+
+    def rate(_: float, e: np.ndarray) -> np.ndarray:
+        E = e.reshape(2, 2)
+        return (F @ E + E @ F.T + NOISE * G @ G.T - E @ information @ E).ravel()
+
+    places, weights = np.polynomial.legendre.leggauss(40)
+    E, lost = START, []  # (time, what E loses there)
+    for k in range(round(TIME)):
+        times = np.append(0.5 * (places + 1.0), 1.0)
+        passed = solve_ivp(rate, (0.0, 1.0), E.ravel(), "LSODA", times, rtol=1e-11, atol=1e-13).y.T.reshape(-1, 2, 2)
+        lost += [(k + c, w / 2 * P @ information @ P) for c, w, P in zip(times, weights, passed[:-1], strict=False)]
+        E = passed[-1]
+        if k + 1 < TIME:  # a reading at the end comes too late for the feedback
+            gained = E @ M.T @ M @ E / (E[0, 0] + variance)
+            lost.append((k + 1.0, gained))
+            E = E - gained
+
+    def cost(end: np.ndarray) -> float:
+        total = 6.0 / TIME**3 + 0.5 * end @ (np.diagonal(E) - np.array(limits))
+        for time, gained in lost:
+            h = TIME - time
+            moved, gramian = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
+            S = moved.T @ np.linalg.solve(np.diag(1 / end) + gramian, moved)
+            total += 0.5 * np.trace(S @ gained)
+        return float(total)
+
+    return -float(minimize(lambda w: -cost(np.exp(w)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6}).fun)

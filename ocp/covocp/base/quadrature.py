@@ -75,6 +75,26 @@ def gauss_transition(points: Any, unit: Any, solve: Callable[[Any, Any], Any]) -
     return unit + (right @ solve(matrix, left) - unit) / SHARE
 
 
+def gauss_arrivals(points: Any, unit: Any, solve: Callable[[Any, Any], Any]) -> tuple[Any, Any, Any]:
+    """Transitions of the two-stage Gauss method to the end of a step of y' = A y, transposed: from its start and nodes.
+
+    The method is its own adjoint: they are the last value and the stages of the step back, z' = -A' z from z(h) = I.
+    Unlike an inverse of the transition from the start they exist where the step itself does.
+
+    Args:
+        points: h A at the two nodes.
+        unit: the identity.
+        solve: (matrix, right side) -> solution.
+
+    Returns:
+        Phi', Psi_1', Psi_2'.
+    """
+    left, right, matrix = _eliminated((points[1].T, points[0].T), unit)
+    second = solve(matrix, left)
+    change = (right @ second - unit) / SHARE
+    return unit + change, second + 2 * GAP * change, second
+
+
 def gauss_step(points: Any, forcing: Any, start: Expr, unit: Any, solve: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
     """The change of y over a step of y' = H y + f by the two-stage Gauss method, and its transition D.
 

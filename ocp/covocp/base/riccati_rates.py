@@ -74,10 +74,10 @@ def recognise(rate: Expr, half: Expr, size: int) -> tuple[Any, Any, Any] | None:
         for j in range(size):
             information[i, j] = -quadratic[position[max(i, j), min(i, j)]] / 2
     form = pack_symbolic(riccati_rate(unpack_symbolic(half, size), drift, unpack_symbolic(constant, size), information))
-    return (drift, unpack_symbolic(constant, size), information) if _same(rate, form, half) else None
+    return (drift, unpack_symbolic(constant, size), information) if same(rate, form, half) else None
 
 
-def _same(first: Expr, second: Expr, half: Expr) -> bool:
+def same(first: Expr, second: Expr, half: Expr) -> bool:
     """Whether two expressions agree at a few random points."""
     symbols = ca.symvar(ca.veccat(first, second, half))
     function = ca.Function("both", [ca.veccat(*symbols)], [first, second])

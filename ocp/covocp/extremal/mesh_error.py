@@ -121,23 +121,31 @@ def node_error(extremal: Extremal) -> float:
         return float((total / size).max(initial=0.0))
 
 
-def finer_steps(extremal: Extremal, options: Options, allowed: float = ALONG) -> Options | None:
+def finer_steps(
+    extremal: Extremal, options: Options, allowed: float = ALONG, running: float | None = None
+) -> Options | None:
     """The options with so many integration steps that halving them moves little at the nodes.
+
+    A gain that is a control, where the estimate learns all the time, may be large for as long as little is estimated.
+    Long steps then find a feedback that is none: at the nodes it is hardly seen, in the cost it is.
 
     Args:
         extremal: a solution on the mesh of the options.
         options: those of this mesh.
         allowed: largest change, relative to the range of each entry.
+        running: the running cost, where the cost of such a gain counts as well.
 
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
     mesh = extremal.mesh
-    error = node_error(extremal)
-    if not allowed < error < np.inf:  # where halving them diverges nothing can be said
+    times = node_error(extremal) / allowed
+    if extremal.statement.fed and running is not None:
+        times = max(times, mesh_error(extremal, running) / COARSE_MESH)
+    if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
         return None
     order = 2 if mesh.step == "strang" else ORDER
-    factor = int(np.clip(np.ceil((error / allowed) ** (1 / order)), 2, MOST_TIMES))
+    factor = int(np.clip(np.ceil(times ** (1 / order)), 2, MOST_TIMES))
     substeps = min(factor, MOST_SUBSTEPS // mesh.substeps) * mesh.substeps
     if substeps <= mesh.substeps:
         return None

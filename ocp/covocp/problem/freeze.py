@@ -13,7 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
-from covocp.base.riccati_rates import inverse, recognise, riccati_rate
+from covocp.base.riccati_rates import inverse, recognise, riccati_rate, same
 from covocp.problem.chances import check_uncertain, uncertainties
 from covocp.problem.checks import check_dynamics
 from covocp.problem.data import used_data
@@ -47,7 +47,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
     stacked = stack(problem)
     x, u, e, t, _, p = stacked.inputs
     rates = _state_rates(problem, stacked)
-    matrix_rates, riccati, measurement = _matrix_rates(problem, stacked, rates)
+    matrix_rates, riccati, sources, measurement = _matrix_rates(problem, stacked, rates)
     running, terminal = stacked.substitute(*(problem.cost or ()))
     coupled = bool(ca.depends_on(rates, e)) if problem.matrices else False
     running_uses = bool(ca.depends_on(running, e)) if problem.matrices else False
@@ -72,6 +72,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         matrix_end=_matrix_end(problem, stacked),
         loop=_loop(problem, stacked),
         riccati=riccati,
+        sources=sources,
         measurement=measurement,
         measurements=measured_blocks(problem.continuous),
         information=_information(problem, stacked),
@@ -212,18 +213,24 @@ def _state_rates(problem: Declarations, stacked: Stacked) -> Any:
     return ca.vertcat(*stacked.substitute(*(problem.rates[state.name].rate for state in problem.states)))
 
 
-def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple[Any, tuple[Any, ...], Any]:
-    """Rates of all half-vectors, their Riccati forms where they have one, and the measurement."""
+def _matrix_rates(
+    problem: Declarations, stacked: Stacked, rates: Expr
+) -> tuple[Any, tuple[Any, ...], tuple[int | None, ...], Any]:
+    """Rates of all half-vectors, their Riccati forms where they have one, what feeds them, and the measurement."""
     e = stacked.inputs[2]
     measurement = _measurement(problem, stacked)
     values: list[Any] = []
     forms: list[Any] = []
+    sources: list[int | None] = []
+    estimated: Any = None
     offset = 0
     for entry in problem.matrices:
+        source = None
         half = e[offset : offset + entry.symbol.shape[0]]
         offset += entry.symbol.shape[0]
         if entry.estimation:
             form: Any = _kalman_form(problem, stacked, rates, measurement)
+            estimated = (len(forms), half, form[2])
             values.append(pack_symbolic(riccati_rate(unpack_symbolic(half, entry.size), *form)))
         elif entry.backward is not None:
             form = tuple(stacked.substitute(*entry.backward.form))
@@ -233,11 +240,34 @@ def _matrix_rates(problem: Declarations, stacked: Stacked, rates: Expr) -> tuple
             plain = entry.role == "moving" and stacked.symbolic is ca.SX
             form = recognise(values[-1], half, entry.size) if plain else None
         if form is not None and ca.depends_on(ca.veccat(*form), e):
-            form = None
+            form = _fed_form(values[-1], half, form, estimated, e) if entry.covariance else None
+            source = None if form is None else estimated[0]
+        sources.append(source)
         forms.append(form and stacked.function(f"riccati_{len(forms)}", list(form), without=("matrices",)))
     function = measurement and stacked.function("measurement", list(measurement), without=("matrices",))
     empty = stacked.symbolic(0, 1)
-    return ca.vertcat(empty, *values), tuple(forms), function
+    return ca.vertcat(empty, *values), tuple(forms), tuple(sources), function
+
+
+def _fed_form(rate: Expr, half: Expr, form: Any, estimated: Any, e: Expr) -> Any:
+    """F, Q, 0 of a covariance of rate F X + X F' + Q + E W E, E the estimation covariance; None where it is another.
+
+    Args:
+        rate: half-vector of the rate.
+        half: that of the covariance X.
+        form: its F, Q, W as they were recognised, with E in them.
+        estimated: position, half-vector and W of E; None where there is none.
+        e: all half-vectors.
+    """
+    if estimated is None or form[0].shape != estimated[2].shape:
+        return None
+    _, error, information = estimated
+    plain = tuple(ca.substitute([*form], [error], [ca.SX.zeros(error.shape)]))
+    if ca.depends_on(ca.veccat(*plain), e):
+        return None
+    E = unpack_symbolic(error, form[0].shape[0])
+    own = riccati_rate(unpack_symbolic(half, form[0].shape[0]), *plain)
+    return plain if same(rate, pack_symbolic(own + E @ information @ E), e) else None
 
 
 def _measurement(problem: Declarations, stacked: Stacked) -> tuple[Any, Any, Any] | None:

@@ -473,7 +473,7 @@ class Solver:
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
         while self._own_steps and outcome.converged and not reporter.stop:
-            finer = finer_steps(outcome.extremal, self._options, OPTIMISED)
+            finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
             if finer is None:
                 break
             try:

@@ -203,6 +203,8 @@ class Statement:
             where there are none. They have no initial value, and their rates do not depend on the other matrices.
         riccati: for each matrix, (state, control, time, duration, parameters) -> F, Q, W with
             V = F E + E F' + Q - E W E, or None where the rate has not this form.
+        sources: for each matrix, the position of the covariance E of which it gains, beside its form, E W E with the W
+            of that: what the estimate of a closed loop learns. None: of none.
         measurement: (state, control, time, duration, parameters) -> measured values, H = their Jacobian by the
             augmented state, noise density; None without measurements.
         measurements: where each of them lies among the measured values.
@@ -229,6 +231,7 @@ class Statement:
     matrix_end: ca.Function | None
     loop: Loop | None
     riccati: tuple[ca.Function | None, ...]
+    sources: tuple[int | None, ...]
     measurement: ca.Function | None
     measurements: tuple[Block, ...]
     information: ca.Function | None
@@ -332,6 +335,11 @@ class Statement:
     def summed(self) -> tuple[int, ...]:
         """Positions among `matrices` of the integrals of what depends on the others; nothing depends on them."""
         return tuple(i for i, block in enumerate(self.matrices) if block.role == "integral")
+
+    @cached
+    def fed(self) -> bool:
+        """Whether a matrix gains what another one loses by what is measured all the time."""
+        return any(source is not None for source in self.sources)
 
     @cached
     def riccati_forms(self) -> bool:

@@ -37,6 +37,10 @@ EXPLICIT_SUBSTEPS = 8
 # 1/20 of an interval, error of the cost with 1, 2, 3, 4, 8 steps: 6e-3, 5e-4, 1e-4, 1e-4, 2e-5.
 IMPLICIT_SUBSTEPS = 4
 
+# Gauss steps an interval, at least, where a gain is a control and the estimate learns all the time: by two of them a
+# large gain while little is estimated costs nothing where the rule of the running cost does not look.
+FED_SUBSTEPS = 4
+
 # Share of the terminal time by which a time may miss an instant and mean it.
 SAME_TIME = 1e-9
 # The same of a node: what dividing and multiplying by the terminal time leave.
@@ -303,6 +307,8 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
     if step != "rodas" and stiffness.decaying > STABILITY_LIMIT * substeps:
         raise _too_few_substeps(substeps, stiffness.decaying)
     paired = statement.running_uses_matrices and (step != "rk4" or bool(statement.behind))
+    if paired and statement.fed and options.substeps == "auto":
+        substeps = max(substeps, FED_SUBSTEPS)
     if paired and substeps % 2:
         substeps += 1  # Simpson's rule for the running cost takes them in pairs
     substeps, points = _choose_points(statement, options, substeps, 2 if paired else 1)
@@ -385,14 +391,16 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
     Raises:
         ProblemError: a step that does not apply.
     """
-    covariance = _choose_covariance_step(statement, options)
+    covariance = _choose_covariance_step(statement, options, stiffness)
     riccati = statement.riccati_forms
-    possible = riccati and options.covariance_step in ("auto", "gauss")
+    possible = riccati and not statement.fed and options.covariance_step in ("auto", "gauss")
     if options.step == "rodas" and not possible:
         raise ProblemError(
             "step='rodas' does not apply: it goes with gauss steps of the covariances.",
             expected="matrices of Riccati or Lyapunov form, stepped by gauss, that the nominal does not depend on",
-            received=f"covariance_step='{options.covariance_step}'"
+            received="a gain that is a control, and an estimate that learns all the time"
+            if statement.fed
+            else f"covariance_step='{options.covariance_step}'"
             if riccati
             else "a matrix of another form: " + ", ".join(block.name for block in statement.matrices),
             remedy="leave step='auto', with more substeps= where the system is stiff",
@@ -404,17 +412,25 @@ def choose_step(statement: Statement, options: Options, stiffness: Stiffness) ->
     return "rodas" if possible and (options.step == "rodas" or stiff) else covariance
 
 
-def _choose_covariance_step(statement: Statement, options: Options) -> StepKind:
+def _choose_covariance_step(statement: Statement, options: Options, stiffness: Stiffness) -> StepKind:
     """The covariance step: gauss where every rate has the Riccati form, else rk4.
 
     Where E and S of a closed loop are variables and small, rk4: written out in scalars, its exact derivatives cost a
     third of those of gauss's linear systems (lag of section 6.12, 6 entries). For large ones these are cheaper (Mars
     entry, 30 entries: 1.6 and 0.2 s for Hessian and Jacobian, with rk4 1.8 and 0.7 s and twice the memory).
+
+    Where a gain is a control and all is measured all the time, few steps of rk4 are cheaper than those that keep Xhat
+    semidefinite, and do: a wall of a double integrator takes a third of the time. Readings make it as narrow as can be.
+    So many steps as a stiff nominal needs are too many to be written out.
     """
     riccati = statement.riccati_forms
     if options.covariance_step == "auto":
         small = statement.ne <= SCALAR_ENTRIES
         stated = bool(statement.behind) and small and not _choose_eliminated(statement, options)
+        if statement.fed:
+            many = explicit_substeps(stiffness.matrices) > EXPLICIT_SUBSTEPS
+            stiff = explicit_substeps(stiffness.nominal) > EXPLICIT_SUBSTEPS
+            stated = stiff or (statement.samples is None and not many)
         return "gauss" if riccati and not stated else "rk4"
     if options.covariance_step != "rk4" and not riccati:
         pairs = zip(statement.matrices, statement.riccati, strict=True)
@@ -426,6 +442,14 @@ def _choose_covariance_step(statement: Statement, options: Options) -> StepKind:
             expected="rates of Riccati or Lyapunov form that depend on the nominal only",
             received=", ".join(names) or "a coupled problem",
             remedy="use covariance_step='rk4' (or leave it 'auto')",
+        )
+    if options.covariance_step == "strang" and statement.fed:
+        raise ProblemError(
+            "covariance_step='strang' does not apply: the covariance of the estimate gains what its error loses, all "
+            "the time.",
+            expected="'gauss' or 'rk4' where a gain is a control",
+            received="covariance_step='strang'",
+            remedy="leave covariance_step='auto'",
         )
     return options.covariance_step
 
@@ -461,7 +485,7 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         )
     if options.covariances != "auto":
         return options.covariances == "eliminated"
-    if statement.integrals or waits(statement):
+    if statement.integrals or waits(statement) or statement.fed:
         return False
     few = statement.loop is not None or statement.ne <= PATH_ENTRIES
     return obstacle is None and not (statement.path.uses_matrices and few)

@@ -23,11 +23,13 @@ from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
+    fed,
     full_interval,
     gathering_step,
     gauss_points,
     in_order,
     joint_interval,
+    moving_step,
     nominal_interval,
     propagate_step,
     read_by,
@@ -348,6 +350,10 @@ def _steps(
 ) -> Callable[[Any, int], tuple[list[Any], Run]]:
     """What makes, from the columns of some steps, the arguments of a sequence of them and the sequence."""
     kinds: list[ca.Function]
+    if fed(statement, positions) and mesh.step != "rk4":  # steps of one that depend on another
+        step = moving_step(statement, positions, mesh.step, mesh.linear_solver)
+        step = _kicked(step) if kicked else step
+        return lambda columns, _: (list(columns), partial(_accumulated, step))
     if passage != "plain":
         sizes = [statement.matrices[i].size for i in positions]
         kinds = [gauss_points(statement, i, mesh.step) for i in positions]

@@ -33,14 +33,18 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
+from covocp.base.linear_solve import LINEAR_SOLVER, SCALAR_SOLVER, linear_solve
 from covocp.base.matrices import pack_symbolic, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, riccati_step, simpson_weight
+from covocp.base.quadrature import GAUSS_NODES, gauss_arrivals, gauss_matrix, hermite, riccati_step, simpson_weight
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.rosenbrock import between, implicit_interval
 
 StepKind = Literal["gauss", "strang", "rk4", "rodas"]
+
+# Rows of a covariance up to which a step of matrices that feed each other is written out in scalars: its exact second
+# derivatives take 5 ms on 40 intervals with two rows, with calls of linear solvers 31; with three rows 22 and 72.
+SCALAR_ROWS = 4
 
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
@@ -297,6 +301,112 @@ def propagate_step(
 
 
 @lru_cache(maxsize=KEPT)
+def moving_step(
+    statement: Statement, positions: tuple[int, ...], step: StepKind, solver: str = LINEAR_SOLVER
+) -> ca.Function:
+    """Some matrices over one step of gauss or strang, between readings.
+
+    Returns:
+        (their half-vectors stacked, x at the start, x at the end, *interval) -> their half-vectors at the end.
+    """
+    if fed(statement, positions):
+        return fed_step(statement, positions, step, _scalar(statement, positions, solver))
+    xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
+    interval = Interval.symbols(statement, ca.MX)
+    e = ca.MX.sym("e", len(statement.entries(positions)))
+    steps = [step_matrix(statement, i, step, solver)(xa, xb, *interval) for i in positions]
+    end = propagate_step(statement, positions, step, solver)(e, *steps)
+    return ca.Function("moving_step", [e, xa, xb, *interval], [end])
+
+
+def fed(statement: Statement, positions: tuple[int, ...]) -> bool:
+    """Whether some of the matrices gain what another one loses by what is measured."""
+    return any(statement.sources[i] is not None for i in positions)
+
+
+def _scalar(statement: Statement, positions: tuple[int, ...], solver: str) -> str:
+    """The linear solver of a step, that of scalars where all is written out in them."""
+    written = statement.symbolic is ca.SX and fed(statement, positions)
+    small = written and max(statement.matrices[i].size for i in positions) <= SCALAR_ROWS
+    return SCALAR_SOLVER if small else solver
+
+
+@lru_cache(maxsize=KEPT)
+def fed_step(
+    statement: Statement, positions: tuple[int, ...], step: StepKind, solver: str = LINEAR_SOLVER
+) -> ca.Function:
+    """`moving_step` where one of the matrices, Xhat, has the rate A Xhat + Xhat A' + Q + E W E, E another of them.
+
+    E takes three steps, to the two Gauss points and to the end, so that it is known there to the order of a step. Then
+    Xhat+ = Phi Xhat Phi' + 1/2 sum_i Psi_i h (Q + E W E)_i Psi_i', Phi and Psi_i the transitions of the Gauss method
+    from the start and from the points to the end: a sum of congruences, positive semidefinite whatever A and h are.
+    """
+    xa, xb = ca.MX.sym("xa", statement.nx), ca.MX.sym("xb", statement.nx)
+    interval = Interval.symbols(statement, ca.MX)
+    ends = np.cumsum([0, *(statement.matrices[i].length for i in positions)]).tolist()
+    e = ca.MX.sym("e", ends[-1])
+    own = {i: e[j:k] for i, j, k in zip(positions, ends, ends[1:], strict=False)}
+    inside = _inside_points(statement)(xa, xb, *interval)
+    places, states = (0.0, *GAUSS_NODES, 1.0), (xa, inside[:, 0], inside[:, 1], xb)
+    after: dict[int, Any] = {}
+    for i in sorted(positions, key=lambda i: statement.sources[i] is not None):
+        source = statement.sources[i]
+        if source is None:
+            passed = [own[i]]
+            for c, d, x, y in zip(places, places[1:], states, states[1:], strict=False):
+                matrix = step_matrix(statement, i, step, solver)(x, y, *interval.part(c, d))
+                passed.append(propagate_step(statement, (i,), step, solver)(passed[-1], matrix))
+            after[i], known = passed[-1], passed[1:3]
+        else:
+            after[i] = _fed_half(statement, (i, source), (own[i], *known), inside, interval, solver)
+    function = ca.Function("fed_step", [e, xa, xb, *interval], [ca.vertcat(*(after[i] for i in positions))])
+    return function.expand("fed_step", {"cse": True}) if solver == SCALAR_SOLVER else function
+
+
+def _fed_half(
+    statement: Statement,
+    which: tuple[int, int],
+    halves: tuple[Any, ...],
+    inside: Expr,
+    interval: Interval,
+    solver: str,
+) -> Any:
+    """Half-vector of Xhat after a step.
+
+    Args:
+        statement: the problem.
+        which: positions of Xhat and E.
+        halves: half-vectors of Xhat before the step, of E at both Gauss points.
+        inside: the nominal there.
+        interval: of the step.
+        solver: of linear systems.
+    """
+    size = statement.matrices[which[0]].size
+    drifts, gained = [], []
+    for j, c in enumerate(GAUSS_NODES):
+        point = interval.at(c, inside[:, j])
+        drift, noise, _ = _form(statement, which[0])(*point)
+        information = _form(statement, which[1])(*point)[2]
+        E = unpack_symbolic(halves[1 + j], size)
+        drifts.append(interval.h * drift)
+        gained.append(interval.h * (noise + E @ information @ E))
+    transitions = gauss_arrivals(drifts, ca.DM.eye(size), lambda a, b: linear_solve(a, ca.densify(b), solver))
+    parts = (unpack_symbolic(halves[0], size), gained[0] / 2, gained[1] / 2)
+    total: Any = sum(turned.T @ part @ turned for turned, part in zip(transitions, parts, strict=True))
+    return pack_symbolic(total)
+
+
+@lru_cache(maxsize=KEPT)
+def _inside_points(statement: Statement) -> ca.Function:
+    """The nominal at the Gauss points of a step, (nx, 2)."""
+    symbolic: Any = statement.symbolic
+    xa, xb = symbolic.sym("xa", statement.nx), symbolic.sym("xb", statement.nx)
+    interval = Interval.symbols(statement)
+    value = ca.densify(_hermite_points(statement, xa, xb, interval))
+    return ca.Function("inside_points", [xa, xb, *interval], [value], _slopes(statement, 2))
+
+
+@lru_cache(maxsize=KEPT)
 def simpson_interval(statement: Statement, substeps: int, by_parts: bool = False) -> ca.Function:
     """Integral of a running cost that depends on the matrices, by Simpson's rule over pairs of substeps.
 
@@ -372,13 +482,12 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     _, states, cost = nominal_interval(statement, substeps, step)(x, *interval)
     starts = ca.horzcat(x, states[:, : substeps - 1])
     stepped = statement.ahead + statement.behind  # what is variable at both ends runs forward here
-    matrices = [step_matrix(statement, i, step, solver) for i in stepped]
-    propagate = propagate_step(statement, stepped, step, solver)
+    move = moving_step(statement, stepped, step, solver)
     own, gathered = e[statement.entries(stepped), :], e[statement.entries(statement.summed), :]
     columns = []
     for j in range(substeps):
         part = interval.part(j / substeps, (j + 1) / substeps)
-        after = propagate(own, *(matrix(starts[:, j], states[:, j], *part) for matrix in matrices))
+        after = move(own, starts[:, j], states[:, j], *part)
         if read_by(statement, stepped):
             whole: Any = ca.MX.zeros(statement.ne)
             whole[statement.entries(stepped)] = after
@@ -395,7 +504,10 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
         if statement.behind:
             cost = ca.if_else(early(interval), simpson_interval(statement, substeps, True)(*arguments), cost)
     fine = ca.vertcat(states, halves)
-    return ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], _slopes(statement, 1))
+    options = _slopes(statement, 1)
+    function = ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], options)
+    scalar = _scalar(statement, stepped, solver) == SCALAR_SOLVER
+    return function.expand("full_interval", options | {"cse": True}) if scalar else function
 
 
 def ahead_size(statement: Statement) -> int:
@@ -500,8 +612,7 @@ def matrices_step(
     if step == "rk4":
         end = runge_kutta_step(statement, positions)(e, xa, *interval)
     else:
-        steps = [step_matrix(statement, i, step, solver)(xa, xb, *interval) for i in positions]
-        end = propagate_step(statement, positions, step, solver)(e, *steps)
+        end = moving_step(statement, positions, step, solver)(e, xa, xb, *interval)
         if read_by(statement, positions):
             whole = ca.MX.zeros(statement.ne)
             whole[statement.entries(positions)] = end

@@ -45,10 +45,10 @@ def stiffness(statement: Statement, options: Options, parameters: Array, *, at_e
     rates = _eigenvalues(state_jacobian(statement)(x, u, e, 0.0, duration, parameters).full())
     longest = duration * float(np.diff(nodes).max())
     matrices = 0.0
-    for block, form in zip(statement.matrices, statement.riccati, strict=True):
+    for block, form, source in zip(statement.matrices, statement.riccati, statement.sources, strict=True):
         if block.role == "integral":
             continue
-        if form is None:
+        if form is None or source is not None:
             slope = _matrix_jacobian(statement)(x, u, e, 0.0, duration, parameters).full()
             matrices = max(matrices, _largest(_eigenvalues(slope)))
             break
