@@ -474,6 +474,8 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
         obstacle = "the rate of a state depends on a matrix"
     elif np.isnan(initial).any():
         obstacle = "an initial value of a matrix is free"
+    elif statement.fed:
+        obstacle = "a gain is a control"
     elif bounded := _bounded_matrices(statement):
         obstacle = f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
     if options.covariances == "eliminated" and obstacle:
