@@ -30,7 +30,7 @@ from covocp.solvers.gradient.records import Iterate, Linear, Measures
 from covocp.solvers.gradient.unknowns import Unknowns, of_part
 from covocp.statement.chain import Link
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.trajectory import Multipliers
 
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.base.matrices import pack, unpack
-from covocp.transcription.steps import moving_step
+from covocp.transcription.covariance_steps import moving_step
 
 PERIOD = 0.8
 

@@ -32,7 +32,7 @@ from covocp.extremal.fine_mesh import fine_trajectory
 from covocp.extremal.readings import Readings, readings_along
 from covocp.statement.interval import Interval, model_symbols, one_sided
 from covocp.statement.statement import Loop, Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 
 # Share of the largest slope below which a direction of the state counts as moved by nothing.
 UNMOVED = 1e-10

@@ -22,10 +22,11 @@ from covocp.extremal.hamiltonian import Costates, state_slope
 from covocp.extremal.inside import instant_jumps
 from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT, StepKind
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, StepKind, full_interval, nominal_interval
+from covocp.transcription.steps import full_interval, nominal_interval
 
 
 def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.inside import instant_jumps
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -24,7 +24,8 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.steps import KEPT, joint_interval, matrices_step, nominal_interval
+from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.steps import joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
 # what is positive semidefinite, to the roots of the diagonal at this place.

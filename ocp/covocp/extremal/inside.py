@@ -11,7 +11,7 @@ from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 
 
 def instant_jumps(extremal: Extremal) -> Array:

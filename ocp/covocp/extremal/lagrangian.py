@@ -18,9 +18,10 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.conditions import Columns, Conditions, Inside
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, full_interval, moving_interval, nominal_interval
+from covocp.transcription.steps import full_interval, moving_interval, nominal_interval
 
 # Rows that hold states alone.
 OF_STATES = ("final", "states")

@@ -17,8 +17,8 @@ from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
 from covocp.statement.chain import Link
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.nlp import terminal_slopes
-from covocp.transcription.steps import KEPT
 
 
 @dataclass(frozen=True, kw_only=True)

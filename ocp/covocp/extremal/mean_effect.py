@@ -30,7 +30,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.readings import Readings, readings_along
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 
 # Entries among the stats of a file, and their types.
 NOTE = "mean_effect_"

@@ -13,7 +13,7 @@ from covocp.base.matrices import Array, stacked, unpack
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import one_sided
 from covocp.statement.statement import Statement
-from covocp.transcription.steps import KEPT
+from covocp.transcription.covariance_steps import KEPT
 
 
 def rates_along(extremal: Extremal) -> tuple[Array, Array]:

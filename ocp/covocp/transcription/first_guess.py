@@ -15,9 +15,10 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, pack, real_numbers, unpack
 from covocp.base.quadrature import interpolated
 from covocp.statement.statement import Block, Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import KEPT, moving_interval, nominal_interval
+from covocp.transcription.steps import moving_interval, nominal_interval
 
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.

@@ -17,7 +17,7 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.statement.statement import Statement
 from covocp.transcription.before_reading import waits
-from covocp.transcription.steps import StepKind
+from covocp.transcription.covariance_steps import StepKind
 
 ELIMINATED_SEGMENTS = 10
 LARGEST_SUBSTEPS = 64

@@ -21,22 +21,18 @@ from covocp.passage.library import functions
 from covocp.passage.sweep import Told, depends, passed_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import fed, gauss_points, moving_step, propagate_step, step_matrix
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import (
-    fed,
     full_interval,
     gathering_step,
-    gauss_points,
     in_order,
     joint_interval,
-    moving_step,
     nominal_interval,
-    propagate_step,
     read_by,
     read_step,
     runge_kutta_step,
     simpson_interval,
-    step_matrix,
     told_at,
 )
 

@@ -21,6 +21,7 @@ from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Conditions, Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import (
     check_model,
     control_scale,
@@ -34,7 +35,6 @@ from covocp.transcription.first_guess import (
 )
 from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, control_places, explicit_substeps
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
-from covocp.transcription.steps import KEPT
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory, at_nodes
 

@@ -12,9 +12,10 @@ from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns
-from covocp.transcription.steps import KEPT, nominal_interval
+from covocp.transcription.steps import nominal_interval
 
 STEERING_STEPS = 4
 STEERING_TOLERANCE = 1e-6

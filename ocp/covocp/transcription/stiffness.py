@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
-from covocp.transcription.steps import KEPT
 
 # Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
 DAMPED = -0.5
