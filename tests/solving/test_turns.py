@@ -61,6 +61,21 @@ def test_the_least_time_is_found(turn, options, least_time):
     assert np.abs(np.diff(solution["heading"])).max() < turn / 8
 
 
+def test_the_least_time_of_two_phases_is_that_of_the_whole(least_time):
+    parts = []
+    for name, duration in (("begin", 1.0), ("end", co.Free(4.0, 0.5, 20.0))):
+        ocp = co.Problem(duration, name=name)
+        last = {"final": 0.0} if parts else {}
+        x, y = (ocp.state(n, initial=None if parts else v, **last) for n, v in zip("xy", FROM, strict=True))
+        heading = ocp.control("heading")
+        ocp.dynamics(x, ca.cos(heading) + 0.5 * y)
+        ocp.dynamics(y, ca.sin(heading))
+        ocp.minimize(terminal=ocp.duration if parts else 0.0)
+        parts.append(ocp)
+    solution = co.solve(co.Phases(parts), intervals=40, progress=False)
+    assert solution.cost + 1.0 == pytest.approx(least_time, rel=1e-6)
+
+
 def test_bounds_of_the_angle_are_kept(least_time):
     solution = co.solve(crossing(lower=-10.0, upper=10.0), progress=False)
     assert solution.cost == pytest.approx(least_time, rel=1e-6)

@@ -21,6 +21,7 @@ from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
 from covocp.solving.refined_meshes import Measured, remade
 from covocp.solving.refining import first_guesses, unseen, with_layers
+from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
 from covocp.statement.chain import Chain, started_at
 from covocp.statement.statement import Statement
@@ -163,7 +164,19 @@ class ChainRuns:
             outcome = prepared.solve(values, begun.guesses, self._reporter)
         if tried > 1:
             outcome = replace(outcome, stats={**outcome.stats, "tried": tried})
-        return self._measured(begun.options, prepared, outcome)
+        return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
+
+    def _unwound(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
+        """Solved again without the turns that angles make between nodes, where that is cheaper."""
+        straight = [unwound(extremal) if outcome.converged else None for extremal in outcome.extremals]
+        if self._reporter.stop or not any(straight):
+            return outcome
+        pairs = zip(straight, outcome.extremals, strict=True)
+        guesses = tuple(Guess(trajectory=entry or extremal.trajectory) for entry, extremal in pairs)
+        again: ChainOutcome = prepared.solve(begun.values, guesses, self._reporter)
+        if not again.converged or not again.cost < outcome.cost:
+            return outcome
+        return replace(again, stats={**outcome.stats, **again.stats, **counted(outcome, again)})
 
     def _best_of(self, begun: Begun, count: int, seed: int) -> Measured:
         """The best of the phases' own start and of random ones, whose phases go on from where the one before ends."""
@@ -177,7 +190,7 @@ class ChainRuns:
                     yield drawn
 
         outcome = best_of(prepared, begun.values, starts(), count + 1, self._reporter)
-        return self._measured(begun.options, prepared, outcome)
+        return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
 
     def _drawn(self, options: tuple[Options, ...], count: int, seed: int, k: int) -> Guesses | None:
         """One random start; None where a phase of it lies outside the domain of the model."""
