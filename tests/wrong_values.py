@@ -319,9 +319,9 @@ def in_phases() -> Iterator[tuple[str, str, Call]]:
     for name in ("units", "title", "path"):
         yield "PhasesMonteCarlo.plot", name, lambda v, n=name: sample.plot("x", **{n: v})
     yield "PhasesMonteCarlo.plot", "names", sample.plot
-    for name, function in {"evaluate": co.evaluate, "certify": co.certify}.items():
-        yield name, "phases", lambda _, f=function: f(co.Phases(parts()))
-        yield name, "a solution of phases", lambda _, f=function: f(solution)
+    yield "certify", "phases", lambda _: co.certify(co.Phases(parts()))
+    yield "certify", "a solution of phases", lambda _: co.certify(solution)
+    yield "evaluate phases", "nominal", lambda v: co.evaluate(co.Phases(parts()), nominal=v)
     yield "compare", "a solution of phases", lambda _: co.compare(solution)
     yield "compare phases", "methods", lambda v: co.compare(co.Phases(parts()), v, **few)
 

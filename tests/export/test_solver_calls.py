@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from exports import FOLDER, PLANNER, package
+from exports import FOLDER, package
 
 import covocp as co
 from covocp.export import export_c
@@ -17,11 +17,12 @@ from covocp.models import brachistochrone, unknown_lag
 pytestmark = [pytest.mark.needs_cc, pytest.mark.filterwarnings("ignore::covocp.CovocpWarning")]
 
 PLUGINS = {"ipopt": "-lipopt", "fatrop": "-lfatrop -lblasfeo"}
+FEW = {"intervals": 4, "substeps": 2}
 TIGHT = {"ipopt": {"tol": 1e-11, "bound_relax_factor": 0.0}}
 
 
 def by_plugin(method, name):
-    return export_c(unknown_lag.problem(weight=10.0), FOLDER / name, **PLANNER, method=method)
+    return export_c(unknown_lag.problem(weight=10.0), FOLDER / name, **FEW, method=method)
 
 
 @pytest.mark.parametrize("method", PLUGINS)
@@ -37,8 +38,9 @@ def test_plugins_are_linked_and_reach_the_same_cost(method):
     )
     made.build(flags=["-O0"])
     planner = made.python()
+    reference = export_c(unknown_lag.problem(weight=10.0), FOLDER / f"beside_{method}", **FEW).reference()
     for arguments in ({}, {"initial_x": 0.4}):
-        plan, own = planner(**arguments), package("planner").python()(**arguments)
+        plan, own = planner(**arguments), reference(**arguments)
         assert planner.status == "OK"
         assert plan["cost"] == pytest.approx(own["cost"], rel=1e-8)
     assert made.check().ok
