@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from plain_problems import FREE, PLAIN, Plain, stated
 
-
 # Equal meshes on which the script by hand is tried.
 MESHES = (10, 25, 50, 100, 200, 400, 800, 1600, 3200, 6400)
 

@@ -1,4 +1,4 @@
-"""Names for what CasADi's type stubs cannot say."""
+"""Names for what CasADi's type stubs cannot say, and what expressions are recognised by."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import Any, TypeAlias
 Expr: TypeAlias = Any
 # What a user gave: of any type until it is checked, and then refused or read.
 Given: TypeAlias = Any
+
+# Functions of tables begin so: what reads an expression finds them by it, and their limits in the last argument.
+TABLE = "covocp_table_"
 
 
 def symbol_of(key: Given) -> Any:

@@ -20,15 +20,13 @@ from scipy.interpolate import CubicSpline
 
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError, spelling
-from covocp.base.expressions import Expr, Given
+from covocp.base.expressions import TABLE, Expr, Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 
 KINDS = ("linear", "cubic")
 # Cells up to which a table in MX chooses by comparisons and is written out.
 SMALL_CELLS = 64
-# Functions of tables begin so: what reads an expression finds them by it, and their limits in the last argument.
-FUNCTION = "covocp_table_"
 # Knots of each variable that the not-a-knot spline needs: its first two and its last two pieces are one.
 FEWEST = {"linear": 2, "cubic": 4}
 
@@ -82,7 +80,7 @@ class Table:
         value = self._compared(*symbols) if small else self._looked_up(*symbols)
         limits = ca.DM([[float(knots[0]), float(knots[-1])] for knots in self.grid])
         unused = kind.sym("limits", *limits.shape)
-        name = FUNCTION + re.sub("_+", "_", re.sub("[^0-9A-Za-z]", "_", self.name)).strip("_")
+        name = TABLE + re.sub("_+", "_", re.sub("[^0-9A-Za-z]", "_", self.name)).strip("_")
         options: dict[str, Any] = {"never_inline": not small, "is_diff_in": [True] * len(symbols) + [False]}
         function = ca.Function(name.rstrip("_"), [*symbols, unused], [value], options)
         return function(*(ca.MX(value) for value in arguments), ca.MX(limits))

@@ -11,8 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
-from covocp.blocks.tables import FUNCTION
+from covocp.base.expressions import TABLE, Expr
 from covocp.problem.declarations import Declarations
 from covocp.problem.stacked import Stacked
 from covocp.statement.conditions import Conditions
@@ -34,7 +33,7 @@ def table_ranges(problem: Declarations, stacked: Stacked) -> Conditions | None:
     found: dict[tuple[str, int], tuple[str, Any, float, float]] = {}
     for call in _calls(_along_the_path(problem)):
         limits = np.asarray(call.dep(call.n_dep() - 1).to_DM())
-        name = call.which_function().name().removeprefix(FUNCTION)
+        name = call.which_function().name().removeprefix(TABLE)
         for i, (first, last) in enumerate(limits):
             argument = call.dep(i)
             which = f"table '{name}'" + (f", argument {i + 1}" if len(limits) > 1 else "")
@@ -65,14 +64,14 @@ def _along_the_path(problem: Declarations) -> Any:
 def _calls(expression: Expr) -> Iterator[Any]:
     """The calls of tables in an expression, also those inside of functions that it calls."""
     whole = ca.Function("whole", ca.symvar(expression), [expression])
-    if not any(function.name().startswith(FUNCTION) for function in whole.find_functions()):
+    if not any(function.name().startswith(TABLE) for function in whole.find_functions()):
         return
     for k in range(whole.n_instructions()):
         if whole.instruction_id(k) != ca.OP_CALL:
             continue
         call = whole.instruction_MX(k)
         function = call.which_function()
-        if function.name().startswith(FUNCTION):
+        if function.name().startswith(TABLE):
             yield call
         elif function.is_a("MXFunction"):
             arguments = [call.dep(i) for i in range(call.n_dep())]
