@@ -35,3 +35,10 @@ def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
     assert found.stats["iterations"] > alone.stats["iterations"]
     largest = found["v"] + 2.0537489 * np.ravel(found.deviation("v"))  # the quantile of 98 %
     assert largest.max() == pytest.approx(1.2, abs=1e-6)
+
+
+def test_other_plugins_and_methods_keep_their_own_iterations():
+    """Sequential quadratic programming has no such option; it finds the same limits kept."""
+    problem = brisk(1.4)  # which do not bind
+    by_other = co.solve(problem, intervals=10, plugin="sqpmethod", progress=False)
+    assert by_other.cost == pytest.approx(co.solve(problem, intervals=10, progress=False).cost, rel=1e-6)
