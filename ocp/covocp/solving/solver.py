@@ -160,7 +160,7 @@ class Solver:
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
-        other = method not in ("ipopt", "auto") or self._own.get("plugin", "ipopt") != "ipopt"
+        other = method not in ("ipopt", "auto") or str(self._own.get("plugin", "ipopt")) != "ipopt"
         patient = other or "max_iterations" in self._own
         self._loosened = bool(self._best) and can_be_loosened(solved) and not patient
         if self._loosened:  # there is another way
