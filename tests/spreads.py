@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -186,3 +189,41 @@ def ellipse_mixed_by_duality(limits: tuple[float, float], variance: float) -> fl
         return float(total)
 
     return -float(minimize(lambda w: -cost(np.exp(w)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6}).fun)
+
+
+def covariances_with_gains(
+    solution: co.Solution,
+    start: np.ndarray,
+    noise: np.ndarray,
+    variance: float,
+    learnt: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """E and Xhat of the double integrator at all nodes by scipy, with Kalman updates, for the gains of a solution.
+
+    Args:
+        solution: whose gains are flown, the same in any unit of the states and the control.
+        start: E at time zero, (2, 2).
+        noise: density of the process noise, (2, 2).
+        variance: of what is read of the position, where a node stands twice.
+        learnt: E -> what is learnt all the time, (2, 2); None: nothing.
+    """
+    t, E, Xhat = solution.t, start.copy(), np.zeros((2, 2))
+    found, gains = [(E, Xhat)], solution.loop.gain
+    for k, (begin, end) in enumerate(pairwise(t)):
+        if begin == end:
+            lost = E[:, :1] @ E[:1] / (E[0, 0] + variance)
+            E, Xhat = E - lost, Xhat + lost
+        else:
+
+            def rate(time: float, y: np.ndarray, k: int = k, begin: float = begin, end: float = end) -> np.ndarray:
+                share = (time - begin) / (end - begin)
+                closed = F - G @ ((1 - share) * gains[k] + share * gains[k + 1])
+                E, Xhat = y.reshape(2, 2, 2)
+                gained = np.zeros((2, 2)) if learnt is None else learnt(E)
+                return np.ravel([F @ E + E @ F.T + noise - gained, closed @ Xhat + Xhat @ closed.T + gained])
+
+            y = solve_ivp(rate, (begin, end), np.ravel([E, Xhat]), "LSODA", rtol=1e-10, atol=1e-14).y[:, -1]
+            E, Xhat = y.reshape(2, 2, 2)
+        found.append((E, Xhat))
+    both = np.array(found)
+    return both[:, 0], both[:, 1]

@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import beta, norm
-from spreads import ellipse_read, ellipse_read_by_duality
+from spreads import F, G, covariances_with_gains, ellipse_read, ellipse_read_by_duality
 
 import covocp as co
 from covocp.solving.coarse_start import coarser
 from covocp.transcription.mesh import Options
 
 DURATION, LIMIT, SIGMAS = 6.0, 1.0, 3.0
-F, G = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
 Q, R, P0 = np.diag([0.0, 0.02]), 4e-4, np.diag([0.01, 0.01])
 RUNS = 20_000
 
@@ -47,27 +46,8 @@ def solution():
 
 
 def covariances(solution):
-    """E and Xhat at all nodes by scipy with Kalman updates, for the gains of the solution."""
-    t, E, Xhat = solution.t, P0.copy(), np.zeros((2, 2))
-    found = [(E, Xhat)]
-    gains = solution.loop.gain
-    for k, (begin, end) in enumerate(pairwise(t)):
-        if begin == end:
-            K = E[:, :1] / (E[0, 0] + R)
-            lost = K @ E[:1]
-            E, Xhat = E - lost, Xhat + lost
-        else:
-
-            def rate(time, y, k=k, begin=begin, end=end):
-                share = (time - begin) / (end - begin)
-                closed = F - G @ ((1 - share) * gains[k] + share * gains[k + 1])
-                E, Xhat = y.reshape(2, 2, 2)
-                return np.ravel([F @ E + E @ F.T + Q, closed @ Xhat + Xhat @ closed.T])
-
-            y = solve_ivp(rate, (begin, end), np.ravel([E, Xhat]), method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
-            E, Xhat = y.reshape(2, 2, 2)
-        found.append((E, Xhat))
-    return np.array(found).transpose(1, 0, 2, 3)
+    """E and Xhat at all nodes by scipy for the gains of the solution."""
+    return covariances_with_gains(solution, P0, Q, R)
 
 
 def test_it_is_solved_and_nothing_is_fed_back_before_the_first_reading(solution):

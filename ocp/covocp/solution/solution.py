@@ -522,7 +522,14 @@ class Solution:
         return passed_limits(self.extremal, self._dense_for(self.extremal.statement.path), points)
 
     def left_tables(self, points: int = 10) -> tuple[Passed, ...]:
-        """Tables that are read beyond their outermost knots along the path, by how much and when, the worst first."""
+        """Tables that are read beyond their outermost knots along the true path, the worst first.
+
+        Args:
+            points: equal parts of each interval at whose ends it is looked at.
+
+        Returns:
+            Of each argument of a table that is passed its name, by how much in its own unit, and the time [s].
+        """
         tables = self.extremal.statement.tables
         return () if tables is None else left_tables(self.extremal, self._dense_for(tables), points)
 

@@ -19,7 +19,7 @@ from covocp.transcription.trajectory import Trajectory
 TURNS = (2.0 * np.pi, 360.0)
 # Changes from node to node that may be part of a turn, and what may be left of a turn, both as shares of it.
 STEEP, LEFT = 1 / 8, 1 / 4
-# Relative difference below which two values of a function are the same.
+# Difference below which two values are the same, as a share of the largest one along the nodes.
 SAME = 1e-9
 
 
@@ -70,6 +70,6 @@ def _is_angle(extremal: Extremal, i: int, turn: float) -> bool:
     for function in functions:
         pairs = zip(function.call(columns), function.call(turned), strict=True)
         for one, other in ((np.asarray(a), np.asarray(b)) for a, b in pairs):
-            if not (np.abs(one - other) <= SAME * (1.0 + np.abs(one))).all():
+            if not (np.abs(one - other) <= SAME * np.abs(one).max(axis=1, keepdims=True)).all():
                 return False
     return True
