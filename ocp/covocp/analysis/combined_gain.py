@@ -157,7 +157,7 @@ def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:
     rows = held_jacobian(extremal)
     scale = np.concatenate([control_scale(st, b, u[:, b.span]) for b in st.controls])
     given = _metric(extremal)
-    plain = np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), np.diag(scale**-2.0)))
+    plain = np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1).full(), np.diag(scale**-2.0)))
     metric = plain if given is None else given
     lower, upper = st.control_bounds
     free = ~np.repeat(np.isin(np.arange(mesh.control_nodes), mesh.idle), st.nu)
@@ -189,7 +189,7 @@ def _metric(extremal: Extremal) -> Array | None:
     curvature = (B - extra).reshape(st.nu, count, st.nu).transpose(1, 0, 2).mean(axis=0)
     if np.linalg.eigvalsh(curvature)[0] <= 0:
         return None
-    return np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1), curvature))
+    return np.asarray(np.kron(mass_matrix(mesh, extremal.trajectory.duration, 1).full(), curvature))
 
 
 def _decrease(classical: Solution, change: Array, ell: Array) -> float:

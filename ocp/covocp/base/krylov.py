@@ -40,7 +40,7 @@ class Krylov:
 
         What the subspace misses of the solution has the residual rho, and adds at most rho^2 / (smallest + shift).
         """
-        from scipy.linalg import solveh_banded
+        from scipy.linalg import solveh_banded  # here: importing scipy takes longer than all of covocp
 
         if length == 0.0:
             return 0.0
@@ -65,8 +65,6 @@ def krylov(
         steps: the most of them.
         known: (smallest Ritz value, its residual, largest absolute one) -> whether that is enough.
     """
-    from scipy.linalg import eigh_tridiagonal
-
     steps = min(start.size, steps)
     basis, images = np.zeros((steps, start.size)), np.zeros((steps, start.size))
     diagonal, beside = np.zeros(steps), np.zeros(steps)
@@ -79,7 +77,7 @@ def krylov(
         for _ in range(2):
             image -= basis[: j + 1].T @ (basis[: j + 1] @ image)
         beside[j] = np.linalg.norm(image)
-        values, vectors = eigh_tridiagonal(diagonal[: j + 1], beside[:j])
+        values, vectors = np.linalg.eigh(np.diag(diagonal[: j + 1]) + np.diag(beside[:j], -1))
         residual = float(beside[j] * np.abs(vectors[-1, 0]))
         largest = max(float(np.abs(values).max()), float(np.finfo(float).tiny))
         if beside[j] <= INVARIANT * largest or (j >= LEAST_STEPS and known(float(values[0]), residual, largest)):

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,7 +175,7 @@ class _Reduced:
     Attributes:
         tangents: from v to nodes and controls.
         between: from there to all points at which limits are imposed, the nodes among them.
-        root: lower Cholesky factor of the metric of v.
+        root: upper triangular R of the metric R' R of v.
         product: Hessian of the Lagrangian by points and controls there, times a direction of them.
         strict: slopes by v of the rows held with a multiplier, (rows, V), in these units.
         loose: of those without, such that a direction is allowed along which none falls.
@@ -182,7 +183,7 @@ class _Reduced:
 
     tangents: Tangents
     between: Between
-    root: Array
+    root: ca.DM
     product: Callable[[Array], Array]
     strict: Array
     loose: Array
@@ -192,8 +193,6 @@ class _Reduced:
     @staticmethod
     def of(extremal: Extremal) -> _Reduced | None:
         """The operator along an extremal; None where nothing can move."""
-        from scipy.linalg import block_diag, cholesky  # here: importing scipy takes longer than all of covocp
-
         st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
         fine = refined(extremal)
         held = held_by(fine, extremal.mesh.points)
@@ -207,13 +206,13 @@ class _Reduced:
         between = _between(extremal, fine)
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
-        free = tangents.free.ravel()
-        metric = mass_matrix(mesh, t.duration, st.nu)[np.ix_(free, free)]
+        moving = np.flatnonzero(tangents.free).tolist()
+        metric = mass_matrix(mesh, t.duration, st.nu)[moving, moving]
         weights = np.zeros(0)
         if tangents.start:  # in units that say something where the best control is none
             controls = choose_scales(st, mesh, t, extremal.parameters).u.mean()
             weights = t.duration * (controls / _scales(t.x)[list(tangents.start)]) ** 2
-        root = cholesky(block_diag(metric, np.diag(weights)), lower=True)
+        root = _root(ca.diagcat(metric, ca.diag(ca.DM(weights))))
         rows = _by_v(tangents, *between.backward(*_split(fine, np.asarray(jacobian(*given).full()))), root)
         if not np.isfinite(rows).all():
             return None
@@ -234,19 +233,15 @@ class _Reduced:
 
     def unscaled(self, v: Array) -> Array:
         """v of the tangents."""
-        from scipy.linalg import solve_triangular
-
-        return np.asarray(solve_triangular(self.root.T, v, lower=False))
+        return _solved(self.root, v[:, None])[:, 0]
 
     def apply(self, v: Array) -> Array:
         """The reduced Hessian times v."""
-        from scipy.linalg import solve_triangular
-
         z, u = self.between.forward(*self.tangents.forward(self.unscaled(v)[:, None]))
         image = self.product(np.concatenate([z.ravel(), u.ravel()]))
         slopes = self.between.backward(image[: z.size].reshape(z.shape), image[z.size :].reshape(u.shape))
         by_v = self.tangents.backward(*slopes)
-        return np.asarray(solve_triangular(self.root, by_v[:, 0], lower=True))
+        return _solved(self.root.T, by_v)[:, 0]
 
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
@@ -263,13 +258,23 @@ def null_space(rows: Array, size: int) -> Array:
     return np.asarray(vectors[int(np.sum(values > DEPENDENT * values[0])) :].T)
 
 
-def _by_v(tangents: Tangents, by_z: Array, by_u: Array, root: Array) -> Array:
-    """Slopes of rows by v, (rows, V), in units of the root of the metric, from those by nodes and controls."""
-    from scipy.linalg import solve_triangular
+def _root(metric: ca.DM) -> ca.DM:
+    """Upper triangular R of a sparse matrix R' R."""
+    pivots, upper, _ = ca.ldl(metric, False)
+    return ca.diag(ca.sqrt(pivots)) @ (upper + ca.DM.eye(metric.shape[0]))
 
+
+def _solved(triangular: ca.DM, columns: Array) -> Array:
+    """The inverse of a sparse triangular matrix times some columns."""
+    right = ca.MX.sym("right", *columns.shape)
+    return np.asarray(ca.Function("solved", [right], [ca.solve(triangular, right)])(columns).full())
+
+
+def _by_v(tangents: Tangents, by_z: Array, by_u: Array, root: ca.DM) -> Array:
+    """Slopes of rows by v, (rows, V), in units of the root of the metric, from those by nodes and controls."""
     if not by_z.shape[2]:
         return np.zeros((0, tangents.size))
-    return np.asarray(solve_triangular(root, tangents.backward(by_z, by_u), lower=True).T)
+    return _solved(root.T, tangents.backward(by_z, by_u)).T
 
 
 def _split(extremal: Extremal, rows: Array) -> tuple[Array, Array]:
@@ -345,17 +350,18 @@ def held_jacobian(extremal: Extremal) -> Array:
     tangents = tangents_along(extremal, everything, feedback=False)
     rows = np.asarray(jacobian(*arguments(fine, _costates(fine, through=True))).full())
     slopes = _between(extremal, fine).backward(*_split(fine, rows))
-    by_v = _by_v(tangents, *slopes, np.eye(tangents.size))
+    by_v = _by_v(tangents, *slopes, ca.DM.eye(tangents.size))
     result = np.zeros((by_v.shape[0], everything.size))
     result[:, everything.ravel()] = by_v
     return result
 
 
-def mass_matrix(mesh: Mesh, duration: float, count: int) -> Array:
-    """The matrix of int du' du dt for the control values, each of `count` entries."""
+def mass_matrix(mesh: Mesh, duration: float, count: int) -> ca.DM:
+    """The sparse matrix of int du' du dt for the control values, each of `count` entries."""
     h = np.diff(mesh.nodes) * duration
-    if mesh.control == "constant":
-        matrix = np.diag(h)
-    else:
-        matrix = np.diag(np.append(h, 0.0) + np.append(0.0, h)) / 3.0 + (np.diag(h, 1) + np.diag(h, -1)) / 6.0
-    return np.asarray(np.kron(matrix, np.eye(count)))
+    matrix = ca.diag(ca.DM(h))
+    if mesh.control == "linear":
+        n = h.size
+        beside = ca.DM.triplet(list(range(n)), list(range(1, n + 1)), ca.DM(h / 6.0), n + 1, n + 1)
+        matrix = ca.diag(ca.DM(np.append(h, 0.0) + np.append(0.0, h)) / 3.0) + beside + beside.T
+    return ca.kron(matrix, ca.DM.eye(count))

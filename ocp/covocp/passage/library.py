@@ -12,7 +12,7 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 2
+VERSION = 3
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {

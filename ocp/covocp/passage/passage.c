@@ -84,17 +84,19 @@ typedef struct {
     double *told;  /* the last point */
     double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */
     double *turned; /* tangents of K, A, E+, of every reading, as `moved` */
+    int along;      /* whether these are along the last direction: 1, or 2 with tangents of kicks */
+    double *direction, *shifted; /* the last direction; the tangents of the half-vectors along it; as `moved` */
 } Passage;
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 2; }
+EXPORT int passage_version(void) { return 3; }
 
 EXPORT void passage_free(Passage *p) {
     if (!p) return;
     void *owned[] = {p->row,   p->col,    p->begin,  p->across, p->which, p->first, p->h1,  p->h2,
                      p->kicks, p->after,  p->stage1, p->stage2, p->factor, p->swaps, p->exchanged,
                      p->work,  p->moved,  p->place,  p->told,   p->gain,  p->keep,  p->inverse, p->reached,
-                     p->turned};
+                     p->turned, p->direction, p->shifted};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(p);
 }
@@ -299,16 +301,22 @@ INLINE void product(
         }
 }
 
+/* a . b, in four sums that do not wait for one another. */
+INLINE double dot(const double *RESTRICT a, const double *RESTRICT b, int size) {
+    double sums[4] = {0.0, 0.0, 0.0, 0.0};
+    int i = 0;
+    for (; i + 4 <= size; i += 4)
+        for (int k = 0; k < 4; ++k) sums[k] += a[i + k] * b[i + k];
+    for (; i < size; ++i) sums[0] += a[i] * b[i];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
 /* A B', (rows x inner) (columns x inner)'. */
 INLINE void product_turned(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     for (int i = 0; i < rows; ++i)
-        for (int c = 0; c < columns; ++c) {
-            double sum = 0.0;
-            for (int j = 0; j < inner; ++j) sum += A[i * inner + j] * B[c * inner + j];
-            result[i * columns + c] = sum;
-        }
+        for (int c = 0; c < columns; ++c) result[i * columns + c] = dot(A + i * inner, B + c * inner, inner);
 }
 
 /* A' B, (inner x rows)' (inner x columns). */
@@ -372,7 +380,7 @@ INLINE void run(
 ) {
     const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
     if (here(p, first, h1, h2, told, kicks)) return;
-    p->known = 0;
+    p->known = p->along = 0;
     memcpy(p->first, first, sizeof(double) * half);
     memcpy(p->h1, h1, all);
     memcpy(p->h2, h2, all);
@@ -444,9 +452,7 @@ INLINE void at_nonzeros(
     for (int q = 0; q < p->nnz; ++q) {
         const int i = p->row[q];
         const double *RESTRICT one = left + (i < n ? i + n : i - n) * r, *RESTRICT other = right + p->col[q] * r;
-        double sum = 0.0;
-        for (int c = 0; c < r; ++c) sum += one[c] * other[c];
-        slopes[q] = i < n ? -0.5 * sum : 0.5 * sum;
+        slopes[q] = (i < n ? -0.5 : 0.5) * dot(one, other, r);
     }
 }
 
@@ -636,15 +642,19 @@ INLINE void divide_transposed(const double *RESTRICT factor, const int *RESTRICT
     for (int i = 0; i < n; ++i)
         for (int k = 0; k < i; ++k) {
             const double share = factor[i * n + k];
-            for (int c = 0; c < n; ++c) B[i * n + c] -= share * B[k * n + c];
+            double *RESTRICT own = B + i * n;
+            const double *RESTRICT other = B + k * n;
+            for (int c = 0; c < n; ++c) own[c] -= share * other[c];
         }
     for (int i = n - 1; i >= 0; --i) {
+        double *RESTRICT own = B + i * n;
         for (int k = i + 1; k < n; ++k) {
             const double share = factor[i * n + k];
-            for (int c = 0; c < n; ++c) B[i * n + c] -= share * B[k * n + c];
+            const double *RESTRICT other = B + k * n;
+            for (int c = 0; c < n; ++c) own[c] -= share * other[c];
         }
         const double inverse = 1.0 / factor[i * n + i];
-        for (int c = 0; c < n; ++c) B[i * n + c] *= inverse;
+        for (int c = 0; c < n; ++c) own[c] *= inverse;
     }
 }
 
@@ -700,12 +710,9 @@ INLINE void tangent_step(
     add_sparse(p, n, -GAP, h1, dY1, inner);
     for (int i = 0; i < m * n; ++i) inner[i] = (inner[i] - dZ[i]) / SHARE, dY2[i] = dY1[i] + 2.0 * GAP * inner[i];
     memcpy(dX, inner, sizeof(double) * n * n);
+    product(next, dX, n, n, n, Z);
     for (int i = 0; i < n; ++i) /* dE+ X = dY - E+ dX, transposed */
-        for (int j = 0; j < n; ++j) {
-            double sum = dE[i * n + j] + inner[(n + i) * n + j];
-            for (int c = 0; c < n; ++c) sum -= next[i * n + c] * dX[c * n + j];
-            right[j * n + i] = sum;
-        }
+        for (int j = 0; j < n; ++j) right[j * n + i] = dE[i * n + j] + inner[(n + i) * n + j] - Z[i * n + j];
     divide_transposed(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, right);
     for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) dE[i * n + j] = 0.5 * (right[i * n + j] + right[j * n + i]);
@@ -746,12 +753,30 @@ INLINE void tangent_reading(Passage *p, int n, int j, const double *E, const dou
     memcpy(dAfter, dE, sizeof(double) * square);
 }
 
-/* Tangents along the passage, of the half-vectors after each step where they are wanted. */
+/* Keep one part of a direction: whether it was the same before. */
+static int same(double **kept, const double *given, size_t count) {
+    double *own = *kept;
+    *kept += count;
+    if (!given || !memcmp(own, given, sizeof(double) * count)) return 1;
+    memcpy(own, given, sizeof(double) * count);
+    return 0;
+}
+
+/* Tangents along the passage, of the half-vectors after each step too; those along the last direction are known. */
 INLINE void tangents(
     Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
-    const double *d_kicks, double *d_after
+    const double *d_kicks
 ) {
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    double *kept = p->direction, *d_after = p->shifted;
+    int known = p->along == (d_kicks ? 2 : 1);
+    known &= same(&kept, d_first, half);
+    known &= same(&kept, d1, nnz * p->moves);
+    known &= same(&kept, d2, nnz * p->moves);
+    known &= same(&kept, d_told, telling(p) * p->reads);
+    known &= same(&kept, d_kicks, half * p->count);
+    if (known) return;
+    p->along = d_kicks ? 2 : 1;
     double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
     spread(p->first, n, E);
     spread(d_first, n, dE);
@@ -773,9 +798,8 @@ INLINE void tangents(
                     dE[i * n + j] += d_kicks[k * half + t];
                     if (i != j) dE[j * n + i] += d_kicks[k * half + t];
                 }
-        if (d_after)
-            for (int j = 0, t = 0; j < n; ++j)
-                for (int i = j; i < n; ++i, ++t) d_after[k * half + t] = dE[i * n + j];
+        for (int j = 0, t = 0; j < n; ++j)
+            for (int i = j; i < n; ++i, ++t) d_after[k * half + t] = dE[i * n + j];
     }
 }
 
@@ -835,12 +859,7 @@ INLINE void back_tangents(
         congruent(p, n, k, dP, spare);
         memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
         divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, n, K);
-        for (int i = 0; i < n; ++i)
-            for (int j = 0; j < n; ++j) {
-                double sum = 0.0;
-                for (int c = 0; c < n; ++c) sum += K[i * n + c] * P[c * n + j];
-                spare[i * n + j] = sum;
-            }
+        product(K, P, n, n, n, spare);
         for (int i = 0; i < n; ++i)
             for (int j = 0; j < n; ++j) dP[i * n + j] -= spare[i * n + j] + spare[j * n + i];
         for (int stage = 0; stage < 2; ++stage) {
@@ -890,11 +909,16 @@ EXPORT VERSIONS int passage_tangent(
     double *d_by_h2, double *d_by_told, double *d_by_kicks
 ) {
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
-    if (!p->moved) p->moved = room((size_t)p->moves * 5 * square, sizeof(double));
-    if (!p->turned) p->turned = room((size_t)p->reads * turned, sizeof(double));
-    if (!p->moved || !p->turned) return 1;
+    const size_t half = square / 2 + p->n / 2 + 1, all = half * p->count, d = sizeof(double);
+    const size_t point = half + all + 2 * (size_t)p->nnz * p->moves + telling(p) * p->reads;
+    if (!p->moved) p->moved = room((size_t)p->moves * 5 * square, d);
+    if (!p->turned) p->turned = room((size_t)p->reads * turned, d);
+    if (!p->direction) p->direction = calloc(point, d); /* compared before it is first written */
+    if (!p->shifted) p->shifted = room(all, d);
+    if (!p->moved || !p->turned || !p->direction || !p->shifted) return 1;
     run(p, p->n, first, h1, h2, told, kicks);
-    tangents(p, p->n, d_first, d_h1, d_h2, d_told, d_kicks, d_after);
+    tangents(p, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
+    if (d_after) memcpy(d_after, p->shifted, d * ((size_t)p->n * (p->n + 1) / 2) * p->count);
     if (seed) back_tangents(p, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
     return 0;
 }
