@@ -8,9 +8,9 @@ from pathlib import Path
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
-# What lets sums be taken in another order, but nothing that changes how the process computes: linking with
+# Nothing that changes how the process computes: linking with
 # -ffast-math would flush subnormal numbers everywhere.
-FLAGS = ["-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
+FLAGS = ["-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
 
 class BuildPassage(build_ext):

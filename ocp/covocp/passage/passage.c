@@ -148,9 +148,30 @@ EXPORT Passage *passage_new(int n, int nnz, const int *row, const int *col, int 
     return p;
 }
 
-/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps), the others solved. */
-INLINE void eliminate(double *RESTRICT a, int m, int w, int *RESTRICT swaps) {
-    for (int k = 0; k < m; ++k) {
+/* own += sign (sum of share_j B_j) over some rows B_j of B, four at a time; shares lie `step` apart, rows `wide`. */
+INLINE void add_rows(
+    double *RESTRICT own, double sign, const double *share, int step, const double *B, int wide, int rows, int columns
+) {
+    int j = 0;
+    for (; j + 4 <= rows; j += 4) {
+        const double a = sign * share[j * step], b = sign * share[(j + 1) * step], c = sign * share[(j + 2) * step],
+                     d = sign * share[(j + 3) * step];
+        if (a == 0.0 && b == 0.0 && c == 0.0 && d == 0.0) continue;
+        const double *RESTRICT one = B + j * wide, *RESTRICT two = one + wide, *RESTRICT three = two + wide,
+                     *RESTRICT four = three + wide;
+        for (int i = 0; i < columns; ++i) own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
+    }
+    for (; j < rows; ++j) {
+        const double a = sign * share[j * step];
+        if (a == 0.0) continue;
+        const double *RESTRICT one = B + j * wide;
+        for (int i = 0; i < columns; ++i) own[i] += a * one[i];
+    }
+}
+
+/* Columns `begin` to `end` of m rows made triangular with partial pivoting of whole rows of w entries. */
+INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, int *RESTRICT swaps) {
+    for (int k = begin; k < end; ++k) {
         int pivot = k;
         double largest = fabs(a[k * w + k]);
         for (int i = k + 1; i < m; ++i) {
@@ -164,23 +185,26 @@ INLINE void eliminate(double *RESTRICT a, int m, int w, int *RESTRICT swaps) {
                 a[k * w + j] = a[pivot * w + j], a[pivot * w + j] = kept;
             }
         const double inverse = 1.0 / a[k * w + k];
-        const double *RESTRICT above = a + k * w;
         for (int i = k + 1; i < m; ++i) {
-            double *RESTRICT own = a + i * w;
+            double *own = a + i * w;
             if (own[k] == 0.0) continue;
-            const double share = own[k] * inverse;
-            own[k] = share;
-            for (int j = k + 1; j < w; ++j) own[j] -= share * above[j];
+            own[k] *= inverse;
+            for (int j = k + 1; j < end; ++j) own[j] -= own[k] * a[k * w + j];
         }
     }
+}
+
+/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps), the others solved. */
+INLINE void eliminate(double *RESTRICT a, int m, int w, int *RESTRICT swaps) {
+    for (int k = 0; k < m; k += 4) {
+        const int end = k + 4 < m ? k + 4 : m;
+        panel(a, m, w, k, end, swaps);
+        for (int i = k + 1; i < m; ++i)
+            add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, (i < end ? i : end) - k, w - end);
+    }
     for (int k = m - 1; k >= 0; --k) {
-        double *RESTRICT own = a + k * w;
-        for (int i = k + 1; i < m; ++i) {
-            const double share = own[i];
-            if (share == 0.0) continue;
-            const double *RESTRICT below = a + i * w;
-            for (int j = m; j < w; ++j) own[j] -= share * below[j];
-        }
+        double *own = a + k * w;
+        add_rows(own + m, -1.0, own + k + 1, 1, own + w + m, w, m - 1 - k, w - m);
         const double inverse = 1.0 / own[k];
         for (int j = m; j < w; ++j) own[j] *= inverse;
     }
@@ -237,10 +261,7 @@ INLINE void applied(const double *RESTRICT D, const double *RESTRICT E, int n, d
     for (int i = 0; i < 2 * n; ++i) {
         double *RESTRICT own = product + i * n;
         memcpy(own, D + i * 2 * n, sizeof(double) * n);
-        for (int j = 0; j < n; ++j) {
-            const double share = D[i * 2 * n + n + j];
-            for (int c = 0; c < n; ++c) own[c] += share * E[j * n + c];
-        }
+        add_rows(own, 1.0, D + i * 2 * n + n, 1, E, n, n, n);
     }
 }
 
@@ -294,11 +315,7 @@ INLINE void product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
-    for (int i = 0; i < rows; ++i)
-        for (int j = 0; j < inner; ++j) {
-            const double share = A[i * inner + j];
-            for (int c = 0; c < columns; ++c) result[i * columns + c] += share * B[j * columns + c];
-        }
+    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i * inner, 1, B, columns, inner, columns);
 }
 
 /* a . b, in four sums that do not wait for one another. */
@@ -324,11 +341,7 @@ INLINE void turned_product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
-    for (int j = 0; j < inner; ++j)
-        for (int i = 0; i < rows; ++i) {
-            const double share = A[j * rows + i];
-            for (int c = 0; c < columns; ++c) result[i * columns + c] += share * B[j * columns + c];
-        }
+    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i, rows, B, columns, inner, columns);
 }
 
 /* Where readings compute: past what steps use. */
@@ -409,40 +422,17 @@ INLINE void divide(const double *RESTRICT factor, const int *RESTRICT swaps, int
     for (int i = 0; i < n; ++i) {
         const double inverse = 1.0 / factor[i * n + i];
         double *RESTRICT own = M + i * r;
+        add_rows(own, -1.0, factor + i, n, M, r, i, r);
         for (int c = 0; c < r; ++c) own[c] *= inverse;
-        for (int k = i + 1; k < n; ++k) {
-            const double share = factor[i * n + k];
-            double *RESTRICT other = M + k * r;
-            for (int c = 0; c < r; ++c) other[c] -= share * own[c];
-        }
     }
-    for (int i = n - 1; i >= 0; --i) {
-        const double *RESTRICT own = M + i * r;
-        for (int k = 0; k < i; ++k) {
-            const double share = factor[i * n + k];
-            double *RESTRICT other = M + k * r;
-            for (int c = 0; c < r; ++c) other[c] -= share * own[c];
-        }
-    }
+    for (int i = n - 2; i >= 0; --i)
+        add_rows(M + i * r, -1.0, factor + (i + 1) * n + i, n, M + (i + 1) * r, r, n - 1 - i, r);
     for (int k = n - 1; k >= 0; --k)
         if (swaps[k] != k)
             for (int c = 0; c < r; ++c) {
                 const double kept = M[k * r + c];
                 M[k * r + c] = M[swaps[k] * r + c], M[swaps[k] * r + c] = kept;
             }
-}
-
-/* Y M, Y (2n x n), M (n x r). */
-INLINE void times(const double *RESTRICT Y, const double *RESTRICT M, int n, int r, double *RESTRICT product) {
-    memset(product, 0, sizeof(double) * 2 * n * r);
-    for (int i = 0; i < 2 * n; ++i) {
-        double *RESTRICT own = product + i * r;
-        for (int j = 0; j < n; ++j) {
-            const double share = Y[i * n + j];
-            const double *RESTRICT other = M + j * r;
-            for (int c = 0; c < r; ++c) own[c] += share * other[c];
-        }
-    }
 }
 
 /* -1/2 (J left) right' at the nonzeros, both (2n x r). */
@@ -543,7 +533,7 @@ INLINE void back_few(Passage *p, int n, int r, int k, Slopes *s, double *RESTRIC
     for (int stage = 0; stage < 2; ++stage) {
         double *out = stage ? s2 : s1;
         if (!out) continue;
-        times((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, n, r, y);
+        product((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, 2 * n, n, r, y);
         for (int i = 0; i < 2 * n; ++i)
             for (int c = 0; c < r; ++c) {
                 double sum = 0.0;
@@ -560,7 +550,7 @@ INLINE void back_all(Passage *p, int n, int k, Slopes *s, double *RESTRICT spare
     for (int stage = 0; stage < 2; ++stage) {
         const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n;
         if (!(stage ? s2 : s1)) continue;
-        times(Y, s->P, n, n, spare);
+        product(Y, s->P, 2 * n, n, n, spare);
         at_nonzeros(p, n, n, spare, Y, stage ? s2 : s1);
     }
 }
@@ -639,20 +629,10 @@ INLINE void divide_transposed(const double *RESTRICT factor, const int *RESTRICT
                 B[k * n + c] = B[swaps[k] * n + c], B[swaps[k] * n + c] = kept;
             }
     }
-    for (int i = 0; i < n; ++i)
-        for (int k = 0; k < i; ++k) {
-            const double share = factor[i * n + k];
-            double *RESTRICT own = B + i * n;
-            const double *RESTRICT other = B + k * n;
-            for (int c = 0; c < n; ++c) own[c] -= share * other[c];
-        }
+    for (int i = 1; i < n; ++i) add_rows(B + i * n, -1.0, factor + i * n, 1, B, n, i, n);
     for (int i = n - 1; i >= 0; --i) {
         double *RESTRICT own = B + i * n;
-        for (int k = i + 1; k < n; ++k) {
-            const double share = factor[i * n + k];
-            const double *RESTRICT other = B + k * n;
-            for (int c = 0; c < n; ++c) own[c] -= share * other[c];
-        }
+        add_rows(own, -1.0, factor + i * n + i + 1, 1, B + (i + 1) * n, n, n - 1 - i, n);
         const double inverse = 1.0 / factor[i * n + i];
         for (int c = 0; c < n; ++c) own[c] *= inverse;
     }
@@ -866,11 +846,11 @@ INLINE void back_tangents(
             const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
             double *out = stage ? d_by_h2 : d_by_h1;
             if (!out) continue;
-            times(dY, P, n, n, left);
-            times(Y, dP, n, n, spare);
+            product(dY, P, m, n, n, left);
+            product(Y, dP, m, n, n, spare);
             for (int i = 0; i < m * n; ++i) left[i] += spare[i];
             at_nonzeros(p, n, n, left, Y, out + k * nnz);
-            times(Y, P, n, n, left);
+            product(Y, P, m, n, n, left);
             at_nonzeros(p, n, n, left, dY, other);
             for (size_t q = 0; q < nnz; ++q) out[k * nnz + q] += other[q];
         }
