@@ -160,7 +160,7 @@ def test_curvature_is_that_of_the_exact_hessian_of_an_nlp_written_out():
     H, g, J = (np.asarray(v.full()) for v in ca.Function("nlp", [u], [hessian, slope, ca.densify(rows)])(solution["u"]))
     assert np.abs(g).max() < 1e-6
     basis = null_space(J)
-    M = mass_matrix(solution.mesh, 4.0, 1)
+    M = mass_matrix(solution.mesh, 4.0, 1).full()
     exact = eigh(basis.T @ H @ basis, basis.T @ M @ basis, eigvals_only=True)
     found = smallest_curvature(solution.extremal)
     assert found.value == pytest.approx(exact[0], rel=1e-4)

@@ -46,7 +46,7 @@ def spectrum(extremal):
     metric = np.zeros((w.size, w.size))
     place = slice(w.size - extremal.trajectory.u.size, w.size)
     scale = np.broadcast_to(nlp.scales.u, extremal.trajectory.u.shape).ravel()
-    metric[place, place] = mass_matrix(mesh, extremal.trajectory.duration, st.nu) * np.outer(scale, scale)
+    metric[place, place] = mass_matrix(mesh, extremal.trajectory.duration, st.nu).full() * np.outer(scale, scale)
     values = eigh(basis.T @ H @ basis, basis.T @ metric @ basis, eigvals_only=True)
     return values, basis[place] * scale[:, None], float(np.abs((g.ravel() + lam_x)[~fixed]).max())
 

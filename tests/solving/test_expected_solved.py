@@ -172,7 +172,7 @@ def test_no_control_nearby_is_better():
         assert min(cost(0.01 * direction), cost(-0.01 * direction)) > best.cost
     curvature = smallest_curvature(best.extremal)
     v = 0.02 * curvature.direction / np.abs(curvature.direction).max()
-    size = v.ravel() @ mass_matrix(best.mesh, best.duration, 2) @ v.ravel()
+    size = v.ravel() @ mass_matrix(best.mesh, best.duration, 2).full() @ v.ravel()
     second = (cost(v) + cost(-v) - 2 * best.cost) / size
     assert curvature.value == pytest.approx(second, rel=1e-3)
 

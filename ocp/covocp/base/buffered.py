@@ -41,3 +41,32 @@ class Buffered:
         if self._buffer.ret():
             return None
         return tuple(result.copy() for result in self._results)
+
+
+def swept(function: ca.Function, start: Array, *columns: Any) -> tuple[Array, ...]:
+    """A function of a value and a column of each of the others, from one column to the next.
+
+    Args:
+        function: (value, *others) -> value after it, and more; all dense.
+        start: the first value.
+        columns: of each of the others, those of all calls side by side (numbers).
+
+    Returns:
+        The entries of each output, a row for each call.
+
+    Raises:
+        RuntimeError: a call failed.
+    """
+    single = [function.size_in(i) for i in range(1, function.n_in())]
+    wide = [np.asarray(ca.DM(column).full()) for column in columns]
+    count = next(array.shape[1] // shape[1] for array, shape in zip(wide, single, strict=True) if shape[1])
+    rows = [array.T.reshape(count, -1) for array in wide]
+    call, value = Buffered(function), start
+    outputs = []
+    for k in range(count):
+        results = call(value, *(row[k] for row in rows))
+        if results is None:
+            raise RuntimeError(f"{function.name()} failed at column {k}")
+        outputs.append(results)
+        value = results[0]
+    return tuple(np.array(each) for each in zip(*outputs, strict=True))

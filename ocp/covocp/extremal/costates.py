@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import swept
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.base.quadrature import classical_step, hermite
@@ -113,28 +114,22 @@ def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :]), slopes, by_duration
 
 
-@lru_cache(maxsize=KEPT)
-def _sweep(statement: Statement, substeps: int, step: StepKind, nominal: bool, intervals: int) -> ca.Function:
-    """The adjoint of so many intervals one after the other."""
-    return adjoint_interval(statement, substeps, step, nominal=nominal).mapaccum("sweep", intervals)
-
-
 def _swept(
     extremal: Extremal, last: Array, jumps: Array, z: Expr, *, nominal: bool = False
 ) -> tuple[Array, Array, float]:
     """The adjoint of one interval swept from the end: costates at the nodes, slopes by the control values and by T."""
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
-    sweep = _sweep(st, mesh.substeps, mesh.step, nominal, n)
+    adjoint = adjoint_interval(st, mesh.substeps, mesh.step, nominal=nominal)
     backward = list(range(n - 1, -1, -1))
     keep, known = (values[:size] for values in _restarts(extremal))
     stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
-    outputs = sweep(last, *(ca.DM(column)[:, backward] for column in stacked))
-    values, by_start, by_end, by_duration = (np.asarray(v.full())[:, ::-1] for v in outputs)
+    outputs = swept(adjoint, last, *(ca.DM(column)[:, backward] for column in stacked))
+    values, by_start, by_end, by_duration = (v[::-1] for v in outputs)
     slopes = np.zeros((mesh.control_nodes, st.nu))
-    slopes[:n] += by_start.T
-    slopes[int(mesh.control == "linear") :][:n] += by_end.T
-    return np.vstack([values.T, last]), mesh.gathered(slopes), float(by_duration.sum())
+    slopes[:n] += by_start
+    slopes[int(mesh.control == "linear") :][:n] += by_end
+    return np.vstack([values, last]), mesh.gathered(slopes), float(by_duration.sum())
 
 
 def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
@@ -389,7 +384,7 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     after, *rest = interval.mx_in()
     keep, known = ca.MX.sym("keep", size), ca.MX.sym("known", size)
     start, _ = interval(keep * after + known, *rest)
-    sweep = ca.Function("sweep", [after, keep, known, *rest], [start]).mapaccum("sweep", n)
+    sweep = ca.Function("sweep", [after, keep, known, *rest], [start])
     backward = list(range(n - 1, -1, -1))
     behind = st.entries(st.behind)
     jumps = impulses(extremal)
@@ -402,8 +397,8 @@ def integrated_costates(extremal: Extremal, pairs: int = 1) -> Costates:
     last[_behind(st)] = last_given
     last[: st.nx] += passage_end(extremal, last_given)[0]
     reversed_given = given[backward].transpose(2, 0, 1).reshape(given.shape[2], given.shape[0] * given.shape[1])
-    result = sweep(last, *stacked, points, reversed_given, *extremal.intervals.columns(backward))
-    costates = np.vstack([np.asarray(result.full())[:, ::-1].T, last])
+    (result,) = swept(sweep, last, *stacked, points, reversed_given, *extremal.intervals.columns(backward))
+    costates = np.vstack([result[::-1], last])
     return Costates(state=costates[:, : st.nx], matrices=costates[:, st.nx :])
 
 
@@ -426,12 +421,11 @@ def given_costates(
     rows = len(_behind(statement))
     if not rows:
         return np.zeros((n, points, 0)), np.zeros(0)
-    sweep = forward_costates(statement, pairs).mapaccum("forward", n)
-    ends, inside = sweep(
-        np.zeros(rows) if first is None else first, values.transpose(2, 0, 1).reshape(size, -1), *common
+    start = np.zeros(rows) if first is None else first
+    ends, inside = swept(
+        forward_costates(statement, pairs), start, values.transpose(2, 0, 1).reshape(size, -1), *common
     )
-    at_points = np.asarray(inside.full()).reshape(rows, n, points).transpose(1, 2, 0)
-    return at_points, np.asarray(ends.full())[:, -1]
+    return inside.reshape(n, points, rows), ends[-1]
 
 
 def _restarts(extremal: Extremal) -> tuple[Array, Array]:

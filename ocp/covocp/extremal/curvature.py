@@ -37,6 +37,7 @@ LANCZOS_STEPS = 120
 # is where the residual is below half of it.
 LANCZOS_TOLERANCE = 1e-3
 DISPLACEMENT = 0.3
+GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
 # Rows held, of unit length, whose part across the others is below this say nothing new.
 DEPENDENT = 1e-9
 # An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
@@ -120,7 +121,8 @@ def _extremes(reduced: _Reduced, basis: Array) -> tuple[Array, Array, float]:
     def known(value: float, residual: float, largest: float) -> bool:
         return residual <= min(LANCZOS_TOLERANCE * largest, max(0.5 * abs(value), SOLVED * largest))
 
-    start = np.random.default_rng(0).standard_normal((1, basis.shape[1]))[0]
+    order = np.arange(1.0, basis.shape[1] + 1.0)
+    start = np.modf(order**2 * GOLDEN)[0] - 0.5  # like random numbers: across no direction
     found = krylov(lambda v: np.asarray(basis.T @ reduced.apply(basis @ v)), start, LANCZOS_STEPS, known)
     return found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry
 

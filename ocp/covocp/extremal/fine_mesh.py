@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
+from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steps import inside_interval
 from covocp.transcription.trajectory import Trajectory
 
@@ -20,11 +23,22 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
     Returns:
         x and e stacked at the starts of the substeps and at the end, (N, substeps + 1, nx + ne).
     """
-    mesh, n = extremal.mesh, extremal.mesh.intervals
-    z = np.hstack([extremal.trajectory.x, extremal.trajectory.e])
-    interval = inside_interval(extremal.statement, substeps, mesh.step).map(n)
-    inside = interval(z[:-1].T, z[1:].T, *extremal.intervals)
-    return np.asarray(inside.full()).T.reshape(n, substeps + 1, z.shape[1])
+    return _inside(
+        extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()), substeps
+    )
+
+
+@lru_cache(maxsize=2)
+def _inside(
+    statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...], substeps: int
+) -> Array:
+    """The same, remembered: several residuals look at one trajectory; read-only."""
+    n, z = mesh.intervals, np.hstack([trajectory.x, trajectory.e])
+    columns = interval_columns(mesh, ca.DM(trajectory.u.T), trajectory.duration, ca.DM(np.array(parameters)))
+    inside = inside_interval(statement, substeps, mesh.step).map(n)(z[:-1].T, z[1:].T, *columns)
+    values = np.asarray(inside.full()).T.reshape(n, substeps + 1, z.shape[1])
+    values.setflags(write=False)
+    return values
 
 
 @lru_cache(maxsize=8)

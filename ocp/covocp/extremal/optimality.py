@@ -105,6 +105,7 @@ class Optimality:
 def assess(
     extremal: Extremal,
     costates: Costates,
+    slopes: Array,
     mesh_error: float,
     smallest_eigenvalue: float,
     loop: ClosedLoop | None = None,
@@ -116,6 +117,7 @@ def assess(
     Args:
         extremal: the solution.
         costates: of its multipliers.
+        slopes: of the Lagrangian by the control values, without the multipliers of their bounds.
         mesh_error: estimated before.
         smallest_eigenvalue: of its covariances.
         loop: its closed loop.
@@ -127,7 +129,6 @@ def assess(
     """
     st = extremal.statement
     slope, curvature, values, size = _at_nodes(extremal, costates)
-    _, slopes, _ = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
     residual = (

@@ -227,7 +227,12 @@ class Solution:
     @cached
     def costates(self) -> Costates:
         """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
-        return self.stored_costates or read_only(discrete_costates(self.extremal)[0])
+        return self.stored_costates or read_only(self._adjoint[0])
+
+    @cached
+    def _adjoint(self) -> tuple[Costates, Array, float]:
+        """Costates, slopes of the Lagrangian by the control values and by T."""
+        return discrete_costates(self.extremal)
 
     @cached
     def optimality(self) -> Optimality:
@@ -237,7 +242,7 @@ class Solution:
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
             return identities(self.extremal, *known)
-        return assess(self.extremal, self.costates, *known, self.within)
+        return assess(self.extremal, self.costates, self._adjoint[1], *known, self.within)
 
     @property
     def cost_identity(self) -> float | None:

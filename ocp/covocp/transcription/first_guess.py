@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import swept
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, pack, real_numbers, unpack
 from covocp.base.quadrature import interpolated
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import moving_interval, nominal_interval
@@ -233,20 +232,14 @@ def _short(values: Array) -> str:
     return np.array2string(np.asarray(values), precision=4, threshold=8)
 
 
-@lru_cache(maxsize=KEPT)
-def _simulation(statement: Statement, mesh: Mesh) -> ca.Function:
-    """All intervals in sequence, from the start."""
-    return moving_interval(statement, mesh.substeps, mesh.step).mapaccum("simulate", mesh.intervals)
-
-
 def simulate_states(
     statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
 ) -> Array:
     """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
     first = np.concatenate([start, e0]) if statement.coupled else start
-    run = _simulation(statement, mesh)
-    ends = np.asarray(run(first, *interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0].full())
-    values = np.vstack([start, ends[: statement.nx].T])
+    advance = moving_interval(statement, mesh.substeps, mesh.step)
+    ends = swept(advance, first, *interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0]
+    values = np.vstack([start, ends[:, : statement.nx]])
     if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:
         lower, upper = statement.state_bounds
         return np.asarray(np.clip(values, lower, upper))
