@@ -79,8 +79,8 @@ class Runs:
         self._most = settings.get("ipopt", {}).get("max_iter", MAX_ITERATIONS)
         self._monitor: Monitor | None = None
         self._nlp: Program | None = None
-        self._cold: Any = None
-        self._warm: Any = None
+        self._solvers: dict[bool, Any] = {}  # of the program, by whether they start from multipliers
+        self._functions: Any = None  # the solver of it that was made first and has the functions of all
 
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
         """Run from these guesses, one for each part; the last iterate is returned whatever happens.
@@ -94,7 +94,8 @@ class Runs:
         begin = time.perf_counter()
         self._share = 1.0
         if self._strictness < 1.0:
-            self._strictness, self._warm = 1.0, None
+            self._strictness = 1.0
+            self._solvers.pop(True, None)
         trajectories = tuple(guess.trajectory for guess in guesses)
         known = [(g.multipliers, g.costates) for g in guesses if g.multipliers is not None and g.costates is not None]
         dual = len(known) == len(guesses)
@@ -136,9 +137,7 @@ class Runs:
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
             if self._open and done[-1] is best and nlp is best.nlp:  # the same run would end where it begins
                 self._tighten(best.residuals)
-            solver = self._warm_solver() if start.lam_x is not None else self._cold
-            assert solver is not None
-            point = self._run(nlp, solver, start, parameters, progress)
+            point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
             done.append(self._judged(nlp, point, parameters, again=True))
         if not done[-1].converged:
             done.append(done.pop(done.index(_best(done))))
@@ -156,7 +155,7 @@ class Runs:
             self._share *= share_for(slope)
         if missed > 1.0:
             self._strictness *= share_for(missed)
-            self._warm = None
+            self._solvers.pop(True, None)
 
     def _judged(self, nlp: Program, point: Point, parameters: Arrays, again: bool = False) -> Round:
         """A run, from such a point or not, with its residuals where it ended at a point that may be stationary."""
@@ -164,8 +163,7 @@ class Runs:
         status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
-        assert self._cold is not None
-        first = FirstOrder(nlp, self._cold if self._open else None)
+        first = FirstOrder(nlp, self._functions if self._open else None)
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
@@ -265,38 +263,36 @@ class Runs:
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
     def _build(self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool) -> tuple[Program, Any]:
-        """The program and its solver, made at the first call; a second solver shares the functions for warm starts.
+        """The program, made at the first call, and its solver.
 
         Other plugins than Ipopt print their iterations where somebody watches that call.
         """
-        if self._nlp is None or self._cold is None:
+        if self._nlp is None:
             if not self._open and not watched:
                 self._settings = silent(self._plugin, self._settings)
             self._transcribe(None, trajectories, parameters)
         assert self._nlp is not None
-        assert self._cold is not None
-        return self._nlp, self._warm_solver() if warm else self._cold
+        return self._nlp, self._solver(warm)
 
     def _transcribe(self, scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> None:
-        """The program in these scales, and its solver."""
+        """The program in these scales."""
         self._nlp = self._build_program(scales, trajectories, parameters)
         if self._open:
             self._monitor = Monitor(self._nlp)
-        self._cold, self._warm = self._make({}), None
+        self._solvers, self._functions = {}, None
 
-    def _warm_solver(self) -> Any:
-        """The solver for starts with multipliers; other plugins than Ipopt have one for all."""
-        assert self._cold is not None
-        if not self._open:
-            return self._cold
-        if self._warm is None:
-            shared = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g"} | (
-                {} if self._limited else {"hess_lag": "nlp_hess_l"}
-            )
-            self._warm = self._make(
-                {option: self._cold.get_function(name) for option, name in shared.items()}, warm=True
-            )
-        return self._warm
+    def _solver(self, warm: bool) -> Any:
+        """The solver for starts with multipliers, or without; other plugins than Ipopt have one for all."""
+        warm = warm and self._open
+        if warm not in self._solvers:
+            shared: dict[str, ca.Function] = {}
+            if self._functions is not None:
+                names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
+                names = {option: name for option, name in names.items() if option != "hess_lag" or not self._limited}
+                shared = {option: self._functions.get_function(name) for option, name in names.items()}
+            self._solvers[warm] = self._make(shared, warm=warm)
+            self._functions = self._functions or self._solvers[warm]
+        return self._solvers[warm]
 
     def _make(self, functions: dict[str, ca.Function], warm: bool = False) -> Any:
         nlp = self._nlp

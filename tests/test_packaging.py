@@ -101,6 +101,20 @@ def test_import_loads_neither_scipy_nor_the_laws(tmp_path):
     assert found.stdout.split() == ["[]", "covocp.blocks.theta_d"]
 
 
+def test_a_solve_loads_nothing_that_takes_as_long(tmp_path):
+    """With necessary conditions, on a mesh that refines itself, with and without covariances."""
+    found = run_python(
+        "import sys, covocp as co\n"
+        "from covocp.models import bryson_denham, mass_chain\n"
+        "co.solve(mass_chain.problem(masses=1), progress=False, intervals=30).optimality\n"
+        "co.solve(bryson_denham.problem(), progress=False, refine=1e-3).optimality\n"
+        "print(sorted({'scipy', 'numpy.ma', 'numpy.random', 'matplotlib'} & set(sys.modules)))",
+        tmp_path,
+    )
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.strip() == "[]"
+
+
 def test_modules_of_the_user_with_the_names_of_the_folders_do_not_collide(tmp_path):
     for name in ("ocp", "models", "solvers"):
         (tmp_path / f"{name}.py").write_text("mine = True\n", encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from plain_problems import FREE, PLAIN, Plain, stated
 
 # Equal meshes on which the script by hand is tried.
 MESHES = (10, 25, 50, 100, 200, 400, 800, 1600, 3200, 6400)
+# Points on which yapss is tried, ten to a segment.
+POINTS = (50, 100, 200, 400, 800)
 
 
 def covocp_solve(case: dict[str, Any]) -> dict[str, Any]:
@@ -85,11 +88,32 @@ def hand(case: dict[str, Any]) -> dict[str, Any]:
 
 def hand_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
     """By hand, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
+    return _coarsest(hand, MESHES, case)
+
+
+def hand_until_settled(case: dict[str, Any]) -> dict[str, Any]:
+    """By hand, on one mesh after the other until the cost no longer changes by what is asked for; all are timed."""
+    seconds, last = {"build": 0.0, "solve": 0.0}, np.inf
     for n in MESHES:
         found = hand({**case, "intervals": n})
-        if found["off"] <= case["refine"] or n == MESHES[-1]:
+        seconds = {name: seconds[name] + found[name] for name in seconds}
+        if abs(found["cost"] - last) <= case["refine"] * abs(found["cost"]):
             break
-    return hand({**case, "intervals": n})
+        last = found["cost"]
+    return {**found, **seconds}
+
+
+def yapss_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
+    """By yapss, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
+    return _coarsest(yapss, POINTS, case)
+
+
+def _coarsest(solve: Callable[[dict[str, Any]], dict[str, Any]], sizes: tuple[int, ...], case: Any) -> dict[str, Any]:
+    for n in sizes:
+        found = solve({**case, "intervals": n})
+        if found["off"] <= case["refine"] or n == sizes[-1]:
+            break
+    return solve({**case, "intervals": n})
 
 
 def rockit(case: dict[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
@@ -299,8 +299,7 @@ def _columnwise(first: ca.Function, others: ca.Function) -> Callable[..., list[A
 def _point_slopes(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
     """(z, u, s, T, p, column) -> slopes of T H(t = s T) by u and by T."""
     arguments, value = _point(statement, cost, matrices)
-    slopes = [ca.densify(ca.gradient(arguments[3] * value, symbol)) for symbol in (arguments[1], arguments[3])]
-    return ca.Function("point_slopes", arguments, slopes)
+    return ca.Function("point_slopes", arguments, slopes_by(arguments[3] * value, (arguments[1], arguments[3])))
 
 
 def _point_rates(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:

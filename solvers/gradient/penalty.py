@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.solvers.gradient.influence import Run
@@ -212,9 +212,7 @@ def _group(
     active = 2 * weights * (shifted != 0)
     outputs = [
         penalty,
-        ca.gradient(penalty, z),
-        ca.gradient(penalty, u),
-        ca.gradient(penalty, duration),
+        *slopes_by(penalty, (z, u, duration)),
         2 * weights * shifted,
         excess(value),
         by_control.T @ (ca.repmat(active, 1, nu) * by_control),

@@ -119,11 +119,12 @@ class ReducedRuns(Runs):
         assert self._monitor is not None
         return Engine(self._nlp, self._tolerance, self._most, self._monitor)
 
-    def _warm_solver(self) -> Engine:
+    def _solver(self, warm: bool) -> Engine:
         """The same for all starts: what was learnt stays."""
-        assert isinstance(self._cold, Engine)
-        self._cold.tolerance = self._tolerance * self._strictness
-        return self._cold
+        engine = super()._solver(False)
+        assert isinstance(engine, Engine)
+        engine.tolerance = self._tolerance * self._strictness
+        return engine
 
     def _tighten(self, found: Residuals) -> None:
         """All by the tolerance: nothing here is compared with one."""

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from covocp.base.matrices import (
+    distinct,
     half_indices,
     half_length,
     is_semidefinite,
@@ -132,6 +133,11 @@ def test_eigenvalues_of_nothing_and_of_nan():
     assert is_semidefinite(np.zeros((3, 2, 2)))
     assert not is_semidefinite(np.full((1, 2, 2), np.nan))
     assert not is_semidefinite(np.full((1, 2, 2), np.inf))
+
+
+def test_different_numbers_are_sorted():
+    assert distinct([0.5, 0.0, 1.0], np.array([1.0, 0.25]), []).tolist() == [0.0, 0.25, 0.5, 1.0]
+    assert distinct([]).size == 0
 
 
 def test_roundoff_is_forgiven_but_not_more():

@@ -21,7 +21,7 @@ import numpy as np
 from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.costates import discrete_costates
@@ -134,7 +134,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
     else:
         classical = evaluate(problem, nominal=nominal, intervals=intervals, **options)
     size, extremal = abs(classical.cost), classical.extremal
-    mesh = Options(grid=np.unique(extremal.mesh.nodes), control=classical.mesh.control)  # type: ignore[arg-type]
+    mesh = Options(grid=distinct(extremal.mesh.nodes), control=classical.mesh.control)  # type: ignore[arg-type]
     if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
         still = np.zeros_like(extremal.trajectory.u)
         return Worth(classical=classical, first_order=0.0, gain=0.0, direction=still, step=0.0)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
+
+import casadi as ca
+import numpy as np
 
 # SX, MX or DM, and where a function is evaluated with numbers an array: the stubs know no type that all of them share,
 # and no operators between them.
@@ -17,3 +21,17 @@ TABLE = "covocp_table_"
 def symbol_of(key: Given) -> Any:
     """The symbol of what stands for a state that is no vector, such as an attitude; anything else as it is."""
     return getattr(key, "quaternion", key)
+
+
+def slopes_by(value: Expr, symbols: Sequence[Expr]) -> list[Any]:
+    """Slopes of a number by several symbols, dense and of their shapes, in one reverse sweep for all of them."""
+    if isinstance(value, ca.SX):
+        sizes = [symbol.numel() for symbol in symbols]
+        whole = ca.densify(ca.gradient(value, ca.veccat(*symbols)))
+        parts = ca.vertsplit(whole, np.cumsum([0, *sizes]).tolist())
+        return [ca.reshape(part, *symbol.shape) for part, symbol in zip(parts, symbols, strict=True)]
+    wanted = {symbol.__hash__() for symbol in symbols}
+    others = [symbol for symbol in ca.symvar(value) if symbol.__hash__() not in wanted]
+    arguments = [*symbols, *others]
+    reverse = ca.Function("value", arguments, [value]).reverse(1)
+    return [ca.densify(slope) for slope in reverse.call([*arguments, value, ca.DM(1)], True, False)[: len(symbols)]]

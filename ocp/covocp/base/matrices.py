@@ -63,6 +63,12 @@ def read_only(holder: T) -> T:
     return holder
 
 
+def distinct(*values: Any) -> Array:
+    """The different numbers among some, sorted: `np.unique` would import numpy.ma, which takes as long as a solve."""
+    together = np.sort(np.concatenate([np.ravel(own) for own in values]))
+    return np.asarray(together[np.append(True, together[1:] != together[:-1])[: together.size]])
+
+
 def half_length(size: int) -> int:
     """Number of distinct entries of a symmetric matrix of the given size."""
     return size * (size + 1) // 2

@@ -56,7 +56,8 @@ class Held:
             kind: np.where(mask.reshape(getattr(m, kind).shape), getattr(m, kind), 0.0) for kind, mask in kept.items()
         }
         ends = {kind: kept[kind].reshape(getattr(m, kind).shape)[-1] for kind in ("states", "matrices")}
-        behind = np.isin(np.arange(st.ne), st.entries(st.behind))
+        behind = np.zeros(st.ne, dtype=bool)
+        behind[st.entries(st.behind)] = True
         values["final"] = np.where(~np.isnan(xf) | ends["states"], m.final, 0.0)
         values["final_matrices"] = np.where(~np.isnan(ef) | ends["matrices"] | behind, m.final_matrices, 0.0)
         return replace(extremal, multipliers=replace(m, **values))
@@ -91,9 +92,11 @@ def held_by(extremal: Extremal, points: int = 1) -> Held:
     matrices[-1] += np.where(np.isnan(ef), m.final_matrices, 0.0)
     matrix_sides, matrix_strict = _sides(t.e, st.matrix_lower, np.full(st.ne, np.inf), matrices)
     matrix_sides = np.where(matrix_strict, matrix_sides, 0.0)
+    known = ~np.isnan(ef)
+    known[st.entries(st.behind)] = False
     groups = [
         ("final", np.flatnonzero(~np.isnan(xf)), None, None),
-        ("final_matrices", np.setdiff1d(np.flatnonzero(~np.isnan(ef)), st.entries(st.behind)), None, None),
+        ("final_matrices", np.flatnonzero(known), None, None),
         ("states", np.flatnonzero(state_sides), state_sides, state_strict),
         ("matrices", np.flatnonzero(matrix_sides), matrix_sides, matrix_strict),
     ]

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import swept
-from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.expressions import Expr, slopes_by
+from covocp.base.matrices import Array, read_only
 from covocp.base.quadrature import classical_step, hermite
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
@@ -56,12 +56,8 @@ def impulses(extremal: Extremal) -> Array:
         symbols = model_symbols(statement)
         weights = symbolic.sym("mu", statement.path.size)
         value = ca.dot(weights, statement.path.function(*symbols))
-        slope = (
-            ca.gradient(value, ca.vertcat(symbols[0], symbols[2]))
-            if statement.symbolic is ca.SX
-            else ca.vertcat(ca.gradient(value, symbols[0]), ca.gradient(value, symbols[2]))
-        )
-        function = ca.Function("jumps", [*symbols, weights], [ca.densify(slope)])
+        slope = ca.vertcat(*slopes_by(value, (symbols[0], symbols[2])))
+        function = ca.Function("jumps", [*symbols, weights], [slope])
         count = extremal.mesh.intervals + 1
         jumps = jumps + np.asarray(function.map(count)(*extremal.columns(), multipliers.path.T).full()).T
     jumps[-1] = 0.0
@@ -85,20 +81,28 @@ def adjoint_interval(statement: Statement, substeps: int, step: StepKind, *, nom
     end, _, cost = interval(z, *common)
     value = ca.dot(keep * after + known, end) + (0 if nominal else cost)
     by = (z, common.start, common.end, *([common.duration] if statement.duration.free else []))
-    slopes = [ca.gradient(value, symbol) for symbol in by] + [ca.DM(0)] * (4 - len(by))
+    slopes = slopes_by(value, by) + [ca.DM(0)] * (4 - len(by))
     return ca.Function("adjoint", [after, keep, known, impulse, z, *common], [slopes[0] + impulse, *slopes[1:]])
 
 
+@lru_cache(maxsize=4)
 def discrete_costates(extremal: Extremal) -> tuple[Costates, Array, float]:
-    """Costates of the discretised problem, by the adjoint sweep from the multipliers at the end.
+    """Costates of the discretised problem, by the adjoint sweep from the multipliers at the end; remembered.
 
     Where the problem was shot in segments, each is swept from the multipliers of the continuity at its end: a nominal
     that is unstable would amplify the error of those at the end of all.
 
     Returns:
         Costates at the nodes; the slope of the Lagrangian by each control value (N + 1 or N, nu), without the
-        multipliers of control bounds; its slope by T through the intervals.
+        multipliers of control bounds; its slope by T through the intervals. All of it read-only.
     """
+    costates, slopes, by_duration = _discrete(extremal)
+    slopes.setflags(write=False)
+    return read_only(costates), slopes, by_duration
+
+
+def _discrete(extremal: Extremal) -> tuple[Costates, Array, float]:
+    """The same, to be written to."""
     st, points = extremal.statement, extremal.mesh.points
     if points > 1:  # limits act between the nodes: swept on the mesh that has them as nodes
         fine, slopes, by_duration = discrete_costates(refined(extremal))
@@ -121,11 +125,15 @@ def _swept(
     st, mesh = extremal.statement, extremal.mesh
     n, size = mesh.intervals, last.size
     adjoint = adjoint_interval(st, mesh.substeps, mesh.step, nominal=nominal)
-    backward = list(range(n - 1, -1, -1))
     keep, known = (values[:size] for values in _restarts(extremal))
     stacked = (keep, known, jumps[:-1].T, z[:, :n], *extremal.intervals)
-    outputs = swept(adjoint, last, *(ca.DM(column)[:, backward] for column in stacked))
-    values, by_start, by_end, by_duration = (v[::-1] for v in outputs)
+    if not keep[:, :-1].any():  # each interval has its own multipliers
+        outputs = adjoint.map(n)(np.tile(last[:, None], n), *stacked)
+        values, by_start, by_end, by_duration = (np.asarray(v.full()).T for v in outputs)
+    else:
+        backward = list(range(n - 1, -1, -1))
+        outputs = swept(adjoint, last, *(ca.DM(column)[:, backward] for column in stacked))
+        values, by_start, by_end, by_duration = (v[::-1] for v in outputs)
     slopes = np.zeros((mesh.control_nodes, st.nu))
     slopes[:n] += by_start
     slopes[int(mesh.control == "linear") :][:n] += by_end
@@ -191,7 +199,7 @@ def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float, Array]:
     nu = terminal_costates(extremal)[1][behind] - extremal.multipliers.final_matrices[behind] - given
     symbols = [ca.MX.sym("x", st.nx), ca.MX.sym("T"), ca.MX.sym("p", st.np)]
     value = ca.dot(ca.DM(nu), st.matrix_end(*symbols))
-    function = ca.Function("passage_end", symbols, [ca.densify(ca.gradient(value, symbol)) for symbol in symbols])
+    function = ca.Function("passage_end", symbols, slopes_by(value, symbols))
     by_x, by_duration, by_p = function(t.x[-1], t.duration, extremal.parameters)
     return np.asarray(by_x.full()).ravel(), float(by_duration), np.asarray(by_p.full()).ravel()
 
@@ -214,7 +222,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage="compiled")
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
-    slopes: list[Any] = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, u, duration, kicks)]
+    slopes = slopes_by(value, (x, u, duration, kicks))
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
     values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
     return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
@@ -274,9 +282,7 @@ def reading_slopes(
     inputs = [point, control, time, duration, p, reading, later]
     after, added = statement.samples.update(point[:nx], control, point[nx:], time, duration, p, reading)
     value = ca.dot(later[nx:], after) + ca.dot(later[:nx], point[:nx]) + (added if cost else 0)
-    by_time = ca.gradient(value, time)
-    slopes = [ca.gradient(value, point), ca.gradient(value, control), by_time, ca.gradient(value, duration)]
-    function = ca.Function("reading_slopes", inputs, [ca.densify(slope) for slope in slopes])
+    function = ca.Function("reading_slopes", inputs, slopes_by(value, (point, control, time, duration)))
     by_z, by_u, by_t, by_duration = function(
         z, part.start, part.time(0.0), part.duration, part.parameters, part.reading, costate
     )

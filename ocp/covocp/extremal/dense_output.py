@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, half_indices, unpack
+from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, distinct, half_indices, read_only, unpack
 from covocp.base.quadrature import hermite
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -84,16 +84,27 @@ def _lengths(h: Array) -> Array:
 
 
 def dense_output(extremal: Extremal, *, matrices: bool = True) -> Dense:
-    """What a solution is between its nodes.
+    """What a solution is between its nodes; remembered.
 
     Args:
         extremal: a trajectory that its mesh's steps made.
         matrices: False where only the states are asked for; their half-vectors are then cubic between the nodes.
 
     Returns:
-        The polynomials; cubic between the nodes where the trajectory is not finite or a step cannot be solved.
+        The polynomials, read-only; cubic between the nodes where the trajectory is not finite or a step cannot be
+        solved.
     """
-    coarse = _between_nodes(extremal)
+    return _remembered(extremal, matrices or not extremal.statement.ne)
+
+
+@lru_cache(maxsize=4)
+def _remembered(extremal: Extremal, matrices: bool) -> Dense:
+    return read_only(_between(extremal, matrices))
+
+
+def _between(extremal: Extremal, matrices: bool) -> Dense:
+    """Polynomials between the nodes."""
+    coarse = between_nodes(extremal)
     if not all(np.isfinite(v).all() for v in (coarse.values, coarse.first, coarse.last)):
         return coarse
     try:
@@ -103,8 +114,8 @@ def dense_output(extremal: Extremal, *, matrices: bool = True) -> Dense:
         return coarse
 
 
-def _between_nodes(extremal: Extremal) -> Dense:
-    """Cubic polynomials through the nodes."""
+def between_nodes(extremal: Extremal) -> Dense:
+    """Cubic polynomials through the nodes with the rates there: nothing is integrated."""
     t, duration = extremal.trajectory, extremal.trajectory.duration
     rates, ends = rates_along(extremal)
     values = np.hstack([t.x, t.e])
@@ -466,7 +477,7 @@ def _joined(extremal: Extremal, tracks: list[tuple[list[int], Dense]]) -> Dense:
 
 def _union(nodes: Array, groups: list[Array]) -> Array:
     """The knots of all, without those that differ by roundoff from a node or from the one before."""
-    inside = np.setdiff1d(np.concatenate(groups), nodes)
+    inside = distinct(*groups)
     k = np.clip(np.searchsorted(nodes, inside) - 1, 0, nodes.size - 2)
     near = SAME * np.diff(nodes)[k]
     inside = inside[(inside - nodes[k] > near) & (nodes[k + 1] - inside > near)]

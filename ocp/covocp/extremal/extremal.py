@@ -25,7 +25,7 @@ from covocp.transcription.trajectory import Multipliers, Trajectory, at_nodes
 STOPPED, ENDED = "stopped", "ended"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Extremal:
     """Trajectory, multipliers, and what is needed to evaluate anything along them.
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import casadi as ca
 
+from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -75,4 +76,4 @@ def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list
 def state_slope(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
     """H_x and H_E stacked, as a function made by `hamiltonian`."""
     make = hamiltonian(statement, cost=cost, matrices=matrices)
-    return make("slope", lambda h, x, u, e, t: [ca.vertcat(ca.gradient(h, x), ca.gradient(h, e))])
+    return make("slope", lambda h, x, u, e, t: [ca.vertcat(*slopes_by(h, (x, e)))])

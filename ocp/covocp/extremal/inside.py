@@ -7,6 +7,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import model_symbols
@@ -80,5 +81,4 @@ def _slopes(statement: Statement, number: int) -> ca.Function:
     symbols, conditions = model_symbols(statement), statement.inside.parts[number].conditions
     weights = type(symbols[0]).sym("weights", conditions.size)
     value = ca.dot(weights, conditions.function(*symbols))
-    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in symbols[:5]]
-    return ca.Function("slopes", [*symbols, weights], slopes)
+    return ca.Function("slopes", [*symbols, weights], slopes_by(value, symbols[:5]))

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
@@ -205,8 +206,7 @@ def _slopes(link: Link) -> ca.Function:
     weights = [ca.MX.sym("px", len(link.states)), ca.MX.sym("pe", len(link.matrices))]
     states, matrices = link.function(*inputs)
     value = ca.dot(weights[0], states) + ca.dot(weights[1], matrices)
-    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in inputs[:3]]
-    return ca.Function("link_slopes", [*inputs, *weights], slopes)
+    return ca.Function("link_slopes", [*inputs, *weights], slopes_by(value, inputs[:3]))
 
 
 def link_residual(before: Passed, after: Passed, link: Link) -> float:

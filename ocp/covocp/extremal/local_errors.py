@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal
@@ -31,7 +31,7 @@ def local_errors(coarse: Extremal, fine: Extremal) -> Array:
     Returns:
         Not negative, (M,); intervals without length are left out.
     """
-    ends = np.unique(fine.mesh.nodes)
+    ends = distinct(fine.mesh.nodes)
     result = np.zeros(ends.size - 1)
     for places, values in (_of_controls(coarse, fine), _of_limits(coarse, fine), _of_steps(coarse)):
         _spread(result, ends, places, np.nan_to_num(np.abs(values), nan=0.0, posinf=0.0))

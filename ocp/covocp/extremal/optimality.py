@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked, standard_deviations
 from covocp.base.residuals import complementary
 from covocp.extremal.closed_loop import ClosedLoop
@@ -105,7 +105,6 @@ class Optimality:
 def assess(
     extremal: Extremal,
     costates: Costates,
-    slopes: Array,
     mesh_error: float,
     smallest_eigenvalue: float,
     loop: ClosedLoop | None = None,
@@ -117,7 +116,6 @@ def assess(
     Args:
         extremal: the solution.
         costates: of its multipliers.
-        slopes: of the Lagrangian by the control values, without the multipliers of their bounds.
         mesh_error: estimated before.
         smallest_eigenvalue: of its covariances.
         loop: its closed loop.
@@ -129,6 +127,7 @@ def assess(
     """
     st = extremal.statement
     slope, curvature, values, size = _at_nodes(extremal, costates)
+    _, slopes, _ = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
     residual = (
@@ -326,7 +325,7 @@ def _absolute_cost(extremal: Extremal) -> float:
 def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
     """-H_x and -H_e at the nodes, stacked."""
     make = hamiltonian(extremal.statement)
-    function = make("rates", lambda h, x, u, e, t: [-ca.gradient(h, x), -ca.gradient(h, e)])
+    function = make("rates", lambda h, x, u, e, t: [-slope for slope in slopes_by(h, (x, e))])
     return np.hstack(along(function, extremal, costates))
 
 

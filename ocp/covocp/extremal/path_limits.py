@@ -103,7 +103,8 @@ def _passed(
     mesh, (lower, upper) = extremal.mesh, limits
     worst, largest = np.zeros((2, len(names))), np.zeros(len(names))
     when = np.zeros((2, len(names)))
-    inner = dense.knots[~np.isin(dense.knots, mesh.nodes)]
+    nearest = np.clip(np.searchsorted(mesh.nodes, dense.knots), 0, mesh.intervals)
+    inner = dense.knots[mesh.nodes[nearest] != dense.knots]
     regular = mesh.intervals * (points + 1)
     for begin in range(0, regular + inner.size, TOGETHER):
         at = np.arange(begin, min(begin + TOGETHER, regular + inner.size))

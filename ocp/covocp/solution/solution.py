@@ -227,12 +227,7 @@ class Solution:
     @cached
     def costates(self) -> Costates:
         """p and the costates of the half-vectors at the nodes, read-only; computed when first asked for."""
-        return self.stored_costates or read_only(self._adjoint[0])
-
-    @cached
-    def _adjoint(self) -> tuple[Costates, Array, float]:
-        """Costates, slopes of the Lagrangian by the control values and by T."""
-        return discrete_costates(self.extremal)
+        return self.stored_costates or discrete_costates(self.extremal)[0]
 
     @cached
     def optimality(self) -> Optimality:
@@ -242,7 +237,7 @@ class Solution:
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
             return identities(self.extremal, *known)
-        return assess(self.extremal, self.costates, self._adjoint[1], *known, self.within)
+        return assess(self.extremal, self.costates, *known, self.within)
 
     @property
     def cost_identity(self) -> float | None:
@@ -387,7 +382,7 @@ class Solution:
     @cached
     def dense(self) -> Dense:
         """States and half-vectors between the nodes, read-only; computed when first asked for."""
-        return self.stored_dense or read_only(dense_output(self.extremal))
+        return self.stored_dense or dense_output(self.extremal)
 
     @cached
     def _dense_states(self) -> Dense:

@@ -15,7 +15,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.solving.attempts import from_starts
@@ -39,15 +39,15 @@ def coarser(statement: Statement, options: Options, mesh: Mesh) -> Options | Non
     """
     if not waits(statement):
         return None
-    nodes = np.unique(mesh.nodes)
-    places = np.unique([0.0, *statement.instants, 1.0])
+    nodes = distinct(mesh.nodes)
+    places = distinct([0.0, *statement.instants, 1.0])
     enough = max(INTERVALS, BETWEEN * (places.size - 1))
     if nodes.size - 1 < TIMES * enough:
         return None
     step = int(np.ceil((nodes.size - 1) / enough))
     kept = [nodes[(nodes >= a) & (nodes < b)] for a, b in pairwise(places)]
     chosen = [part[:: min(step, max(1, part.size // BETWEEN))] for part in kept]
-    return with_instants(statement, replace(options, grid=np.unique([*np.concatenate(chosen), 1.0])))
+    return with_instants(statement, replace(options, grid=distinct(*chosen, [1.0])))
 
 
 def from_coarser(

@@ -16,7 +16,7 @@ from covocp.base.checks import as_number, check_density, check_kind, column
 from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import Array, stacked, unpack
+from covocp.base.matrices import Array, distinct, stacked, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance, variances
 from covocp.extremal.extremal import Extremal, Outcome
@@ -144,7 +144,7 @@ def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> 
     given = Options(intervals=intervals, **_known(options))
     if isinstance(nominal, Solution) and not options:
         own = nominal.mesh
-        given = replace(given, grid=np.unique(own.nodes), control=own.control)  # type: ignore[arg-type]
+        given = replace(given, grid=distinct(own.nodes), control=own.control)  # type: ignore[arg-type]
     return given
 
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import CovocpError
-from covocp.base.matrices import Array, pack
+from covocp.base.matrices import Array, distinct, pack
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
@@ -208,7 +208,7 @@ def weighted(own: Declarations, of: str = "") -> Declarations:
 
 def _searched(statement: Statement, rows: list[Row], best: Solution, parameters: Mapping[str, Any]) -> Solution | None:
     """The solution along the nominal of `best` with weights of X that come closest to the conditions; None: no need."""
-    options = Options(grid=np.unique(best.mesh.nodes), control=best.mesh.control)  # type: ignore[arg-type]
+    options = Options(grid=distinct(best.mesh.nodes), control=best.mesh.control)  # type: ignore[arg-type]
     assert best.loop is not None
     loop = best.loop
     outcome: Outcome | None = None
@@ -231,7 +231,7 @@ def _searched(statement: Statement, rows: list[Row], best: Solution, parameters:
         if closed is None:
             break
         loop = closed
-    return None if found is None else Solution.of(found, METHOD)
+    return None if found is None else Solution.of(found, METHOD, assess=False)
 
 
 def close_enough(worst: float, turn: int) -> bool:

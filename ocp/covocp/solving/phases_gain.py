@@ -15,7 +15,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError, Interrupted, without_warnings
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.extremal.phase_loops import phase_loops
 from covocp.problem.closed_loop_covariance import reasons, with_best_gain
 from covocp.problem.declarations import Declarations
@@ -153,7 +153,7 @@ def _searched(
     weights: list[Array] = [np.zeros(len(listed)) for listed in rows]
     chain, nominals = phases.chain(), list(best)
     meshes = [phase.mesh for phase in best]
-    options = tuple(Options(grid=np.unique(own.nodes), control=own.control) for own in meshes)  # type: ignore[arg-type]
+    options = tuple(Options(grid=distinct(own.nodes), control=own.control) for own in meshes)  # type: ignore[arg-type]
     given, closest, found = values_of(chain, parameters), np.inf, None
     runs: Runs | None = None
     for turn in range(ROUNDS):

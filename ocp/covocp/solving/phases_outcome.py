@@ -15,8 +15,15 @@ from covocp.solution.solution import Solution
 from covocp.statement.chain import Chain
 
 
-def phases_solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesSolution:
-    """An outcome as solutions of the phases; link residuals are nan where nothing was chosen."""
+def phases_solution(chain: Chain, outcome: ChainOutcome, method: str, *, assess: bool = True) -> PhasesSolution:
+    """An outcome as solutions of the phases; link residuals are nan where nothing was chosen.
+
+    Args:
+        chain: the phases.
+        outcome: what was found.
+        method: by which.
+        assess: whether the mesh errors of the phases are estimated.
+    """
     loops: tuple[PhaseLoop | None, ...] = (None,) * len(outcome.extremals)
     if chain.statements[0].loop is not None:
         loops = phase_loops(outcome.extremals, chain.links)
@@ -42,7 +49,7 @@ def phases_solution(chain: Chain, outcome: ChainOutcome, method: str) -> PhasesS
             violations=own,
             stats={**_of_phase(outcome.stats, i), **noted(None if closed is None else closed.mean)},
         )
-        phases.append(Solution.of(single, method, within, closed))
+        phases.append(Solution.of(single, method, within, closed, assess=assess))
     residuals = (
         ()
         if passed is None or outcome.given

@@ -99,7 +99,7 @@ class ChainRuns:
         values = tuple(extremal.parameters for extremal in start.extremals)
         prepared = self._prepare(chain, options, **self._own)
         assert isinstance(start.outcome, ChainOutcome)
-        known = phases_solution(chain, start.outcome, self._method)
+        known = phases_solution(chain, start.outcome, self._method, assess=False)
         parts = zip(chain.statements, prepared.meshes, values, known, strict=True)
         guesses = tuple(make_guess(st, mesh, own, phase, linked=True) for st, mesh, own, phase in parts)
         return self._measured(options, prepared, prepared.solve(values, guesses, self._reporter))

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -81,7 +81,7 @@ class Measured:
     @property
     def intervals(self) -> tuple[int, ...]:
         """Intervals of positive length of each phase."""
-        return tuple(int(np.unique(mesh.nodes).size - 1) for mesh in self.meshes)
+        return tuple(int(distinct(mesh.nodes).size - 1) for mesh in self.meshes)
 
     @property
     def counted(self) -> str:
@@ -226,7 +226,7 @@ def _with_more_points(current: Measured, runs: Runs, made: list[AnyOutcome]) -> 
             options[i] = more_points(options[i], mesh) or options[i]
     if all(new is own for new, own in zip(options, current.options, strict=True)):
         return None
-    nodes = tuple(np.unique(mesh.nodes) for mesh in current.meshes)
+    nodes = tuple(distinct(mesh.nodes) for mesh in current.meshes)
     return _solved(nodes, replace(current, options=tuple(options)), runs, made)[0]
 
 
@@ -268,7 +268,7 @@ def _next_nodes(
     whole = max(AIMED * allowed, BOLD * coarse.error) * cost
     given = []
     for own, finer, error in zip(coarse.meshes, fine.extremals, errors, strict=True):
-        given.append((np.unique(own.nodes), np.unique(finer.mesh.nodes), error, ORDERS[finer.mesh.control]))
+        given.append((distinct(own.nodes), distinct(finer.mesh.nodes), error, ORDERS[finer.mesh.control]))
     jumps = [_jumps(extremal) for extremal in fine.extremals]
     demands = [demand(*own, found) for own, found in zip(given, jumps, strict=True)]
     total = max(sum(demands), np.finfo(float).tiny)

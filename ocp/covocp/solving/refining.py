@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess, Outcome, Prepared
@@ -90,7 +90,7 @@ class ProblemRuns:
         """From a solution on another mesh."""
         prepared: Prepared = self.prepare(options[0])
         assert isinstance(start.outcome, Outcome)
-        solution = Solution.of(start.outcome, self.method)
+        solution = Solution.of(start.outcome, self.method, assess=False)
         guess = make_guess(self.statement, prepared.mesh, self.parameters, solution)
         outcome = prepared.solve(self.parameters, guess, self.progress)
         return self.measured(options[0], prepared, outcome, start.least)
@@ -132,7 +132,7 @@ def with_layers(statement: Statement, options: Options, parameters: Array) -> Op
     nodes = options.nodes()
     longest = float(np.diff(nodes).max())
     layer = longest / fast * LAYER_RATIO ** np.arange(np.ceil(np.log(fast) / np.log(LAYER_RATIO)))
-    whole = completed(statement, np.union1d(np.unique(nodes), np.concatenate([layer, 1.0 - layer])))
+    whole = completed(statement, distinct(nodes, layer, 1.0 - layer))
     known = options.grid.stiffness if isinstance(options.grid, Graded) else None
     return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known, layered=True))
 

@@ -329,7 +329,11 @@ class Solver:
 
         def run(statement: Statement, last: Outcome | None, most: int) -> Outcome:
             prepared = self._prepare(statement, self._options, **{**self._own, "max_iterations": most})
-            start = begin if last is None else make_guess(statement, mesh, values, Solution.of(last, self.method))
+            start = (
+                begin
+                if last is None
+                else make_guess(statement, mesh, values, Solution.of(last, self.method, assess=False))
+            )
             outcome: Outcome = prepared.solve(values, start, reporter)
             return outcome
 
@@ -479,7 +483,8 @@ class Solver:
                 break
             try:
                 prepared = self._prepare(self._solved, finer, **self._own)
-                start = make_guess(self._solved, prepared.mesh, values, Solution.of(outcome, self.method))
+                coarse = Solution.of(outcome, self.method, assess=False)
+                start = make_guess(self._solved, prepared.mesh, values, coarse)
                 again = prepared.solve(values, start, reporter)
             except CovocpError:  # what the steps are off is told with the solution that there is
                 break

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, pack
+from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
+from covocp.extremal.dense_output import between_nodes
 from covocp.extremal.extremal import Guess
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
@@ -162,36 +163,43 @@ def _resampled(
 ) -> Trajectory:
     """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
     duration = _duration(statement, solution, elapsed)
-
-    def at(nodes: Array, side: Literal["before", "after"] = "after") -> Any:
-        return solution.at(_places(nodes, duration, solution, elapsed) * solution.duration, side=side)
-
+    # matrices that the program does not hold tell their magnitudes and nothing more: they need not be integrated
+    dense = between_nodes(solution.extremal) if mesh.eliminated else solution.dense
     sizes, t = mesh.nodes.size, solution.trajectory
-    sample, ahead = at(mesh.nodes), at(mesh.nodes[mesh.instants], "before")
-    at_controls = at(control_places(mesh.nodes, mesh.control))
+
+    def at(nodes: Array, *, before: bool = False) -> dict[str, Array]:
+        places = _places(nodes, duration, solution, elapsed)
+        z = dense.at(solution.mesh.placed(places), before=before)
+        u = solution.controls_at(places * solution.duration, before=before)
+        return {"state": z[:, : t.x.shape[1]], "control": u, "matrix": z[:, t.x.shape[1] :]}
+
+    sample = at(mesh.nodes)
+    ahead = at(mesh.nodes[mesh.instants], before=True) if mesh.instants else sample
+    if mesh.control != "linear":
+        sample["control"] = at(control_places(mesh.nodes, mesh.control))["control"]
     gain = free_gain_block(statement) if solution.loop is not None else None
-    others = {(b.name, b.kind, b.size) for b in solution.blocks}
+    others = {(b.name, b.kind, b.size): b for b in solution.blocks}
     if matched:  # nothing of it stays
         x, u, e = (np.zeros((n, v.shape[1])) for n, v in ((sizes, t.x), (mesh.control_nodes, t.u), (sizes, t.e)))
     else:
         plain = own_start(statement, mesh, parameters).trajectory  # for what the solution does not know
         x, u, e = plain.x.copy(), plain.u.copy(), plain.e.copy()
     for block in (*statement.states, *statement.controls, *statement.matrices):
-        if (block.name, block.kind, block.size) not in others:
+        own = others.get((block.name, block.kind, block.size))
+        wanted = {"state": x, "control": u, "matrix": e}[block.kind]
+        if own is None:
             if block == gain:
                 nodes = mesh.nodes if gain.kind == "state" else control_places(mesh.nodes, mesh.control)
                 places = _places(nodes, duration, solution, elapsed)
-                (x if gain.kind == "state" else u)[:, gain.span] = gain_entries(statement, gain, solution, places)
+                wanted[:, block.span] = gain_entries(statement, gain, solution, places)
             continue
-        if block.kind == "state":
-            x[:, block.span] = sample[block.name].reshape(-1, block.size)
-        elif block.kind == "control":
-            u[:, block.span] = at_controls[block.name].reshape(-1, block.size)
-            if mesh.control == "linear":  # which may jump at an instant
-                u[mesh.instants, block.span] = ahead[block.name].reshape(-1, block.size)
-        else:
-            e[:, block.span] = pack(sample[block.name])
-            e[mesh.instants, block.span] = pack(ahead[block.name])
+        values = sample[block.kind][:, own.span]
+        if block.tangent:  # of unit length, which interpolation keeps up to its error
+            values = values / np.linalg.norm(values, axis=1, keepdims=True)
+        wanted[:, block.span] = values
+        jumps = block.kind == "matrix" or (block.kind == "control" and mesh.control == "linear")
+        if jumps and mesh.instants:
+            wanted[mesh.instants, block.span] = ahead[block.kind][:, own.span]
     if gain is not None and gain.name not in {b.name for b in solution.blocks}:
         e = simulate_matrices(statement, mesh, x, u, starts(statement, mesh, parameters)[1], duration, parameters)
     return Trajectory(x=x, u=u, e=e, duration=duration)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Graded, Options
 
@@ -35,7 +35,7 @@ def with_instants(statement: Statement, options: Options) -> Options:
     """
     if isinstance(options.grid, Graded):
         return _completed_grid(statement, options, options.grid)
-    nodes = np.unique(options.nodes())
+    nodes = distinct(options.nodes())
     asked = nodes.size - 1
     needed = _needed(statement, asked)
     if not needed.size:
@@ -53,12 +53,12 @@ def completed(statement: Statement, nodes: Array, asked: int | None = None) -> A
         nodes: rising.
         asked: number of intervals that the mesh was asked to have; None: those between the nodes.
     """
-    needed = _needed(statement, np.unique(nodes).size - 1 if asked is None else asked)
+    needed = _needed(statement, distinct(nodes).size - 1 if asked is None else asked)
     if not needed.size:
         return nodes
-    others = np.unique(nodes)
+    others = distinct(nodes)
     kept = others[~_near(others, needed) | (others == 0.0) | (others == 1.0)]
-    return np.sort(np.concatenate([np.union1d(kept, needed), statement.instants, statement.inside.thrice]))
+    return np.sort(np.concatenate([distinct(kept, needed), statement.instants, statement.inside.thrice]))
 
 
 def _completed_grid(statement: Statement, options: Options, grid: Graded) -> Options:
@@ -73,12 +73,12 @@ def _completed_grid(statement: Statement, options: Options, grid: Graded) -> Opt
 def _needed(statement: Statement, asked: int) -> Array:
     """Nodes that a mesh of so many intervals must have."""
     instants = np.array(statement.instants)
-    kinks = np.unique([place for own in statement.kinks if len(own) <= asked for place in own])
+    kinks = distinct([place for own in statement.kinks if len(own) <= asked for place in own])
     if not kinks.size:
         return instants
-    fixed = np.union1d(instants, [0.0, 1.0])
+    fixed = distinct(instants, [0.0, 1.0])
     kinks = kinks[~_near(kinks, fixed)]
-    return np.union1d(instants, kinks[np.diff(kinks, prepend=-1.0) > SAME])
+    return distinct(instants, kinks[np.diff(kinks, prepend=-1.0) > SAME])
 
 
 def _near(nodes: Array, places: Array) -> Any:
@@ -90,7 +90,7 @@ def _near(nodes: Array, places: Array) -> Any:
 
 def _spread(instants: Array, intervals: int) -> Array:
     """Nodes evenly spread between the instants, about as many intervals as asked for."""
-    ends = np.union1d(instants, [0.0, 1.0])
+    ends = distinct(instants, [0.0, 1.0])
     parts = [
         begin + (end - begin) * np.arange(count) / count
         for begin, end in pairwise(ends)

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import OutsideDomainError
+from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
@@ -314,8 +315,7 @@ def _terminal_slopes(statement: Statement) -> ca.Function:
     for conditions, weights in ((statement.end, end), (statement.path, path)):
         if conditions.size:
             value += ca.dot(weights, conditions.function(x, u, e, t, t, p))
-    slopes = [ca.densify(ca.gradient(value, symbol)) for symbol in (x, e)]
-    return ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes)
+    return ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes_by(value, (x, e)))
 
 
 def _fix(lower: Array, upper: Array, values: Array) -> None:

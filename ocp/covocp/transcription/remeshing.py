@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 from covocp.base.short_repr import short_repr
 
 # Parts of an interval, at most, and the share of it that a new one is at least: errors are not followed further.
@@ -53,7 +53,8 @@ def divided(nodes: Array, controls: Array, constant: bool) -> Array:
         controls: values there, (N + 1, nu), or of the intervals where they are constant over each, (N, nu).
         constant: which of both.
     """
-    own, first = np.unique(nodes, return_index=True)
+    first = np.flatnonzero(np.diff(nodes, prepend=-1.0))
+    own = nodes[first]
     span = np.ptp(controls, axis=0)
     change = np.abs(np.diff(controls, axis=0)) >= CHANGING * np.where(span > 0, span, np.inf)
     steep = np.zeros(nodes.size - 1, dtype=bool)
@@ -96,7 +97,7 @@ def remeshed(
     sums = _gathered(weights, owner, nodes)[owner]
     shares = np.where(sums > 0, weights / np.where(sums > 0, sums, 1.0), 1.0 / np.bincount(owner)[owner])
     levels = np.append(0.0, np.cumsum(parts[owner] * shares))
-    fixed = np.unique(np.concatenate([[0.0, 1.0], kept, *(jump.nodes for jump in jumps)]))
+    fixed = distinct([0.0, 1.0], kept, *(jump.nodes for jump in jumps))
     fixed = fixed[np.append(True, np.diff(fixed) > CLOSEST)]
     at = np.interp(fixed, ends, levels)
     result = [np.zeros(1)]
