@@ -168,6 +168,17 @@ def test_a_failed_iterate_is_kept_and_is_a_guess(tmp_path):
     assert solution.cost == pytest.approx(6.551062, rel=1e-5)
 
 
+@pytest.mark.parametrize("covariances", ["eliminated", "states"])
+def test_a_file_without_its_problem_is_a_guess_on_any_mesh(lag, tmp_path, covariances):
+    problem = unknown_lag.problem()
+    options = {"intervals": 97, "covariances": covariances}
+    loaded = co.load(lag.save(tmp_path / "lag.npz"))
+    near = co.Solver(problem, **options).solve(guess=loaded, iteration_limit=0, assess=False)
+    assert near.cost == pytest.approx(lag.cost, rel=1e-4)
+    assert near.stats["iterations"] == 0
+    assert solve(problem, guess=loaded, **options).cost == pytest.approx(lag.cost, rel=1e-5)
+
+
 def test_optimality_that_cannot_be_evaluated_does_not_keep_from_saving(lag, tmp_path):
     extremal = replace(lag.extremal, trajectory=replace(lag.trajectory, duration=float("nan")))
     broken = replace(lag, extremal=extremal, stored_optimality=None)

@@ -164,7 +164,7 @@ def _resampled(
     """The trajectory of a solution on another mesh, or of another problem; `matched`: nothing else is needed."""
     duration = _duration(statement, solution, elapsed)
     # matrices that the program does not hold tell their magnitudes and nothing more: they need not be integrated
-    dense = between_nodes(solution.extremal) if mesh.eliminated else solution.dense
+    dense = solution.stored_dense or (between_nodes(solution.extremal) if mesh.eliminated else solution.dense)
     sizes, t = mesh.nodes.size, solution.trajectory
 
     def at(nodes: Array, *, before: bool = False) -> dict[str, Array]:
