@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -176,6 +177,8 @@ def _made_ready(
         settings |= JIT
         meshes = tuple(replace(mesh, linear_solver=COMPILED_SOLVER) for mesh in meshes)
     settings = merged(settings, plugin_options or {})
+    if plugin == "ipopt" and not any(name.startswith("calc_") and settings[name] for name in settings):
+        settings["no_nlp_grad"] = True  # the slope of the Lagrangian by w and p, which nothing else asks for
     limit = max(LIMIT, LIMIT_PER_TOLERANCE * settings.get("ipopt", {}).get("tol", TOLERANCE))
     return meshes, settings, limited, limit
 
@@ -203,7 +206,7 @@ def _mention_slowness(pairs: list[tuple[Statement, Mesh]]) -> None:
 
 def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plugin: Given) -> None:
     """Refuse a plugin that is not there, and options that mean nothing to it."""
-    if not ca.has_nlpsol(plugin):
+    if not _is_there(plugin):
         raise ProblemError(
             "The NLP plugin is not there.",
             expected="a plugin of this CasADi, such as 'ipopt' or 'sqpmethod'",
@@ -223,6 +226,12 @@ def _check_options(tolerance: Given, max_iterations: Given, hessian: Given, plug
                 received=repr(value),
                 remedy=f"correct {name}=",
             )
+
+
+@cache
+def _is_there(plugin: str) -> bool:
+    """Whether this CasADi has an NLP plugin; asking it looks for files each time."""
+    return bool(ca.has_nlpsol(plugin))
 
 
 class ShootingSolver:

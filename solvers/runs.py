@@ -100,7 +100,9 @@ class Runs:
         known = [(g.multipliers, g.costates) for g in guesses if g.multipliers is not None and g.costates is not None]
         dual = len(known) == len(guesses)
         warm = dual and all(guess.warm for guess in guesses)
-        nlp, solver = self._build(parameters, trajectories, warm, progress.shown)
+        units = tuple(guess.scales for guess in guesses if guess.scales is not None)
+        known_units = units if len(units) == len(guesses) else None
+        nlp, solver = self._build(known_units, trajectories, parameters, warm, progress.shown)
         built = time.perf_counter()
         start = Start(w=nlp.pack(trajectories))
         if dual:
@@ -262,15 +264,17 @@ class Runs:
             return status
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
-    def _build(self, parameters: Arrays, trajectories: Trajectories, warm: bool, watched: bool) -> tuple[Program, Any]:
-        """The program, made at the first call, and its solver.
+    def _build(
+        self, units: Magnitudes | None, trajectories: Trajectories, parameters: Arrays, warm: bool, watched: bool
+    ) -> tuple[Program, Any]:
+        """The program, made at the first call, in these units or those of the trajectories, and its solver.
 
         Other plugins than Ipopt print their iterations where somebody watches that call.
         """
         if self._nlp is None:
             if not self._open and not watched:
                 self._settings = silent(self._plugin, self._settings)
-            self._transcribe(None, trajectories, parameters)
+            self._transcribe(units, trajectories, parameters)
         assert self._nlp is not None
         return self._nlp, self._solver(warm)
 

@@ -1,4 +1,4 @@
-"""What plain.py runs in its processes: a plain problem by covocp, by hand in CasADi, by rockit, by yapss."""
+"""What plain.py runs in its processes: a plain problem by covocp, by hand in CasADi, by rockit, maptor, yapss."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import contextlib
 import io
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -88,32 +90,47 @@ def hand(case: dict[str, Any]) -> dict[str, Any]:
 
 def hand_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
     """By hand, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
-    return _coarsest(hand, MESHES, case)
+    return hand({**case, "intervals": _coarsest("hand", MESHES, case)})
 
 
 def hand_until_settled(case: dict[str, Any]) -> dict[str, Any]:
     """By hand, on one mesh after the other until the cost no longer changes by what is asked for; all are timed."""
+    return _until_settled(hand, MESHES, case)
+
+
+def yapss_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
+    """By yapss, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
+    return yapss({**case, "intervals": _coarsest("yapss", POINTS, case)})
+
+
+def yapss_until_settled(case: dict[str, Any]) -> dict[str, Any]:
+    """By yapss, on one mesh after the other until the cost no longer changes by what is asked for; all are timed."""
+    return _until_settled(yapss, POINTS, case)
+
+
+def _coarsest(name: str, sizes: tuple[int, ...], case: dict[str, Any]) -> int:
+    """The coarsest mesh of the error that is asked for, else the last, found in another process: first solves count."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as other:
+        return other.submit(_exact_enough, name, sizes, case).result()
+
+
+def _exact_enough(name: str, sizes: tuple[int, ...], case: dict[str, Any]) -> int:
+    solve: Callable[[dict[str, Any]], dict[str, Any]] = globals()[name]
+    with contextlib.redirect_stdout(io.StringIO()):
+        return next((n for n in sizes if solve({**case, "intervals": n})["off"] <= case["refine"]), sizes[-1])
+
+
+def _until_settled(
+    solve: Callable[[dict[str, Any]], dict[str, Any]], sizes: tuple[int, ...], case: dict[str, Any]
+) -> dict[str, Any]:
     seconds, last = {"build": 0.0, "solve": 0.0}, np.inf
-    for n in MESHES:
-        found = hand({**case, "intervals": n})
+    for n in sizes:
+        found = solve({**case, "intervals": n})
         seconds = {name: seconds[name] + found[name] for name in seconds}
         if abs(found["cost"] - last) <= case["refine"] * abs(found["cost"]):
             break
         last = found["cost"]
     return {**found, **seconds}
-
-
-def yapss_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
-    """By yapss, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
-    return _coarsest(yapss, POINTS, case)
-
-
-def _coarsest(solve: Callable[[dict[str, Any]], dict[str, Any]], sizes: tuple[int, ...], case: Any) -> dict[str, Any]:
-    for n in sizes:
-        found = solve({**case, "intervals": n})
-        if found["off"] <= case["refine"] or n == sizes[-1]:
-            break
-    return solve({**case, "intervals": n})
 
 
 def rockit(case: dict[str, Any]) -> dict[str, Any]:
@@ -187,3 +204,41 @@ def yapss(case: dict[str, Any]) -> dict[str, Any]:
     with contextlib.redirect_stdout(io.StringIO()):
         solution = problem.solve()
     return _result(case, start, built, float(solution.objective), n, str(solution.nlp_info.ipopt_status))
+
+
+def maptor(case: dict[str, Any]) -> dict[str, Any]:
+    """By maptor: Legendre-Gauss-Radau collocation on meshes that refine themselves; its defaults but the tolerance."""
+    import maptor as tool
+
+    own = PLAIN[case["problem"]]
+    start = time.process_time()
+    problem = tool.Problem(case["problem"])
+    phase = problem.set_phase(1)
+    free = own.duration is FREE
+    end = phase.time(initial=0.0, final=(1e-3, 1e3) if free else own.duration).final
+    highest = [None if np.isinf(most) else (-1e6, most) for most in own.highest]
+    x = [
+        phase.state(f"x{i}", initial=first, final=last, boundary=most)
+        for i, (first, last, most) in enumerate(zip(own.initial, own.final, highest, strict=False))
+    ]
+    bounds = [(-1e6, 1e6) if np.isinf(low) else (low, high) for low, high in zip(own.lower, own.upper, strict=True)]
+    u = [phase.control(f"u{i}", boundary=limits) for i, limits in enumerate(bounds)]
+    phase.dynamics(dict(zip(x, own.rates(x, u), strict=True)))
+    problem.minimize(end if own.fastest else phase.add_integral(own.running(x, u)))
+    degrees = [5] * 4
+    phase.mesh(degrees, np.linspace(-1.0, 1.0, len(degrees) + 1))
+    line = [_guesses(own, np.linspace(0.0, 1.0, degree + 1)) for degree in degrees]
+    shares = np.linspace(0.0, 1.0, len(degrees) + 1)
+    states = [
+        _guesses(own, a + (b - a) * np.linspace(0.0, 1.0, degree + 1))[0]
+        for a, b, degree in zip(shares[:-1], shares[1:], degrees, strict=True)
+    ]
+    controls = [np.tile(line[0][1][:, None], (1, degree)) for degree in degrees]
+    phase.guess(states=states, controls=controls, initial_time=0.0, terminal_time=own.duration or own.guess)
+    options = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 500}
+    built = time.process_time()
+    tolerances = {"error_tolerance": case["refine"], "nlp_options": options, "show_summary": False}
+    with contextlib.redirect_stdout(io.StringIO()):
+        solution = tool.solve_adaptive(problem, **tolerances)
+    count = sum(len(entry["mesh_intervals"]) if "mesh_intervals" in entry else 0 for entry in solution.phases.values())
+    return _result(case, start, built, float(solution.status["objective"]), count, str(solution.status["message"]))

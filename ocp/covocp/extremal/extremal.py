@@ -18,6 +18,7 @@ from covocp.statement.conditions import Inside
 from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.nlp import Scales
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.trajectory import Multipliers, Trajectory, at_nodes
 
@@ -151,6 +152,7 @@ class Guess:
         costates: p and the costates of the half-vectors at the nodes that belong to them, or None.
         warm: whether it comes from a solution.
         tentative: whether there are others: a method that loses its way should stop.
+        scales: units of a program that is made for it; None: chosen by the trajectory.
     """
 
     trajectory: Trajectory
@@ -158,5 +160,6 @@ class Guess:
     costates: tuple[Array, Array] | None = None
     warm: bool = False
     tentative: bool = False
+    scales: Scales | None = None
 
     __repr__ = short_repr

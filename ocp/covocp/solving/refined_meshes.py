@@ -26,6 +26,7 @@ from covocp.solving.between_nodes import mention_between, more_points, worst_bet
 from covocp.statement.statement import Statement
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Graded, Mesh, Options
+from covocp.transcription.nlp import Scales
 from covocp.transcription.remeshing import HIDING, Jump, demand, divided, jumps_of, remeshed
 from covocp.transcription.stiffness import nominal_along
 
@@ -60,6 +61,7 @@ class Measured:
         cost: of all.
         least: relative error of the cost that the tolerance of the method leaves.
         error: estimated relative error of the cost; nan until it is measured.
+        scales: units of each phase, the same on all meshes; None until they are known.
     """
 
     options: tuple[Options, ...]
@@ -70,6 +72,7 @@ class Measured:
     cost: float
     least: float
     error: float = np.nan
+    scales: tuple[Scales, ...] | None = None
 
     __repr__ = short_repr
 

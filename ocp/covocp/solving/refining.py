@@ -26,6 +26,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Graded, Mesh, Options
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import stiffness
 
@@ -92,8 +93,10 @@ class ProblemRuns:
         assert isinstance(start.outcome, Outcome)
         solution = Solution.of(start.outcome, self.method, assess=False)
         guess = make_guess(self.statement, prepared.mesh, self.parameters, solution)
-        outcome = prepared.solve(self.parameters, guess, self.progress)
-        return self.measured(options[0], prepared, outcome, start.least)
+        trajectory = start.outcome.extremal.trajectory
+        scales = start.scales or (choose_scales(self.statement, start.meshes[0], trajectory, self.parameters),)
+        outcome = prepared.solve(self.parameters, replace(guess, scales=scales[0]), self.progress)
+        return replace(self.measured(options[0], prepared, outcome, start.least), scales=scales)
 
 
 def first_options(statement: Statement, options: Options, nominal: str, points: bool) -> Options:

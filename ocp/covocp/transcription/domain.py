@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from covocp.base.matrices import Array
@@ -11,6 +13,8 @@ from covocp.transcription.mesh import Mesh
 
 # By how much Ipopt widens bounds, of their size or of the scale of the variable.
 WIDENED = 1e-8
+# Points at which the model was asked that are remembered.
+REMEMBERED = 256
 
 
 def needs_exact_bounds(statement: Statement, mesh: Mesh, start: Array, e0: Array, parameters: Array) -> bool:
@@ -37,9 +41,16 @@ def needs_exact_bounds(statement: Statement, mesh: Mesh, start: Array, e0: Array
         for entries in (*bounded[:, None], bounded):
             beyond = point.copy()
             beyond[entries] = passed[entries]
-            if entries.size and not holds(statement, beyond[statement.nu :], beyond[: statement.nu], e0, parameters):
+            numbers = (beyond[statement.nu :], beyond[: statement.nu], e0, parameters)
+            if entries.size and not _holds(statement, *(values.tobytes() for values in numbers)):
                 return True
     return False
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _holds(statement: Statement, *numbers: bytes) -> bool:
+    """`holds` at a point given by its bytes: all meshes of a problem ask at the same ones."""
+    return holds(statement, *(np.frombuffer(values) for values in numbers))
 
 
 def holds(statement: Statement, x: Array, u: Array, e: Array, parameters: Array) -> bool:
