@@ -332,6 +332,12 @@ def test_hessian_can_be_chosen():
     assert exact.cost == pytest.approx(limited.cost, rel=1e-6)
 
 
+def test_multipliers_of_parameters_may_be_asked_of_ipopt():
+    """Which needs a function that is left out otherwise."""
+    cost = solve(lag().problem).cost
+    assert solve(lag().problem, plugin_options={"calc_lam_p": True}).cost == pytest.approx(cost, rel=1e-9)
+
+
 def test_plugin_options_reach_ipopt():
     solution = solve(lag().problem, plugin_options={"ipopt": {"max_iter": 1}}, allow_failure=True)
     assert solution.stats["iterations"] == 1

@@ -7,6 +7,8 @@ import pytest
 from problems import lag
 
 import covocp as co
+from covocp.models import mass_chain
+from covocp.solvers.ipopt import ShootingSolver
 
 
 def test_a_loop_without_assessment_finds_the_same_solutions():
@@ -37,3 +39,17 @@ def test_what_is_left_out_can_be_asked_for():
     again = solver.solve(guess=first, progress=False, assess=False)
     assert again.optimality.curvature == pytest.approx(first.optimality.curvature, rel=1e-3)
     assert again.optimality.stationarity < 1e-4
+
+
+def test_steps_of_a_large_covariance_are_looked_at_before_the_first_run(monkeypatch):
+    """A chain of 14 masses needs two steps an interval: found along the guess, the program is solved once."""
+    made = []
+    own = ShootingSolver.solve
+    monkeypatch.setattr(ShootingSolver, "solve", lambda self, *given: made.append(self.mesh) or own(self, *given))
+    solution = co.solve(mass_chain.problem(masses=14), intervals=50, progress=False)
+    assert [mesh.substeps for mesh in made] == [2]
+    halved = co.solve(mass_chain.problem(masses=14), intervals=50, substeps=4, progress=False)
+    assert solution.cost == pytest.approx(halved.cost, rel=1e-4)
+    made.clear()
+    co.solve(mass_chain.problem(masses=1), intervals=50, progress=False)
+    assert [mesh.substeps for mesh in made] == [1]

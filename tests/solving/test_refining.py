@@ -10,6 +10,8 @@ import pytest
 from scipy.integrate import quad
 
 import covocp as co
+from covocp.solving import refining
+from covocp.transcription import domain
 
 
 def rest_to_rest(**control: Any) -> co.Problem:
@@ -213,3 +215,22 @@ def test_what_does_not_go_together_is_refused():
 def test_what_is_not_solved_is_not_returned():
     with pytest.raises(co.SolveError):
         co.solve(rest_to_rest(), refine=1e-4, max_iterations=1, progress=False)
+
+
+def test_all_meshes_have_the_units_of_the_first_solution(monkeypatch):
+    """What is asked once for all of them: units, and whether the model holds beyond its bounds."""
+    asked = {"units": 0, "bounds": 0}
+
+    def counted(name, function):
+        def call(*given, **named):
+            asked[name] += 1
+            return function(*given, **named)
+
+        return call
+
+    monkeypatch.setattr(refining, "choose_scales", counted("units", refining.choose_scales))
+    monkeypatch.setattr(domain, "holds", counted("bounds", domain.holds))
+    solution = co.solve(rest_to_rest(), refine=1e-6, progress=False)
+    assert len(solution.stats["mesh_intervals"]) > 2
+    assert solution.cost == pytest.approx(2.0, rel=1e-6)
+    assert asked == {"units": 1, "bounds": 2}  # beyond both bounds of the control

@@ -16,7 +16,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_end, refined_run
 from covocp.transcription.mesh import Mesh, Options, with_substeps
 from covocp.transcription.scales import magnitudes
-from covocp.transcription.trajectory import Trajectory
+from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
 COARSE_MESH = 2e-4
@@ -150,6 +150,26 @@ def finer_steps(
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
+
+
+def steps_along(
+    statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array, options: Options, allowed: float
+) -> Options | None:
+    """`finer_steps` along a guess, whose matrices are made first: before a run that would be made again.
+
+    Args:
+        statement: a problem whose matrices are eliminated.
+        mesh: of the options.
+        guess: states where the segments start, and controls.
+        parameters: of the statement.
+        options: of the mesh.
+        allowed: largest change, relative to the range of each entry.
+    """
+    own = refined_run(statement, mesh, guess, parameters, parts=1)
+    trajectory = replace(guess, x=own.states, e=own.matrices)
+    multipliers = Multipliers.zero(statement, mesh)
+    along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=multipliers)
+    return finer_steps(along, options, allowed)
 
 
 def _moved(jumps: Array, x: Array) -> float:

@@ -29,7 +29,7 @@ from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Guess, Outcome, Prepared
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
-from covocp.extremal.mesh_error import OPTIMISED, finer_steps
+from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
@@ -56,6 +56,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.starts import own_start
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
@@ -77,6 +78,8 @@ WORSE = 1e-6
 # Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
+# Rows of a covariance from which on a look at the steps along the guess is cheaper than a run that is made again.
+LARGE = 16
 
 
 def check_problem(problem: Given) -> None:
@@ -154,6 +157,7 @@ class Solver:
         if refine is not None:
             self._options = refining.with_layers(self.statement, self._options, self.statement.values)
         self._own_steps = self._options.substeps == "auto" and refine is None
+        self._looked = False  # at the steps along the guess
         if nominal == "deterministic":  # the steps of what runs around it
             around = evaluation_mesh(self.statement, self._options, self.statement.values)
             self._options = replace(self._options, substeps=around.substeps)
@@ -264,6 +268,8 @@ class Solver:
                 if isinstance(guess, str):
                     outcome = self._multistart(guess, values, starts, seed, reporter)
                 else:
+                    if assess and guess is None and first is None:
+                        self._look_at_steps(values)
                     outcome, start = self._from_start(values, guess, first, reporter)
                     outcome = self._leave_saddle(outcome, values, reporter, start) if assess else outcome
                 outcome = self._unwound(outcome, values, reporter) if assess else outcome
@@ -319,6 +325,21 @@ class Solver:
                 break
         outcome = outcome if outcome.converged or best is None else self._tightened(outcome, values, best, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
+
+    def _look_at_steps(self, values: Array) -> None:
+        """Take shorter steps from the first run on where a large covariance needs them along the guess."""
+        mesh = self._prepared.mesh
+        large = mesh.eliminated and max((one.size for one in self._solved.matrices), default=0) >= LARGE
+        if self._looked or not self._own_steps or not large:
+            return
+        self._looked = True
+        guess = own_start(self._solved, mesh, values).trajectory
+        try:
+            finer = steps_along(self._solved, mesh, guess, values, self._options, OPTIMISED)
+        except RuntimeError:  # CasADi's, of a linear system that is singular there: the run tells
+            return
+        if finer is not None:
+            self._keep(finer, self._prepare(self._solved, finer, **self._own))
 
     def _tightened(self, failed: Outcome, values: Array, best: Solution, reporter: Progress) -> Outcome:
         """Solved by way of loosened limits of the spread, from the best gain; else as it failed."""

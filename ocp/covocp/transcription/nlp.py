@@ -54,7 +54,7 @@ class Rows:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NLP:
     """A transcribed problem: minimise f(w, p) subject to bounds on w and g(w, p); everything scaled.
 
@@ -142,11 +142,10 @@ class NLP:
             "ubg": ubg,
         }
 
-    def violations(self, g: Array, parameters: Array) -> dict[str, float]:
-        """Largest violation of each violated constraint, in its own unit, by name."""
-        bounds = self.bounds(parameters)
-        excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
-        excess = np.where(np.isfinite(g), excess, np.inf)
+    def violations(self, excess: Array, parameters: Array) -> dict[str, float]:
+        """Largest violation of each violated constraint, in its own unit, by name; from those of all rows, scaled."""
+        if not (excess > VIOLATION).any():
+            return {}
         result: dict[str, float] = {}
         fixed = ~np.isnan(self.statement.boundary_values(parameters)[1])
         offset = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +23,7 @@ Arrays = tuple[Array, ...]
 Trajectories = tuple[Trajectory, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Program:
     """Transcribed statements, with the rows that link the end of each to the start of the next.
 
@@ -130,7 +131,11 @@ class Program:
         yield from zip(self.parts, trajectories, self.filled(trajectories, parameters), strict=True)
 
     def bounds(self, parameters: Arrays) -> dict[str, Array]:
-        """Bounds of w and g (nlpsol's names) for these parameters."""
+        """Bounds of w and g (nlpsol's names) for these parameters, read-only; those of the last ones are kept."""
+        return _bounds(self, *(own.tobytes() for own in parameters))
+
+    def _made_bounds(self, parameters: Arrays) -> dict[str, Array]:
+        """The same, made."""
         found = [part.bounds(own) for part, own in zip(self.parts, parameters, strict=True)]
         for i, link in enumerate(self.links):
             part, entries = self.parts[i + 1], _linked(link, self.parts[i + 1]).get("link_e")
@@ -151,9 +156,12 @@ class Program:
     def violations(self, g: Array, parameters: Arrays) -> dict[str, float]:
         """Largest violation of each violated constraint, in its own unit, by name (of several parts with theirs)."""
         result: dict[str, float] = {}
+        bounds = self.bounds(parameters)
+        excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
+        excess = np.where(np.isfinite(g), excess, np.inf)
         for part, own, span in zip(self.parts, parameters, self._row_spans(), strict=True):
             prefix = f"{part.statement.name}: " if self.links else ""
-            result |= {prefix + name: value for name, value in part.violations(g[span], own).items()}
+            result |= {prefix + name: value for name, value in part.violations(excess[span], own).items()}
         values = g[g.size - sum(rows.lower.size for rows in self.link_rows) :]
         offset = 0
         for rows in self.link_rows:
@@ -230,6 +238,15 @@ class Program:
     def _row_spans(self) -> list[slice]:
         """The rows of g of each part."""
         return _consecutive([part.g.shape[0] for part in self.parts])
+
+
+@lru_cache(maxsize=2)
+def _bounds(program: Program, *parameters: bytes) -> dict[str, Array]:
+    """What each look at a point asks for: of the last programs and parameters, which are given by their bytes."""
+    made = program._made_bounds(tuple(np.frombuffer(own) for own in parameters))
+    for values in made.values():
+        values.flags.writeable = False
+    return made
 
 
 def alone(nlp: NLP) -> Program:
