@@ -216,29 +216,26 @@ def maptor(case: dict[str, Any]) -> dict[str, Any]:
     phase = problem.set_phase(1)
     free = own.duration is FREE
     end = phase.time(initial=0.0, final=(1e-3, 1e3) if free else own.duration).final
-    highest = [None if np.isinf(most) else (-1e6, most) for most in own.highest]
+    highest = [None if np.isinf(most) else (None, most) for most in own.highest]
     x = [
         phase.state(f"x{i}", initial=first, final=last, boundary=most)
         for i, (first, last, most) in enumerate(zip(own.initial, own.final, highest, strict=False))
     ]
-    bounds = [(-1e6, 1e6) if np.isinf(low) else (low, high) for low, high in zip(own.lower, own.upper, strict=True)]
+    bounds = [None if np.isinf(low) else (low, high) for low, high in zip(own.lower, own.upper, strict=True)]
     u = [phase.control(f"u{i}", boundary=limits) for i, limits in enumerate(bounds)]
     phase.dynamics(dict(zip(x, own.rates(x, u), strict=True)))
     problem.minimize(end if own.fastest else phase.add_integral(own.running(x, u)))
     degrees = [5] * 4
-    phase.mesh(degrees, np.linspace(-1.0, 1.0, len(degrees) + 1))
-    line = [_guesses(own, np.linspace(0.0, 1.0, degree + 1)) for degree in degrees]
-    shares = np.linspace(0.0, 1.0, len(degrees) + 1)
-    states = [
-        _guesses(own, a + (b - a) * np.linspace(0.0, 1.0, degree + 1))[0]
-        for a, b, degree in zip(shares[:-1], shares[1:], degrees, strict=True)
-    ]
-    controls = [np.tile(line[0][1][:, None], (1, degree)) for degree in degrees]
+    ends = np.linspace(0.0, 1.0, len(degrees) + 1)
+    phase.mesh(degrees, 2.0 * ends - 1.0)
+    parts = zip(ends[:-1], ends[1:], degrees, strict=True)
+    states = [_guesses(own, np.linspace(a, b, degree + 1))[0] for a, b, degree in parts]
+    controls = [np.tile(_guesses(own, ends)[1][:, None], (1, degree)) for degree in degrees]
     phase.guess(states=states, controls=controls, initial_time=0.0, terminal_time=own.duration or own.guess)
     options = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 500}
     built = time.process_time()
     tolerances = {"error_tolerance": case["refine"], "nlp_options": options, "show_summary": False}
     with contextlib.redirect_stdout(io.StringIO()):
         solution = tool.solve_adaptive(problem, **tolerances)
-    count = sum(len(entry["mesh_intervals"]) if "mesh_intervals" in entry else 0 for entry in solution.phases.values())
+    count = int(solution.phases[1]["mesh"]["num_intervals"])
     return _result(case, start, built, float(solution.status["objective"]), count, str(solution.status["message"]))
