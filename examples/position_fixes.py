@@ -19,7 +19,7 @@ ocp.measurement("speed", v, noise=0.02)  # all the time, white noise of this den
 ocp.measurement("fix", x, noise=0.04, every=4.0)  # at 4, 8 and 12 s, noise of this variance
 ocp.minimize_expected(running=0.5 * thrust**2, terminal=5.0 * (x - 10.0) ** 2 + 5.0 * v**2)
 
-solution = co.solve(ocp, intervals=60)
+solution = co.solve(ocp, intervals=60, tolerance=1e-9)
 print(solution)
 for time in (4.0, 8.0, 12.0):
     before, after = (solution.at(time, side)["E"][0, 0] ** 0.5 for side in ("before", "after"))

@@ -24,7 +24,7 @@ from covocp.solvers.reached import Magnitudes
 from covocp.solvers.runs import MAX_ITERATIONS, Runs, extremals
 from covocp.statement.chain import Chain
 from covocp.statement.statement import Statement
-from covocp.transcription.domain import needs_exact_bounds
+from covocp.transcription.domain import WIDENED, needs_exact_bounds
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import QUIET
@@ -160,6 +160,8 @@ def _made_ready(
             "print_level": 0,
             "sb": "yes",
             "tol": TOLERANCE if tolerance is None else tolerance,
+            # bounds that are passed by a share of themselves make the cost less, on every mesh
+            "bound_relax_factor": min(WIDENED, TOLERANCE if tolerance is None else tolerance),
             "max_iter": MAX_ITERATIONS if max_iterations is None else max_iterations,
             # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
             "fixed_variable_treatment": "make_parameter_nodual",

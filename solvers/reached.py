@@ -11,9 +11,10 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
 from covocp.base.short_repr import short_repr
-from covocp.transcription.nlp import Scales
+from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.scales import choose_scales, magnitudes
+from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
 SMALLEST_SHARE = 1e-6
@@ -198,7 +199,10 @@ def residuals(
         point.status != ACCEPTABLE
     )  # where not even its own tolerance is, an unstable plant makes any change look large
     if met and not bound and max(slope, rest, missed) > LIMIT * size:
-        size = max(size, VANISHING * _change(first, point.w, by_w, nlp.units(scales), parameters))
+        moved = _change(first, point.w, by_w, nlp.units(scales), parameters)
+        each = zip(nlp.each(trajectories, parameters), scales, strict=True)
+        own = np.sum([_change_at_nodes(*entry, units) for entry, units in each])
+        size = max(size, VANISHING * min(moved, float(own)))
     size = max(size, float(np.finfo(float).tiny))
     return Residuals(slope=slope / size, complementarity=rest / size, infeasibility=missed / size, violation=worst)
 
@@ -209,3 +213,31 @@ def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: 
     _, moved = first.cost(w + DISPLACEMENT * step, parameters)
     change = abs(float((moved - slope) @ step)) / DISPLACEMENT
     return change if np.isfinite(change) else 0.0
+
+
+def _change_at_nodes(part: NLP, t: Trajectory, parameters: Array, scales: Scales) -> float:
+    """The same of the costs at the nodes, where nothing is integrated; inf where no nominal enters the cost.
+
+    Along an unstable nominal all variables together change the cost by what they grow to, which says nothing of it.
+    """
+    st, count = part.statement, part.mesh.intervals + 1
+    if not st.nx or t.x.shape[0] != count:
+        return np.inf
+    u = at_nodes(t.u, count)
+    steps = [np.where(v < 0, -unit, unit) for v, unit in ((t.x, scales.x), (u, at_nodes(_rows(scales.u, t.u), count)))]
+    time, running = t.duration * part.mesh.nodes, st.rates.map(count)
+    costs = []
+    for share in (DISPLACEMENT, 0.0, -DISPLACEMENT):
+        x, v = t.x + share * steps[0], u + share * steps[1]
+        arguments = (x.T, v.T, t.e.T, time[None, :], t.duration, parameters)
+        rate = np.asarray(running(*arguments)[2].full()).ravel()
+        terminal = float(st.terminal(x[-1], t.e[-1], t.duration, parameters))
+        costs.append(float(np.trapezoid(rate, time)) + terminal)
+    change = abs(costs[0] - 2.0 * costs[1] + costs[2]) / DISPLACEMENT**2
+    roundoff = np.finfo(float).eps * max(map(abs, costs)) / DISPLACEMENT**2
+    return change if np.isfinite(change) and change > roundoff else np.inf
+
+
+def _rows(scales: Array, controls: Array) -> Array:
+    """Units of the controls, a row for each of their values."""
+    return np.broadcast_to(scales, controls.shape)

@@ -225,3 +225,29 @@ def test_slope_has_a_size_without_a_running_cost(method, dynamics):
 
 def test_minimum_time_by_the_gradient_method_is_stationary():
     assert solve(brachistochrone.problem(), method="gradient", intervals=50).optimality.stationarity < 1e-5
+
+
+def under_a_roof(roof: float, **jump: float) -> co.Problem:
+    """A mass over a distance of 1 in 1 s with the least energy: 12 where the roof is out of reach."""
+    ocp = co.Problem(1.0)
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.subject_to(v, upper=roof, name="roof")
+    ocp.minimize(running=u**2)
+    return ocp
+
+
+def test_the_form_of_the_controls_counts_beside_a_limit_that_is_never_reached():
+    """It was called 0 as soon as there was any condition along the path."""
+    solution = co.solve(under_a_roof(100.0), intervals=6, control="constant", progress=False)
+    assert solution.optimality.control_error == pytest.approx(solution.cost / 12.0 - 1.0, rel=1e-3)
+    assert solution.optimality.control_slope > 0.0
+
+
+def test_the_form_of_the_controls_is_not_told_where_a_limit_is_reached():
+    solution = co.solve(under_a_roof(1.3), intervals=6, progress=False)
+    assert solution.optimality.control_error is None
+    assert solution.optimality.control_slope is None
+    assert "piecewise form" not in str(solution)

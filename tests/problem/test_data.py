@@ -213,3 +213,11 @@ def test_data_at_the_end_are_those_of_the_duration(count):
     ocp.minimize(running=u**2, terminal=(x - last) ** 2)
     exact = np.interp(2.5, times, times**2) * 2.5 / 3.5
     assert co.solve(ocp, intervals=20, progress=False)[x][-1] == pytest.approx(exact, rel=1e-7)
+
+
+def test_data_that_end_a_little_early_are_told_by_how_much():
+    ocp = co.Problem(10.0)
+    with pytest.raises(co.ProblemError) as caught:
+        ocp.data("w", [0.0, 10.0 - 1e-9], [0.0, 1.0])
+    assert caught.value.expected == "times from 0 to 10 s"
+    assert caught.value.received == "times from 0 to 9.999999999 s"

@@ -168,3 +168,45 @@ def test_information_that_is_negative_at_the_start_is_refused():
     E = ocp.estimation_covariance()
     ocp.minimize(running=w, terminal=E[x, x])
     refused(lambda: solve(ocp, intervals=10), "information of 'm'")
+
+
+def two_sensors(**given: object) -> co.Problem:
+    """A mass whose place and speed may be measured."""
+    ocp = co.Problem(4.0)
+    x, v = ocp.state("x", initial=0.0, variance=0.1), ocp.state("v", initial=0.0, final=1.0, variance=0.2)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.1 * v, noise=0.01)
+    ocp.measurement("both", ca.vertcat(x, v), **given) if given else ocp.measurement("speed", v, noise=2.0)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[x, x])
+    return ocp
+
+
+@pytest.mark.parametrize("information", [[0.0, 0.5], np.diag([0.0, 0.5]), ca.DM([0.0, 0.5])])
+def test_a_sensor_of_no_information_is_one_that_is_not_there(information):
+    solution = co.solve(two_sensors(information=information), intervals=20, progress=False)
+    alone = co.solve(two_sensors(), intervals=20, progress=False)
+    assert solution.cost == pytest.approx(alone.cost, rel=1e-10)
+
+
+def test_no_information_at_all():
+    cost = co.solve(two_sensors(information=0.0), intervals=20, progress=False).cost
+    assert cost > co.solve(two_sensors(), intervals=20, progress=False).cost
+
+
+@pytest.mark.parametrize("refine", [1e-3, 1e-5])
+def test_meshes_refine_themselves_beside_a_sensor_that_is_switched(refine):
+    """The bound of zero is passed by no share of it: information that is negative means nothing."""
+    ocp = co.Problem(4.0)
+    x, w = ocp.state("x", initial=0.0, variance=1.0), ocp.control("w", lower=0, upper=1, guess=0.5)
+    ocp.dynamics(x, -0.2 * x, noise=0.3)
+    ocp.measurement("m", x, information=w / 0.1)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(ocp.integral(w), upper=1.0)
+    ocp.minimize(terminal=E[x, x])
+    # the last second: up to 3 s by the linear equation, then by the Riccati equation of one state
+    before = np.exp(-0.4 * 3.0) + 0.75 * (1.0 - np.exp(-0.4 * 3.0))
+    rate = solve_ivp(lambda _, e: -0.4 * e + 0.3 - e**2 / 0.1, (0.0, 1.0), [before], rtol=1e-11, atol=1e-13)
+    solution = co.solve(ocp, refine=refine, progress=False)
+    assert solution.cost == pytest.approx(rate.y[0, -1], rel=refine)

@@ -362,3 +362,65 @@ def test_without_information_nothing_is_fed_back_and_the_printout_says_so(measur
     assert f"{reason}" in text
     assert "nothing is fed back: the actual control is the nominal one" in " ".join(text.split())
     assert "gain C" not in text
+
+
+# --- plants that are very unstable ------------------------------------------------------------------------------------
+
+
+def pushed_away(duration):
+    """x'' = x/2 + u with noise, its place measured: the nominal of x(0) = 0 is zero, the cost is that of the noise."""
+    ocp = co.Problem(duration, name="pushed away")
+    x, v = ocp.state("x", initial=0.0, variance=1.0), ocp.state("v", initial=0.0, variance=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, 0.5 * x + u, noise=0.3)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize_expected(running=0.5 * u**2 + 0.5 * x**2)
+    return ocp
+
+
+def cost_of_the_noise(duration):
+    """1/2 (tr S(0) E(0) + int tr S Q + int tr E C' C), S and E by scipy."""
+    drift, input_, noise = np.array([[0.0, 1.0], [0.5, 0.0]]), np.array([[0.0], [1.0]]), np.diag([0.0, 0.3])
+    weight, seen = np.diag([1.0, 0.0]), np.diag([1.0, 0.0]) / 0.1
+
+    def back(_, s):
+        S = s.reshape(2, 2)
+        return (drift.T @ S + S @ drift + weight - S @ input_ @ input_.T @ S).ravel()
+
+    options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-12}
+    S = solve_ivp(back, (0.0, duration), np.zeros(4), dense_output=True, **options).sol
+
+    def ahead(t, values):
+        E, s = values[:4].reshape(2, 2), S(duration - t).reshape(2, 2)
+        rate = drift @ E + E @ drift.T + noise - E @ seen @ E
+        return np.append(rate.ravel(), np.trace(s @ noise) + np.trace(E @ s @ input_ @ input_.T @ s))
+
+    gathered = solve_ivp(ahead, (0.0, duration), np.append(np.eye(2).ravel(), 0.0), **options).y[4, -1]
+    return 0.5 * (np.trace(S(duration).reshape(2, 2)) + gathered)
+
+
+@pytest.mark.parametrize("duration", [20.0, 200.0])
+def test_an_unstable_plant_is_left_at_rest_however_long(duration):
+    """Changes grow by e^14 and e^141: by ten segments the nominal of what was called solved cost 5e-4 of all."""
+    solution = co.solve(pushed_away(duration), intervals=200, progress=False)
+    assert solution.cost == pytest.approx(cost_of_the_noise(duration), rel=2e-4)
+    assert solution.cost_terms["running"] < 1e-8 * solution.cost
+    assert np.abs(solution["u"]).max() < 1e-3
+
+
+def test_a_nominal_that_no_run_follows_has_no_classical_design():
+    """It was evaluated along its controls, ran away by roundoff, and was called the same but for roundoff, 2.5e90."""
+    solution = co.solve(pushed_away(200.0), intervals=200, progress=False)
+    assert "classical_cost" not in solution.stats
+    assert "so unstable that roundoff" in str(solution)
+    with pytest.raises(co.SolveError, match="so unstable that roundoff of its controls"):
+        co.solve(pushed_away(200.0), nominal="deterministic", intervals=200, progress=False)
+
+
+def test_controls_that_are_zero_are_stationary():
+    """All terms of H_u are zero but for roundoff: the slope counts by what it changes of the cost."""
+    solution = co.solve(pushed_away(5.0), progress=False)
+    assert np.abs(solution["u"]).max() < 1e-3
+    assert solution.cost_terms["running"] < 1e-7 * solution.cost
+    assert solution.optimality.stationarity < 1e-4

@@ -210,3 +210,37 @@ def test_parameters_by_name_and_by_symbol():
 def test_a_state_for_a_parameter():
     ocp = uncertain()
     co.Solver(ocp, intervals=10).solve({ocp.declarations.states[0].symbol: 1.0}, progress=False)
+
+
+def test_what_is_no_parameter_is_called_what_it_is():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    d, spent = ocp.decision("d", guess=1.0), ocp.integral(u**2, name="J")
+    ocp.minimize(running=u**2, terminal=(d - 2) ** 2 + spent)
+    for name, kind in (("d", "a decision"), ("J", "an integral"), ("x", "a state")):
+        with pytest.raises(co.ProblemError, match=f"'{name}' is {kind}, no parameter"):
+            co.solve(ocp, parameters={name: 2.0}, progress=False)
+
+
+def test_a_problem_without_unknowns_takes_no_means():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2)
+    with pytest.raises(co.ProblemError, match="means= was given something") as caught:
+        co.Solver(ocp, intervals=10).solve(means={"b": 1.0})
+    assert caught.value.expected == "one of none: the problem has nothing of that kind"
+
+
+def test_the_least_time_may_be_a_running_cost_of_one():
+    def problem(running: float) -> co.Problem:
+        ocp = co.Problem(co.Free(3.0, 0.5, 20.0))
+        x, u = ocp.state("x", initial=0.0, final=4.0), ocp.control("u", lower=-1, upper=1)
+        ocp.dynamics(x, u)
+        ocp.minimize(running=running)
+        return ocp
+
+    assert co.solve(problem(1.0), progress=False).duration == pytest.approx(4.0)
+    with pytest.raises(co.ProblemError, match="depends on nothing that can be chosen"):
+        co.solve(problem(0.0), progress=False)

@@ -144,3 +144,13 @@ def test_none_in_a_sequence_is_free():
     ocp.minimize(running=ca.sumsqr(u))
     solution = run(ocp)
     np.testing.assert_allclose(solution["x"], np.column_stack([solution.t, np.full(21, 3.0)]), atol=1e-7)
+
+
+def test_a_decision_has_a_guess_without_a_time():
+    """As many numbers as entries, which are near the number of intervals by chance."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    d = ocp.decision("d", 20, guess=np.ones(20))
+    ocp.minimize(running=u**2 + ca.sumsqr(d - 2))
+    assert co.solve(ocp, intervals=30, progress=False).cost == pytest.approx(1.0)

@@ -30,9 +30,9 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import evaluate_controls
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
+from covocp.solving.beside_classical import is_roundoff
 from covocp.solving.evaluation import evaluate
 from covocp.solving.once import solve
-from covocp.solving.solver import is_roundoff
 from covocp.transcription.first_guess import control_scale
 from covocp.transcription.mesh import Options
 

@@ -213,10 +213,12 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
     else:
         values = np.linalg.eigvalsh(numbers)
         largest = float(np.abs(values).max(initial=0.0))
+        alone = not np.count_nonzero(numbers - np.diag(np.diag(numbers)))  # each entry in a unit of its own
+        least = 0.0 if alone else 1e-14 * largest
         if values.size and values[0] < -1e-12 * largest:
             problem = f"is not positive semidefinite (smallest eigenvalue {values[0]:.6g})"
             problem = "is negative" if scalar else problem
-        elif definite and values.size and values[0] <= 1e-14 * largest:
+        elif definite and values.size and values[0] <= least:
             problem = "is zero" if scalar else f"is singular (smallest eigenvalue {values[0]:.6g})"
     if problem:
         number = f"a {'positive' if definite else 'nonnegative'} number"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked, standard_deviations
-from covocp.base.residuals import complementary
+from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
@@ -26,11 +26,16 @@ from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import model_symbols, repeated
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
+from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.stiffness import state_jacobian
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
+# A condition along the path is at its limit where it is closer than this, in its range or the limit itself.
+TOUCHED = 1e-4
+# A stationarity above which it is asked what it does to the cost.
+LARGE_SLOPE = 1e-5
 # Costs below this count as zero.
 NO_COST = 1e-12
 # Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
@@ -46,10 +51,12 @@ class Optimality:
     Attributes:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
             neighbourhood of a node), bounds' multipliers included; relative to the largest sum of the
-            absolute terms of H_u (or |H_uu| |u|, where more).
+            absolute terms of H_u (or |H_uu| |u|, where more); or, where that is less, to the slope that changes the
+            cost by a tenth if the controls change by their magnitudes all the time: what is zero has no terms.
         complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
             cost: a multiplier of a bound that is not active makes a slope look like none.
-        control_slope: root mean square of H_u at the nodes with free controls; of the order of the square of the
+        control_slope: root mean square of H_u at the nodes with free controls, None where a condition along the path
+            reaches its limit; of the order of the square of the
             interval for piecewise-linear controls; same normalisation.
         costate_difference: largest difference between the costates of the multipliers and those integrated backward,
             relative to the largest costate of each kind.
@@ -134,17 +141,16 @@ def assess(
         (slopes + _limit_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
     )
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
-    control_slope, control_error = 0.0, 0.0
-    if st.nu and free is not None:
+    control_slope, control_error = (None, None) if _path_acts(extremal) else (0.0, 0.0)
+    if st.nu and free is not None and control_slope is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
         free = free & ~_beside(extremal)[:, None]
-        if not st.path.size:
-            control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2)))
-            others = 0.0 if within is None else within.size
-            control_error = _control_error(extremal, costates, free[:-1] & free[1:], others)
+        control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2))) / scale
+        others = 0.0 if within is None else within.size
+        control_error = _control_error(extremal, costates, free[:-1] & free[1:], others)
     return Optimality(
-        stationarity=float(np.abs(residual).max(initial=0.0)) / scale if st.nu else 0.0,
-        control_slope=control_slope / scale,
+        stationarity=_stationarity(extremal, residual, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
+        control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
         transversality=_transversality(extremal, costates, values, within) if st.duration.free else None,
@@ -158,6 +164,29 @@ def assess(
         cost_identity=cost_identity,
         **_loop_identities(loop),
     )
+
+
+def _stationarity(extremal: Extremal, residual: Array, scale: float, others: float) -> float:
+    """The largest slope of the Lagrangian in units of the terms of H_u, or of the cost."""
+    value = float(np.abs(residual).max(initial=0.0)) / scale
+    if not LARGE_SLOPE < value < np.inf:
+        return value
+    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
+    changed = np.abs(residual).max(axis=0) * units * extremal.trajectory.duration
+    cost = VANISHING * (_absolute_cost(extremal) + others)
+    return min(value, float(changed.max()) / max(cost, np.finfo(float).tiny))
+
+
+def _path_acts(extremal: Extremal) -> bool:
+    """Whether a condition along the path reaches a limit: H_u is then no measure of the form of the controls."""
+    for conditions, place, values in extremal.inequalities():
+        for limits in (conditions.lower, conditions.upper) if place == "path" else ():
+            known = np.isfinite(limits)
+            limits = np.where(known, limits, 0.0)
+            near = np.abs(values - limits) <= TOUCHED * (np.ptp(values, axis=0) + np.abs(limits))
+            if (near & known).any():
+                return True
+    return False
 
 
 def complementarity(extremal: Extremal, others: float = 0.0) -> float:

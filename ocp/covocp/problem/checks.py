@@ -98,8 +98,8 @@ def find_name(symbol: Given, what: str, declared: list[Any], allowed: tuple[Any,
             return str(entry.name)
     names = [str(entry.name) for entry in allowed]
     raise ProblemError(
-        f"{what}() was given something that is not a symbol of this problem.",
-        expected="one of " + ", ".join(names),
+        f"{what} was given something that is not a symbol of this problem.",
+        expected="one of " + (", ".join(names) or "none: the problem has nothing of that kind"),
         received=str(symbol),
         remedy=spelling(symbol, names, "check the spelling; or pass the symbol that its declaration returned"),
     )

@@ -89,7 +89,7 @@ def _both_limits(label: str, lower: Given, upper: Given, equals: Given, size: in
 
 
 def check_place(label: str, at: Given) -> None:
-    """A place is one of three.
+    """A place that is no instant is one of three.
 
     Raises:
         ProblemError: it is none.
@@ -97,9 +97,9 @@ def check_place(label: str, at: Given) -> None:
     if not isinstance(at, str) or at not in PLACES:
         raise ProblemError(
             f"'{label}' has an unknown place.",
-            expected="at='path', 'initial' or 'final'",
+            expected="at='path', 'initial' or 'final', or an instant: a number of seconds",
             received=repr(at),
-            remedy="choose one of the three",
+            remedy="correct at=",
         )
 
 

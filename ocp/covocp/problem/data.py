@@ -101,8 +101,9 @@ def _check_covered(own: Declarations, name: str, times: Array) -> None:
     if times[0] > SAME * longest or times[-1] < longest * (1 - SAME):
         raise ProblemError(
             f"The data '{name}' do not cover the time of the problem.",
-            expected=f"times from 0 to {longest:g} s" + ("" if free is None else ", the upper bound of the duration"),
-            received=f"times from {times[0]:g} to {times[-1]:g} s",
+            expected=f"times from 0 to {longest:.15g} s"
+            + ("" if free is None else ", the upper bound of the duration"),
+            received=f"times from {times[0]:.15g} to {times[-1]:.15g} s",
             remedy="give values at both ends too: beyond its times a table knows nothing"
             + ("" if free is None else "; or lower the upper bound, Free(guess, lower, upper)"),
         )

@@ -123,7 +123,7 @@ def _by_name(what: str, weights: Expr, entries: Sequence[Any]) -> Any:
         name = name_of(key, symbols, tuple(sizes), missing_ok=True, sizes=sizes)
         entry = split_entry(name)
         if name in sizes or entry is None:
-            name = find_name(key, what, list(entries), tuple(entries))
+            name = find_name(key, f"{what}()", list(entries), tuple(entries))
             weight = density_matrix(name, word, value, sizes[name])
         else:
             name, k = entry

@@ -190,7 +190,8 @@ def _check_symbols(problem: Declarations, part: bool) -> None:
             )
     constants = {q.symbol.__hash__() for q in _all(problem.parameters, problem.unknowns)}
     constants.add(problem.time.__hash__())
-    if not part and all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
+    longer = problem.free_duration is not None and problem.cost is not None and not problem.cost[0].is_zero()
+    if not part and not longer and all(symbol.__hash__() in constants for symbol in ca.symvar(expressions[-1][1])):
         raise ProblemError(
             "The cost depends on nothing that can be chosen.",
             expected="a cost of states, controls, matrix states or the free duration",

@@ -57,7 +57,7 @@ def stated_noise(name: str, noise: Expr, information: Expr, size: int, *, sample
     if stated.is_constant():
         stated = ca.MX(ca.sparsify(ca.evalf(stated)))
     diagonal = ca.densify(ca.diag(stated))
-    if not stated.sparsity().is_diag():
+    if any(row != column for row, column in zip(*stated.sparsity().get_triplet(), strict=True)):  # zeros have none
         raise ProblemError(
             f"The information of the measurement '{name}' is not diagonal.",
             expected=f"a number or {size} numbers" if size > 1 else "a number",

@@ -17,7 +17,7 @@ from covocp.statement.statement import error_size
 
 def with_rate(own: Declarations, symbol: Given, rate: Given, noise: Given) -> Declarations:
     """The declarations with the rate of one of the symbols; arguments and errors as of `Problem.dynamics`."""
-    name = find_name(symbol, "dynamics", list(own.named), (*own.states, *own.matrices))
+    name = find_name(symbol, "dynamics()", list(own.named), (*own.states, *own.matrices))
     for state in own.states:
         if state.name == name:
             value = as_expression(name, "rate", rate, (state.size, 1))

@@ -202,7 +202,7 @@ def _by_name(given: Given, argument: str, kind: str, starts: Mapping[str, Start]
         )
     known, result = tuple(start.of for start in starts.values()), dict[str, Any]()
     for key, value in given.items():
-        name = find_name(getattr(key, "_stands_for", key), argument, list(known), known)
+        name = find_name(getattr(key, "_stands_for", key), f"{argument}=", list(known), known)
         if name in result:
             raise ProblemError(
                 f"{argument}= has two values of '{name}'.",

@@ -142,7 +142,7 @@ class Elsewhere:
                 )
         result = dict(parameters or {})
         for key, value in (means or {}).items():
-            name = find_name(key, "means", list(own.unknowns), own.unknowns)
+            name = find_name(key, "means=", list(own.unknowns), own.unknowns)
             if any(find_name_or_none(given, own.unknowns) == name for given in result):
                 raise ProblemError(
                     f"The mean of '{name}' is given twice.",

@@ -80,9 +80,9 @@ def solve_phases(
     if asked[0].refine is not None:
         own = adapted(method_options(method), own, asked[0].refine)
     guesses = of_each(chain, None if random is not None else guess)
-    for mesh_of_phase, entry in zip(asked, guesses, strict=True):
+    for statement, mesh_of_phase, entry in zip(chain.statements, asked, guesses, strict=True):
         if isinstance(entry, Mapping):
-            mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase)
+            mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase, statement)
     values = values_of(chain, {} if parameters is None else parameters)
     run = {"guess": guess, "parameters": parameters, **{name: v for name, v in given.items() if name != "refine"}}
     best = None if random is not None else best_gains(phases, guesses, _best_solver(asked, run))

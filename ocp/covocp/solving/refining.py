@@ -166,11 +166,7 @@ def adapted(known: dict[str, Any], own: dict[str, Any], refine: float) -> dict[s
         return {VIOLATION: share, **own}
     if "plugin" not in known or own.get("plugin", "ipopt") != "ipopt":
         return own
-    result = dict(own) if own.get("tolerance") is not None else {**own, "tolerance": share}
-    given = dict(own.get("plugin_options") or {})
-    # bounds that are passed by a share of themselves make the cost less on every mesh
-    inner = {"bound_relax_factor": min(1e-8, SOLVED * refine), **given.get("ipopt", {})}
-    return {**result, "plugin_options": {**given, "ipopt": inner}}
+    return dict(own) if own.get("tolerance") is not None else {**own, "tolerance": share}
 
 
 def unseen(own: dict[str, Any]) -> float:

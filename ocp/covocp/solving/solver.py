@@ -37,6 +37,7 @@ from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
+from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.decisions import bent_data, far_away
@@ -68,13 +69,8 @@ ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "paramet
 # Control intervals where none are asked for.
 INTERVALS = 100
 NOMINALS = ("combined", "deterministic")
-# Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
-# so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
-ROUNDOFF = 1e-10
 # Relative decrease of the cost from which on it is asked whether both are zero.
 SUSPICIOUS_GAIN = 0.5
-# Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
-WORSE = 1e-6
 # Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
@@ -174,7 +170,7 @@ class Solver:
         self._prepared = self._prepare(solved, self._options, **self._own)
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
-        mention_lengths(self.statement.guesses, self._options)
+        mention_lengths(self.statement.guesses, self._options, self.statement)
 
     @checked(
         progress=truth,
@@ -254,7 +250,7 @@ class Solver:
         if self._remade:
             self._keep(*self._first)
         if isinstance(guess, Mapping):
-            mention_lengths({str(key): value for key, value in guess.items()}, self._options)
+            mention_lengths({str(key): value for key, value in guess.items()}, self._options, self.statement)
         guess = later_of(guess, elapsed)
         title = self.statement.name or "solving"
         with evaluating(self.statement.name):
@@ -374,6 +370,10 @@ class Solver:
             if not shorter.converged:
                 break
             closed, options = shorter, finer
+        moved = drift(found.trajectory.x, closed.extremal)
+        if closed.converged and outcome.converged and not moved <= DRIFTED:
+            message = UNSTABLE.format(moved)
+            return replace(closed, converged=False, message=message, violations=outcome.violations)
         return replace(
             closed,
             converged=outcome.converged and closed.converged,
@@ -393,21 +393,21 @@ class Solver:
                 self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
             with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
-                classical = self._classical._solve_values(given)
+                classical, missing = self._classical._solve_values(given)
         except KeyboardInterrupt:
             message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
             raise Interrupted(message, solution=solution) from None
         except CovocpError as error:  # no deterministic cost: there is nothing to compare with
             return _noted(solution, **Classical(missing=str(error).partition("\n")[0]).counts)
-        if classical is None:
-            return _noted(solution, **Classical(missing="The problem without noise was not solved.").counts)
-        worse, excess = _is_worse(solution, classical), solution.cost - classical
+        if missing:
+            return _noted(solution, **Classical(missing=missing).counts)
+        worse, excess = is_worse(solution, classical), solution.cost - classical
         suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
         if suspicious and is_roundoff(excess, self.statement, self._options, given):
             return _noted(solution, **Classical(cost=classical, same=True).counts)
         if worse:  # stationary up to a tolerance only, or spurious: going on from there tells
             solution = self._continued(solution, given)
-            worse = _is_worse(solution, classical)
+            worse = is_worse(solution, classical)
         if worse:
             warn_user(
                 f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
@@ -432,14 +432,16 @@ class Solver:
             return solution
         return _noted(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
 
-    def _solve_values(self, values: Array) -> float | None:
-        """Cost of the classical design for stacked parameters; None where it was not found."""
+    def _solve_values(self, values: Array) -> tuple[float, str]:
+        """Cost of the classical design for stacked parameters, and why there is none."""
         with Progress("", show=False) as reporter:
             guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
             outcome = self._closed(from_starts(self._prepared, values, guesses, reporter)[0])
             if reporter.stop:
                 raise KeyboardInterrupt
-        return float(sum(outcome.cost_terms.values())) if outcome.converged else None
+        if outcome.converged:
+            return cost_of(outcome), ""
+        return np.nan, f"The problem without noise was not solved: {outcome.message}."
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
         """The best of the problem's own start and several random ones."""
@@ -549,19 +551,6 @@ class Solver:
             mention_doubts(solution)
             mention_limits(solution)
         return solution
-
-
-def _is_worse(solution: Solution, classical: float) -> bool:
-    """Whether a combined design costs more than the classical one, by more than the mesh leaves open."""
-    return bool(solution.cost - classical > (WORSE + solution.mesh_error) * abs(classical))
-
-
-def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
-    """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess."""
-    mesh = evaluation_mesh(statement, options, parameters)
-    start = make_guess(statement, mesh, parameters, None).trajectory
-    outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
-    return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
 
 
 def _noted(solution: Solution, **stats: Any) -> Solution:

@@ -12,6 +12,7 @@ from covocp.base.errors import warn_user
 from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
 from covocp.statement.names import chosen_entry
+from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -31,16 +32,18 @@ def mention_forgotten(problem: Problem) -> None:
         mention(problem.declarations)
 
 
-def mention_lengths(guesses: Mapping[str, Any], options: Options) -> None:
+def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Statement) -> None:
     """Warn of guesses that look like values at the nodes and have another number of them.
 
     Args:
         guesses: by name.
         options: of the mesh, graded or not.
+        statement: whose decisions have guesses without a time.
     """
+    decided = {block.name for block in statement.states if block.role != "moving"}
     known = {options.intervals, options.intervals + 1, options.nodes().size - 1, options.nodes().size}
     for name, guess in guesses.items():
-        if guess is None or callable(guess):
+        if guess is None or callable(guess) or name in decided:
             continue
         try:
             shape = real_numbers(guess).shape

@@ -178,9 +178,10 @@ def stacked_parameters(statement: Statement, given: Mapping[str, Any], base: Arr
 def _not_given(name: str, statement: Statement, some: bool) -> str:
     """What to do about a name that is no parameter, nor nearly one."""
     declared = "what is to change from solve to solve is declared by Problem.parameter"
-    kind = next((block.kind for block in statement.blocks if block.name == name), None)
-    if kind is not None:
-        return f"'{name}' is a {kind}, no parameter: {declared}"
+    block = next((block for block in statement.blocks if block.name == name), None)
+    if block is not None:
+        kind = block.kind if block.role == "moving" else block.role
+        return f"'{name}' is {'an' if kind[0] in 'aeiou' else 'a'} {kind}, no parameter: {declared}"
     return f"give one of these; {declared}" if some else declared
 
 

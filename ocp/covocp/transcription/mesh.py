@@ -20,6 +20,9 @@ from covocp.transcription.before_reading import waits
 from covocp.transcription.covariance_steps import StepKind
 
 ELIMINATED_SEGMENTS = 10
+# Logarithm of what a change may grow to within one of them. With e^17 a regulator of an unstable plant ended away from
+# its optimum: by any control the end of a segment moves further than a cost can tell.
+GROWTH = 5.0
 LARGEST_SUBSTEPS = 64
 # Entries of E and S up to which their step is written out in scalars where they are variables.
 SCALAR_ENTRIES = 12
@@ -269,12 +272,14 @@ class Stiffness:
             steps must resolve it too, they would damp it.
         decaying: of what does not grow: explicit steps that are too long for it end in nonsense.
         matrices: of the covariances, where they are stepped by Runge-Kutta.
+        growing: the largest real part, where it is positive.
     """
 
     nominal: float
     oscillating: float
     decaying: float
     matrices: float = 0.0
+    growing: float = 0.0
 
 
 def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffness: Stiffness) -> Mesh:
@@ -293,7 +298,10 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
     intervals = nodes.size - 1
     eliminated = _choose_eliminated(statement, options)
     if options.segments == "auto":
-        count = min(ELIMINATED_SEGMENTS, intervals) if eliminated and statement.matrices else intervals
+        count = intervals
+        if eliminated and statement.matrices:
+            grown = float(np.nan_to_num(intervals * stiffness.growing / GROWTH, posinf=intervals))
+            count = min(max(ELIMINATED_SEGMENTS, int(np.ceil(grown))), intervals)
     else:
         count = min(options.segments, intervals)
     if options.substeps == "auto":

@@ -66,6 +66,7 @@ def stiffness(statement: Statement, options: Options, parameters: Array, *, at_e
         oscillating=longest * _largest(rates[rates.real >= DAMPED * np.abs(rates)]),
         decaying=longest * _largest(rates[rates.real <= 0.0]),
         matrices=longest * matrices,
+        growing=longest * float(rates.real.max(initial=0.0)),
     )
 
 
@@ -89,6 +90,7 @@ def nominal_along(
         "nominal": sizes,
         "oscillating": np.where(rates.real >= DAMPED * sizes, sizes, 0.0),
         "decaying": np.where(rates.real <= 0.0, sizes, 0.0),
+        "growing": np.maximum(rates.real, 0.0),
     }
     first = np.clip(np.searchsorted(places, nodes[:-1], side="right") - 1, 0, places.size - 1)
     last = np.clip(np.searchsorted(places, nodes[1:]), 0, places.size - 1)
