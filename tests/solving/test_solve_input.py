@@ -244,3 +244,22 @@ def test_the_least_time_may_be_a_running_cost_of_one():
     assert co.solve(problem(1.0), progress=False).duration == pytest.approx(4.0)
     with pytest.raises(co.ProblemError, match="depends on nothing that can be chosen"):
         co.solve(problem(0.0), progress=False)
+
+
+def test_a_control_that_nothing_stops_is_named():
+    ocp = co.Problem(10.0)
+    v, u = ocp.state("v", initial=0.0), ocp.control("thrust")
+    ocp.dynamics(v, u - 0.1 * v)
+    ocp.minimize(running=-u)
+    with pytest.raises(co.SolveError, match=r"the control 'thrust' went to \S+ and has no upper bound"):
+        co.solve(ocp, progress=False)
+
+
+def test_how_many_intervals_there_may_be_is_told():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2)
+    with pytest.raises(co.ProblemError, match="'intervals'") as caught:
+        co.solve(ocp, intervals=10**10, progress=False)
+    assert caught.value.expected.endswith("at most 1e+07")

@@ -1,4 +1,4 @@
-"""What a run that failed says of its decisions and data: what went far away without a bound, what bends where."""
+"""What a run that failed says of what it could choose and of data: what went away without a bound, what bends where."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from covocp.base.matrices import Array
 from covocp.solution.solution import Solution
 from covocp.statement.statement import entry_names
 
-# A decision that moved by so many times its magnitude where no bound stops it has no end in sight.
-FAR = 1e6
+# A decision or a control (in any unit) that is so many times its magnitude where no bound stops it has no end in sight.
+FAR, FAR_CONTROL = 1e6, 1e12
 
 
 def far_away(solution: Solution) -> str:
-    """A line that names the decisions that went to where no bound stops them; "" where none did."""
+    """A line that names the decisions and controls that went to where no bound stops them; "" where none did."""
     statement = solution.statement
     if statement is None:
         return ""
-    found, x = [], solution.trajectory.x[0]
-    for block in (b for b in statement.states if b.role == "decision"):
-        scale: Array = statement.scales.get(block.name, np.ones(block.size))
-        bounds = [bound[block.span] for bound in statement.state_bounds]
-        for k, name in enumerate(entry_names((block,))):
-            value = float(x[block.span][k])
-            side = "upper" if value > 0 else "lower"
-            if not abs(value) <= FAR * scale[k] and not np.isfinite(bounds[int(value > 0)][k]):
-                found.append(f"the decision '{name}' went to {value:.3g} and has no {side} bound")
+    t, found = solution.trajectory, []
+    decided = [block for block in statement.states if block.role == "decision"]
+    for what, blocks, values, limits, far in (
+        ("decision", decided, t.x[:1], statement.state_bounds, FAR),
+        ("control", statement.controls, t.u, statement.control_bounds, FAR_CONTROL),
+    ):
+        for block in blocks:
+            scale: Array = statement.scales.get(block.name, np.ones(block.size))
+            bounds, own = [bound[block.span] for bound in limits], values[:, block.span]
+            for k, name in enumerate(entry_names((block,))):
+                value = float(own[np.argmax(np.abs(own[:, k])), k])
+                side = "upper" if value > 0 else "lower"
+                if not abs(value) <= far * scale[k] and not np.isfinite(bounds[int(value > 0)][k]):
+                    found.append(f"the {what} '{name}' went to {value:.3g} and has no {side} bound")
     listed = "; ".join(found)
     return f"\n  {listed}: the cost may fall with it without end, give its bounds." if found else ""
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from covocp.base.arguments import is_number
+from covocp.base.arguments import MOST, is_number
 from covocp.base.checks import as_number, is_whole
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import Given
@@ -520,7 +520,7 @@ def _whole(name: str, value: Given, expected: str = "1, 2, 3, ...") -> None:
     if not is_whole(value):
         raise ProblemError(
             f"The option '{name}' must be a positive whole number.",
-            expected=expected,
+            expected=f"{expected}, at most {MOST:.3g}",
             received=repr(value),
             remedy=f"correct {name}=",
         )
