@@ -49,7 +49,7 @@ def test_a_file_of_one_problem_is_no_file_of_phases(tmp_path: Path) -> None:
     one, two = co.Problem(1.0, name="one"), co.Problem(1.0, name="two")
     steered(one, two)
     path = co.solve(one, intervals=2, progress=False).save(tmp_path / "one.npz")
-    with pytest.raises(co.ProblemError, match="not a problem"):
+    with pytest.raises(co.ProblemError, match="holds the solution of one problem, 'one'"):
         co.load(path, co.Phases([one, two]))
 
 

@@ -153,6 +153,15 @@ def test_along_a_solution_on_another_mesh():
     assert fine.cost == pytest.approx(best.cost, rel=10 * best.mesh_error)
 
 
+def test_along_a_solution_on_so_many_intervals():
+    """They were ignored without a word; of a solution that is kept as it is they are refused."""
+    best = solve(drifted(), intervals=12)
+    fine = co.evaluate(drifted(), nominal=best, intervals=36)
+    assert fine.mesh.intervals == 36
+    assert fine.cost == co.evaluate(drifted(), nominal=best, grid=np.linspace(0, 1, 37)).cost
+    refused(lambda: co.evaluate(best, intervals=36), "keeps its nominal, mesh and parameters", "intervals=")
+
+
 def test_along_a_solution_of_another_problem():
     """The input that identifies best (chapter 5) is no good nominal: dearer than either design."""
     learning = solve(unknown_lag.problem(weight=0.1, final=1.0), intervals=100)

@@ -25,8 +25,7 @@ from covocp.solution.storage import SUFFIXES as FILES
 from covocp.solving.comparison import COMPARED
 from covocp.solving.methods import method_options
 from covocp.solving.random_starts import STARTS
-from covocp.solving.solver import INTERVALS
-from covocp.transcription.mesh import Options
+from covocp.transcription.mesh import INTERVALS, Options
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
 # Solutions and exit codes by problem and nominal: figures of one model share them.
@@ -294,7 +293,7 @@ def _solved(problem: Given, arguments: argparse.Namespace, nominal: Given = None
     try:
         if isinstance(nominal, Mapping):  # given, not solved for: only the mesh matters
             mesh = {name: value for name, value in options.items() if name in {f.name for f in fields(Options)}}
-            return co.evaluate(problem, nominal=nominal, intervals=arguments.intervals or INTERVALS, **mesh), 0
+            return co.evaluate(problem, nominal=nominal, intervals=arguments.intervals, **mesh), 0
         if nominal is not None:
             options["nominal"] = nominal
         solution = co.solve(

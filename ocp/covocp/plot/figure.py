@@ -48,6 +48,7 @@ START: dict[str, Any] = {"marker": "s", "markersize": 4.0, "markerfacecolor": "b
 ELLIPSE_WIDTH = 0.7
 PATH_MARGIN = 0.05  # of the range, on both sides
 BAND = 0.13  # opacity
+HATCH = "////"  # of bands that a probability asks to be inside limits: others show a spread
 NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
 # Curves that change by less than this share of their size are drawn as constants: what is left is a solver's tolerance.
 CONSTANT = 1e-5
@@ -322,7 +323,7 @@ def _legend(
         handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=f"± {widths}"))
     if any(curve.needed is not None for curve in curves):
         label = "must be inside the limits" if handles else "band: must be inside the limits"
-        handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, label=label))
+        handles.append(Patch(color="#555555", alpha=2 * BAND, linewidth=0, hatch=HATCH, label=label))
     if sigmas and any(panel.ellipses for panel in panels):
         handles.append(Line2D([], [], color="#555555", linewidth=ELLIPSE_WIDTH, label=f"ellipses of {widths}"))
     if any(panel.path for panel in panels):
@@ -364,7 +365,7 @@ def _draw(axes: Axes, panel: Panel, count: int, sigmas: tuple[float, ...]) -> No
                 axes.plot(curve.t, edge, color=line["color"], linewidth=0.5, alpha=0.7, drawstyle=style)
         if curve.needed is not None:
             low, high = curve.y - curve.needed[0], curve.y + curve.needed[1]
-            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0)
+            axes.fill_between(curve.t, low, high, color=line["color"], alpha=BAND, linewidth=0, hatch=HATCH)
             axes.plot(curve.t, np.column_stack([low, high]), color=line["color"], linewidth=0.5, alpha=0.7)
         axes.plot(curve.t, curve.y, drawstyle=style, **line)
     for ellipse in panel.ellipses:

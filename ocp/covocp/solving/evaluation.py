@@ -36,7 +36,7 @@ from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
 from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
 from covocp.transcription.grading import graded
-from covocp.transcription.mesh import Mesh, Options, control_places
+from covocp.transcription.mesh import INTERVALS, Mesh, Options, control_places
 from covocp.transcription.nlp import check_costs
 
 # Relative difference of rates or slopes above which the truth is another system.
@@ -57,7 +57,7 @@ def evaluate(
     *,
     nominal: Given = None,
     truth: Given = None,
-    intervals: Given = 100,
+    intervals: Given = None,
     parameters: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Solution | PhasesSolution:
@@ -73,8 +73,8 @@ def evaluate(
         truth: what the statistics really are, for a solution with an expected cost: a problem of the same symbols
             (its variances and noise densities count), or a dict of parameter name to value; of phases `Phases`, the
             noise of whose jumps counts too, or such a dict.
-        intervals: number of control intervals, where the nominal is not a solution; of phases that of each, or a list
-            of one for each.
+        intervals: number of control intervals; None: 100, along a solution its own mesh. Of phases that of each, or a
+            list of one for each.
         parameters: values of parameters other than the declared ones, by name.
         options: of the mesh, as in `solve`.
 
@@ -87,7 +87,7 @@ def evaluate(
         SolveError: a phase becomes NaN or inf along the nominal.
     """
     if isinstance(problem, (Solution, PhasesSolution)):
-        _check_kept(nominal, parameters, options)
+        _check_kept(nominal, intervals, parameters, options)
     if isinstance(problem, (Phases, PhasesSolution)):
         run = {"nominal": nominal, "truth": truth, "intervals": intervals, "parameters": parameters}
         return cast("PhasesSolution", later("solving.phases_evaluated").evaluate_phases(problem, **run, **options))
@@ -102,23 +102,23 @@ def evaluate(
     return _under(solution, truth)
 
 
-def _check_kept(nominal: Given, parameters: Given, options: dict[str, Any]) -> None:
+def _check_kept(nominal: Given, intervals: Given, parameters: Given, options: dict[str, Any]) -> None:
     """A solution is evaluated as it is.
 
     Raises:
         ProblemError: something else is given for it.
     """
-    if nominal is not None or options or parameters is not None:
+    if nominal is not None or options or parameters is not None or intervals is not None:
         raise ProblemError(
             "evaluate(solution) keeps its nominal, mesh and parameters.",
             expected="truth=... only",
-            received="nominal=, parameters= or options of the mesh",
+            received="nominal=, intervals=, parameters= or options of the mesh",
             remedy="evaluate the problem along the solution: evaluate(problem, nominal=solution)",
         )
 
 
 def _along(
-    problem: Problem, nominal: Given, intervals: int, parameters: Mapping[str, Any], options: dict[str, Any]
+    problem: Problem, nominal: Given, intervals: Given, parameters: Mapping[str, Any], options: dict[str, Any]
 ) -> Solution:
     """The problem along a nominal."""
     check_kind(problem, Problem, "evaluate(problem, nominal=...), or evaluate(solution, truth=...)")
@@ -141,8 +141,8 @@ def _along(
 
 def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> Options:
     """The mesh that is asked for, or that of a nominal which is a solution."""
-    given = Options(intervals=intervals, **_known(options))
-    if isinstance(nominal, Solution) and not options:
+    given = Options(intervals=INTERVALS if intervals is None else intervals, **_known(options))
+    if isinstance(nominal, Solution) and not options and intervals is None:
         own = nominal.mesh
         given = replace(given, grid=distinct(own.nodes), control=own.control)  # type: ignore[arg-type]
     return given

@@ -65,8 +65,15 @@ def load(path: str | Path, problem: Problem | Phases | None = None) -> Solution 
     solution = made(path, tree, from_tree)
     if problem is None:
         return solution
+    if isinstance(problem, Phases):
+        raise ProblemError(
+            f"The file holds the solution of one problem, '{solution.name}'.",
+            expected="the Problem that was solved",
+            received=kind_and_name(problem),
+            remedy="give it, or load without a problem",
+        )
     check_kind(problem, Problem, "give the problem that was solved, or load without one")
-    return attached(solution, problem.statement())  # type: ignore[union-attr]
+    return attached(solution, problem.statement())
 
 
 def _of_phases(solution: PhasesSolution, phases: Problem | Phases | None) -> PhasesSolution:

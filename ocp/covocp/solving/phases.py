@@ -18,14 +18,14 @@ from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
 from covocp.solving.methods import METHODS, method_options
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
-from covocp.solving.phases_given import INTERVALS, intervals_of, of_each, values_of
+from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.phases_runs import ChainRuns
 from covocp.solving.random_starts import multistart
 from covocp.solving.refining import FIRST, adapted, first_options
 from covocp.solving.unused import mention_lengths
 from covocp.statement.chain import Chain
-from covocp.transcription.mesh import Options
+from covocp.transcription.mesh import INTERVALS, Options
 
 BEST = "ipopt"  # solves phases with the best gain, from which others start
 

@@ -87,7 +87,7 @@ def _along(
     nominals = of_each(chain, nominal, "nominal")
     if isinstance(nominal, Mapping):  # a phase that is left out is given nothing
         nominals = [{} if entry is None else entry for entry in nominals]
-    counts = intervals_of(chain, intervals)
+    counts = [None] * len(chain.statements) if intervals is None else intervals_of(chain, intervals)
     asked = tuple(first_options(own, n, options) for own, n in zip(nominals, counts, strict=True))
     values = values_of(chain, {} if parameters is None else parameters)
     runs = run_all(chain, nominals, asked, values)

@@ -15,9 +15,9 @@ from covocp.solution.phases import PhasesSolution
 from covocp.statement.chain import Chain
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement
+from covocp.transcription.mesh import INTERVALS
 
 Arrays = tuple[Array, ...]
-INTERVALS = 100  # of each phase, where none are asked for
 TAKEN_BY = {"guess": "solve", "nominal": "evaluate"}
 
 

@@ -56,7 +56,7 @@ from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
-from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.mesh import INTERVALS, Mesh, Options, with_substeps
 from covocp.transcription.starts import own_start
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
@@ -66,8 +66,6 @@ UNMOVED = 1e-6
 ESCAPES = (1.0, -1.0)
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
-# Control intervals where none are asked for.
-INTERVALS = 100
 NOMINALS = ("combined", "deterministic")
 # Relative decrease of the cost from which on it is asked whether both are zero.
 SUSPICIOUS_GAIN = 0.5

@@ -19,6 +19,8 @@ from covocp.statement.statement import Statement
 from covocp.transcription.before_reading import waits
 from covocp.transcription.covariance_steps import StepKind
 
+# Control intervals where none are asked for.
+INTERVALS = 100
 ELIMINATED_SEGMENTS = 10
 # Logarithm of what a change may grow to within one of them. With e^17 a regulator of an unstable plant ended away from
 # its optimum: by any control the end of a segment moves further than a cost can tell.
@@ -74,7 +76,7 @@ class Graded:
 class Options:
     """Options of every shooting method, as the user gives them (`solve`); checked on construction."""
 
-    intervals: int = 100
+    intervals: int = INTERVALS
     control: Literal["linear", "constant"] = "linear"
     substeps: int | Literal["auto"] = "auto"
     grid: Any = None
