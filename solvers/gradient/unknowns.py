@@ -117,6 +117,7 @@ class Unknowns(ABC):
         """Largest relative violation of each group of inequalities."""
         return violation(iterate.penalty, self.weights)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what is too large to be squared is not small
     def measure(self, iterate: Iterate, linear: Linear) -> Measures:
         """Norms of the stop test, with the multiplier that makes the first of them least."""
         inverse = 1.0 / self.fixed_metric

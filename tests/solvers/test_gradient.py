@@ -364,3 +364,14 @@ def test_new_parameters_without_rebuilding() -> None:
     for alpha in (0.0, 1.0):
         solution = solver.solve({"terminal_weight": alpha}, progress=False)
         assert solution.cost == pytest.approx(noisy_integrator.exact(alpha).cost, abs=1e-10)
+
+
+def test_a_plant_that_runs_away_ends_as_an_error_without_numpy_telling_of_overflows() -> None:
+    ocp = co.Problem(200.0)
+    x, v = ocp.state("x", initial=0.0), ocp.state("v", initial=0.0)
+    u = ocp.control("u", guess=0.1)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, 2 * x + u)
+    ocp.minimize(running=u**2 + x**2)
+    with pytest.raises(co.SolveError):
+        co.solve(ocp, "gradient", max_iterations=10, progress=False)
