@@ -179,7 +179,7 @@ def _made_ready(
         settings |= JIT
         meshes = tuple(replace(mesh, linear_solver=COMPILED_SOLVER) for mesh in meshes)
     settings = merged(settings, plugin_options or {})
-    if plugin == "ipopt" and not any(name.startswith("calc_") and settings[name] for name in settings):
+    if plugin == "ipopt" and not any(str(name).startswith("calc_") and settings[name] for name in settings):
         settings["no_nlp_grad"] = True  # the slope of the Lagrangian by w and p, which nothing else asks for
     limit = max(LIMIT, LIMIT_PER_TOLERANCE * settings.get("ipopt", {}).get("tol", TOLERANCE))
     return meshes, settings, limited, limit
