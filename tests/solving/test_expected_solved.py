@@ -15,6 +15,8 @@ from scipy.integrate import solve_ivp
 import covocp as co
 from covocp.extremal.curvature import mass_matrix, smallest_curvature
 from covocp.models import unknown_lag
+from covocp.solving.beside_classical import is_roundoff
+from covocp.transcription.mesh import Options
 
 # 6.12 has a boundary layer at T.
 GRADED = graded(40)
@@ -416,6 +418,15 @@ def test_a_nominal_that_no_run_follows_has_no_classical_design():
     assert "so unstable that roundoff" in str(solution)
     with pytest.raises(co.SolveError, match="so unstable that roundoff of its controls"):
         co.solve(pushed_away(200.0), nominal="deterministic", intervals=200, progress=False)
+
+
+@pytest.mark.parametrize("duration", [5.0, 20.0, 40.0])
+def test_a_guess_that_runs_away_makes_no_cost_nothing(duration):
+    """Beside its cost, 6e11 after 20 s, half a percent of the optimal one was called roundoff."""
+    statement = pushed_away(duration).statement()
+    for share, nothing in ((5e-3, False), (1e-30, True)):
+        cost = share * cost_of_the_noise(duration)
+        assert is_roundoff(cost, statement, Options(intervals=100), statement.values) is nothing
 
 
 def test_controls_that_are_zero_are_stationary():

@@ -94,7 +94,7 @@ class Worth:
 
 
 @one_at_a_time
-def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **options: Any) -> Worth:
+def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = None, **options: Any) -> Worth:
     """Estimate what choosing the nominal together with filter and feedback gains over the classical design.
 
     Decisions keep the values of `nominal`, which must be given where there are any: what others gain comes on top.
@@ -102,7 +102,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int = 100, **op
     Args:
         problem: with an expected cost.
         nominal: the classical nominal, as in `evaluate`; None: from the deterministic cost.
-        intervals: number of control intervals.
+        intervals: number of control intervals; None: 100, along a solution its own mesh.
         options: of the mesh, as in `solve`.
 
     Returns:

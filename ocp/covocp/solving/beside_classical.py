@@ -14,6 +14,7 @@ from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Options
 from covocp.transcription.scales import magnitudes
+from covocp.transcription.stiffness import stiffness
 
 # A run along the controls of a nominal that leaves it by more than this, in magnitudes of the states, is another one.
 DRIFTED = 1e-3
@@ -41,8 +42,12 @@ def is_worse(solution: Solution, classical: float) -> bool:
 
 
 def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
-    """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess."""
+    """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess.
+
+    Without what that grows by where the nominal is unstable: beside e^(2 a T) everything would be nothing.
+    """
     mesh = evaluation_mesh(statement, options, parameters)
     start = make_guess(statement, mesh, parameters, None).trajectory
     outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
-    return abs(cost) <= ROUNDOFF * abs(sum(outcome.cost_terms.values()))
+    grown = stiffness(statement, options, parameters).growing / float(np.diff(options.nodes()).max())
+    return bool(abs(cost) <= ROUNDOFF * np.exp(-2.0 * grown) * abs(sum(outcome.cost_terms.values())))
