@@ -194,3 +194,10 @@ def test_without_a_deterministic_cost_a_nominal_is_given():
     found = co.worth(without_deterministic_cost(), nominal={"u": 0.2}, intervals=5)
     assert found.gain == 0.0  # a linear system: no nominal is better than another
     assert found.verdict.startswith("nothing to gain")
+
+
+def test_along_a_solution_its_mesh_is_kept_where_no_other_is_asked_for():
+    problem = linear_quadratic(2)
+    best = co.solve(problem, intervals=14, progress=False)
+    assert co.worth(problem, nominal=best).classical.mesh.intervals == best.mesh.intervals
+    assert co.worth(problem, nominal=best, intervals=21).classical.mesh.intervals != best.mesh.intervals
