@@ -29,6 +29,7 @@ mapped = [f"covocp.{name}.{inner}" for name in plain for inner in find_packages(
 passage = Extension(
     "covocp.passage._passage",
     ["ocp/covocp/passage/passage.c"],
+    depends=sorted(str(path) for path in Path("ocp", "covocp", "passage").glob("*.h")),
     py_limited_api=True,
     optional=True,  # without a compiler: `covocp.build_info()` says so
 )

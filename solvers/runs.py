@@ -15,6 +15,7 @@ from covocp.base.progress import Progress
 from covocp.base.residuals import VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
+from covocp.solvers.at_point import Nodes
 from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
@@ -81,6 +82,7 @@ class Runs:
         self._nlp: Program | None = None
         self._solvers: dict[bool, Any] = {}  # of the program, by whether they start from multipliers
         self._functions: Any = None  # the solver of it that was made first and has the functions of all
+        self._nodes: Nodes | None = None  # its functions, where they are had together
 
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
         """Run from these guesses, one for each part; the last iterate is returned whatever happens.
@@ -283,7 +285,7 @@ class Runs:
         self._nlp = self._build_program(scales, trajectories, parameters)
         if self._open:
             self._monitor = Monitor(self._nlp)
-        self._solvers, self._functions = {}, None
+        self._solvers, self._functions, self._nodes = {}, None, None
 
     def _solver(self, warm: bool) -> Any:
         """The solver for starts with multipliers, or without; other plugins than Ipopt have one for all."""
@@ -302,8 +304,13 @@ class Runs:
         nlp = self._nlp
         assert nlp is not None
         settings = {**self._settings, **functions}
-        if nlp.jacobian is not None and "jac_g" not in settings:
-            settings["jac_g"] = nlp.jacobian
+        problem: dict[str, Any] = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
+        if nlp.gradient is not None and self._open:  # slopes that are had together, in compiled code
+            self._nodes = self._nodes or Nodes(nlp)
+            problem, settings = self._nodes.problem, {**settings, **self._nodes.slopes}
+        elif nlp.jacobian is not None and "jac_g" not in settings:
+            outputs, names = [nlp.g, nlp.jacobian], (["x", "p"], ["g", "jac_g_x"])
+            settings["jac_g"] = ca.Function("nlp_jac_g", [nlp.w, nlp.p], outputs, *names)
         if self._monitor is not None:
             settings["iteration_callback"] = self._monitor
         if warm:
@@ -317,7 +324,7 @@ class Runs:
             }
             settings["ipopt"]["tol"] *= self._strictness
         try:
-            return ca.nlpsol("nlp", self._plugin, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+            return ca.nlpsol("nlp", self._plugin, problem, settings)
         except RuntimeError as error:
             raise ProblemError(
                 f"The NLP plugin '{self._plugin}' refuses its settings.",

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import Buffered
 from covocp.base.matrices import Array
+from covocp.solvers.at_point import AtPoint
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.reduced.condensed import Bounds, Layout, layout_of
 from covocp.solvers.reduced.curvature import Curvature, first_curvature
@@ -30,17 +30,10 @@ class Engine:
             most: iterations.
             monitor: that is told of each iteration.
         """
-        w, p = program.w, program.p
-        jacobian = program.jacobian
-        rows = jacobian(w, p)[1] if jacobian is not None else ca.jacobian(program.g, w)
         self._program, self._monitor = program, monitor
         self.tolerance, self._most = tolerance, most
-        outputs = [program.f, ca.densify(ca.gradient(program.f, w)), ca.densify(program.g), rows]
-        self._pattern = rows.sparsity()
-        self._full = Buffered(ca.Function("full", [w, p], outputs))
-        self._value = Buffered(ca.Function("value", [w, p], outputs[:1] + outputs[2:3]))
+        self._of = AtPoint(program)
         self._memory: Memory | None = None
-        self._last: tuple[bytes, tuple[Array, ...] | None] | None = None
         self._layout: tuple[bytes, Layout] | None = None
         self._stats: dict[str, Any] = {}
 
@@ -82,7 +75,7 @@ class Engine:
         limited = np.isfinite(bounds.lbx) | np.isfinite(bounds.ubx)
         key = np.concatenate([bounds.ubx > bounds.lbx, limited]).tobytes()
         if self._layout is None or self._layout[0] != key:
-            self._layout = key, layout_of(self._program, bounds, self._pattern)
+            self._layout = key, layout_of(self._program, bounds, self._of.pattern)
         return self._layout[1]
 
     def stats(self) -> dict[str, Any]:
@@ -91,33 +84,25 @@ class Engine:
 
     def get_function(self, name: str) -> Callable[[Array, Array], tuple[Any, Any]]:
         """Cost and slope ('nlp_grad_f'), or rows and their Jacobian ('nlp_jac_g'), at a point."""
-        first = {"nlp_grad_f": 0, "nlp_jac_g": 2}[name]
+        of_rows = {"nlp_grad_f": False, "nlp_jac_g": True}[name]
 
         def chosen(w: Array, p: Array) -> tuple[Any, Any]:
-            outputs = self._outputs(np.asarray(w, dtype=float), p)
+            outputs = self._of.full(np.asarray(w, dtype=float), p)
             if outputs is None:
                 raise RuntimeError("the model fails")
-            if first:
-                return ca.DM(outputs[2]), ca.DM(self._pattern, outputs[3])
-            return ca.DM(outputs[0]), ca.DM(outputs[1])
+            cost, rows, slope, entries = outputs
+            return (ca.DM(rows), ca.DM(self._of.pattern, entries)) if of_rows else (ca.DM(cost), ca.DM(slope))
 
         return chosen
-
-    def _outputs(self, w: Array, p: Array) -> tuple[Array, ...] | None:
-        """Cost, slope, rows and the entries of their Jacobian at a point, the last one remembered; None: it fails."""
-        key = np.concatenate([w, p]).tobytes()
-        if self._last is None or self._last[0] != key:
-            self._last = key, self._full(w, p)
-        return self._last[1]
 
     def _at(self, layout: Layout, p: Array) -> Callable[[Array], Place | None]:
         """Everything at a point."""
 
         def full(w: Array) -> Place | None:
-            outputs = self._outputs(w, p)
+            outputs = self._of.full(w, p)
             if outputs is None or not all(np.isfinite(values).all() for values in outputs):
                 return None
-            cost, slope, g, entries = outputs
+            cost, g, slope, entries = outputs
             return Place(w=w, cost=float(cost[0]), slope=slope, g=g, jacobian=layout.slopes(entries))
 
         return full
@@ -126,7 +111,7 @@ class Engine:
         """Cost and rows at a point."""
 
         def value(w: Array) -> tuple[float, Array] | None:
-            outputs = self._value(w, p)
+            outputs = self._of.value(w, p)
             if outputs is None or not all(np.isfinite(values).all() for values in outputs):
                 return None
             return float(outputs[0][0]), outputs[1]
@@ -135,8 +120,8 @@ class Engine:
 
     def _slope(self, w: Array, p: Array) -> Array:
         """Slope of the cost; NaN where it has none."""
-        outputs = self._outputs(w, p)
-        return np.full(w.size, np.nan) if outputs is None else outputs[1]
+        outputs = self._of.full(w, p)
+        return np.full(w.size, np.nan) if outputs is None else outputs[2]
 
     def _first(self, layout: Layout, p: Array) -> Callable[[Place], Curvature]:
         (part,) = self._program.parts

@@ -198,4 +198,5 @@ def test_a_problem_without_the_library_has_the_same_solution(monkeypatch, seed, 
     assert fast.cost == pytest.approx(plain.cost, rel=1e-9)
     for name in ("state", "matrices"):
         own, other = (getattr(solution.costates, name) for solution in (fast, plain))
-        assert np.abs(own - other).max() <= 1e-5 * np.abs(other).max()
+        # where they are zero but for the tolerance of the run, 1e-7, they agree in nothing
+        assert np.abs(own - other).max() <= max(1e-5 * np.abs(other).max(), 1e-8 * abs(plain.cost))

@@ -7,6 +7,7 @@ import threading
 import casadi as ca
 import numpy as np
 import pytest
+from longer import in_long_double
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -62,37 +63,6 @@ def by_casadi(n: int, arguments: list[ca.MX]) -> ca.MX:
     return ca.Function("step", inputs, [after]).mapaccum("steps", STEPS)(*arguments)
 
 
-def solved(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """A^-1 B in long double arithmetic."""
-    A, B = A.copy(), B.copy()
-    for k in range(len(A)):
-        p = k + int(np.argmax(np.abs(A[k:, k])))
-        A[[k, p]], B[[k, p]] = A[[p, k]], B[[p, k]]
-        for i in range(len(A)):
-            if i != k:
-                share = A[i, k] / A[k, k]
-                A[i], B[i] = A[i] - share * A[k], B[i] - share * B[k]
-    return B / np.diag(A)[:, None]
-
-
-def in_long_double(E: np.ndarray, h1: np.ndarray, h2: np.ndarray) -> np.ndarray:
-    """The last covariance by the stages themselves: Y_i = Z0 + sum_j a_ij h H_j Y_j."""
-    n = len(E)
-    root = np.sqrt(np.longdouble(3.0))
-    a = np.array([[0.25, 0.25 - root / 6], [0.25 + root / 6, 0.25]], dtype=np.longdouble)
-    E = E.astype(np.longdouble)
-    for k in range(STEPS):
-        span = slice(2 * n * k, 2 * n * (k + 1))
-        H = [h1[:, span].astype(np.longdouble), h2[:, span].astype(np.longdouble)]
-        Z = np.vstack([np.eye(n, dtype=np.longdouble), E])
-        system = np.block([[(i == j) * np.eye(2 * n) - a[i, j] * H[j] for j in range(2)] for i in range(2)])
-        Y = solved(system, np.vstack([Z, Z]))
-        Z = Z + (H[0] @ Y[: 2 * n] + H[1] @ Y[2 * n :]) / 2
-        E = solved(Z[:n].T, Z[n:].T)
-        E = (E + E.T) / 2
-    return E
-
-
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
 @pytest.mark.parametrize(
     ("changes", "allowed"),
@@ -109,7 +79,7 @@ def test_last_covariance_in_longer_arithmetic(n, changes, allowed):
     E, h1, h2 = systems(n, n, **changes)
     arguments, passed = node(n)
     found = unpack(np.asarray(ca.Function("f", arguments, [passed])(pack(E), h1, h2).full()).T, n)
-    exact = in_long_double(E, h1, h2)
+    exact = in_long_double(E, h1, h2, steps=STEPS)
     deviation = np.sqrt(np.diag(exact))
     assert np.abs((found[-1] - exact) / np.outer(deviation, deviation)).max() < allowed
     assert np.linalg.eigvalsh(found).min() > 0

@@ -162,7 +162,8 @@ def density_matrix(name: str, what: str, value: Given, size: int) -> Any:
     if numbers.shape != (size, size):
         raise shape_error(name, what, expected, f"shape {numbers.shape}")
     check_density(name, what, numbers, definite=False)
-    return ca.MX(ca.DM(numbers))
+    full = ca.DM(numbers)
+    return ca.MX(ca.project(full, ca.Sparsity.diag(size) + ca.sparsify(full).sparsity()))
 
 
 def symmetric_data(name: str, what: str, value: Given, size: int, *, semidefinite: bool) -> Any:

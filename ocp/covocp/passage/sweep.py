@@ -14,6 +14,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.passage.library import functions
+from covocp.passage.ordering import ordering
 
 # Bytes of passages that are kept for the next call beside the last one.
 KEPT_BYTES = 50_000_000
@@ -77,8 +78,10 @@ def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, 
 def _pattern(points: Sequence[Expr], size: int) -> tuple[list[int], list[int]]:
     """Rows and columns, column by column, of what may be nonzero in some step."""
     united = ca.Sparsity(2 * size, 2 * size)
-    for point in points:
-        for part in ca.horzsplit(point.sparsity(), 2 * size):
+    for point in points if points[0].shape[1] else ():
+        whole, first = point.sparsity(), point[:, : 2 * size].sparsity()
+        same = whole == ca.repmat(first, 1, whole.shape[1] // (2 * size))
+        for part in (first,) if same else ca.horzsplit(whole, 2 * size):
             if part != united:
                 united = united + part
     return united.get_triplet()
@@ -136,6 +139,7 @@ class _Sweep(ca.Callback):
         self._read[list(reads)] = 1
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
         self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
+        self._ordering = ordering(size, *(list(part) for part in pattern))
         steps = self.moves * (10 * size * size + 2 * self.entries) + 2 * count * self.half
         readings = self.reads * (4 * size * size + 2 * height * (size + height) + self.telling)
         self.bytes = 8 * (steps + readings + 17 * size * size)
@@ -147,8 +151,10 @@ class _Sweep(ca.Callback):
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
         rows, columns = self._rows.ctypes.data, self._columns.ctypes.data
-        read = self._read.ctypes.data
-        memory = _library()["passage_new"](self._size, self.entries, rows, columns, self.count, self._height, read)
+        read, own = self._read.ctypes.data, self._ordering
+        order = [None] * 3 if own is None else [part.ctypes.data for part in (own.order, own.begins, own.columns)]
+        numbers = (self._size, self.entries, rows, columns, self.count, self._height, read)
+        memory = _library()["passage_new"](*numbers, *order)
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
@@ -214,9 +220,9 @@ class _Sweep(ca.Callback):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        given = self.padded([_address(argument) for argument in arguments])
+        given = self.padded([address(argument) for argument in arguments])
         memory = _WORKSPACES.take(self)
-        _library()["passage_forward"](memory, *given, _address(results[0]))
+        _library()["passage_forward"](memory, *given, address(results[0]))
         _WORKSPACES.give(self, memory)
         return 0
 
@@ -287,8 +293,8 @@ class _Slopes(_Derived):
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([_address(argument) for argument in arguments[:count]])
-        seeds, slopes = _address(arguments[count + 1]), [_address(result) for result in results]
+        given = sweep.padded([address(argument) for argument in arguments[:count]])
+        seeds, slopes = address(arguments[count + 1]), [address(result) for result in results]
         memory = _WORKSPACES.take(sweep)
         for k in range(self._directions):
             own = sweep.padded(sweep.direction(slopes, k))
@@ -321,10 +327,10 @@ class _Tangents(_Derived):
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([_address(argument) for argument in arguments[:count]])
-        moved = [_address(argument) for argument in arguments[count + 1 :]]
+        given = sweep.padded([address(argument) for argument in arguments[:count]])
+        moved = [address(argument) for argument in arguments[count + 1 :]]
         for k in range(self._tangents):
-            after = sweep.seed(_address(results[0]), k)
+            after = sweep.seed(address(results[0]), k)
             sweep.tangent(given, None, sweep.direction(moved, k), None, after, [None] * 5)
         return 0
 
@@ -343,10 +349,10 @@ class _MovedSlopes(_Derived):
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([_address(argument) for argument in arguments[:count]])
-        seeds = _address(arguments[count + 1])
-        moved = [_address(argument) for argument in arguments[2 * count + 2 : 3 * count + 2]]
-        moved_seeds, slopes = _address(arguments[-1]), [_address(result) for result in results]
+        given = sweep.padded([address(argument) for argument in arguments[:count]])
+        seeds = address(arguments[count + 1])
+        moved = [address(argument) for argument in arguments[2 * count + 2 : 3 * count + 2]]
+        moved_seeds, slopes = address(arguments[-1]), [address(result) for result in results]
         for t in range(self._tangents):
             along = sweep.direction(moved, t)
             for k in range(self._directions):
@@ -356,6 +362,6 @@ class _MovedSlopes(_Derived):
         return 0
 
 
-def _address(view: memoryview | None) -> int | None:
+def address(view: memoryview | None) -> int | None:
     """Where the numbers of CasADi's buffer lie; None: no numbers are given or wanted."""
     return None if view is None else int(np.frombuffer(view).ctypes.data)

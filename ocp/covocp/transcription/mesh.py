@@ -21,7 +21,9 @@ from covocp.transcription.covariance_steps import StepKind
 
 # Control intervals where none are asked for.
 INTERVALS = 100
-ELIMINATED_SEGMENTS = 10
+# Shooting segments where matrices are eliminated; where there are many states as few as these, about so many states at
+# the starts of all: an iteration of Ipopt takes as long as an evaluation there (chain of masses of 28 and 58 states).
+ELIMINATED_SEGMENTS, FEWEST_SEGMENTS, SEGMENT_STATES = 10, 5, 120
 # Logarithm of what a change may grow to within one of them. With e^17 a regulator of an unstable plant ended away from
 # its optimum: by any control the end of a segment moves further than a cost can tell.
 GROWTH = 5.0
@@ -303,7 +305,8 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
         count = intervals
         if eliminated and statement.matrices:
             grown = float(np.nan_to_num(intervals * stiffness.growing / GROWTH, posinf=intervals))
-            count = min(max(ELIMINATED_SEGMENTS, int(np.ceil(grown))), intervals)
+            usual = int(np.clip(SEGMENT_STATES // max(statement.nx, 1), FEWEST_SEGMENTS, ELIMINATED_SEGMENTS))
+            count = min(max(usual, int(np.ceil(grown))), intervals)
     else:
         count = min(options.segments, intervals)
     if options.substeps == "auto":

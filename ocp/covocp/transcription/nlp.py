@@ -60,7 +60,8 @@ class NLP:
 
     `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
     nodes (columns), the terminal time, running cost, terminal cost and g. `backward` maps them to the half-vectors at
-    the start of the matrices that run backward; None where none does.
+    the start of the matrices that run backward; None where none does. `gradient`, f and its slopes by w, and `jacobian`,
+    those of g, are there where CasADi's own take longer, else None.
     """
 
     statement: Statement
@@ -71,7 +72,8 @@ class NLP:
     f: Any
     g: Any
     rows: tuple[Rows, ...]
-    jacobian: ca.Function | None
+    gradient: tuple[Any, Any] | None
+    jacobian: Any
     evaluate: ca.Function
     backward: ca.Function | None = None
 

@@ -30,7 +30,8 @@ class Program:
     Minimise f(w, p) subject to bounds on w and g(w, p); everything scaled. `w` and `p` stack those of the parts, then
     the scale of the cost; `g` stacks those of the parts, then the links. Where matrices are eliminated the half-vectors
     at the start of a part are no variables: expressions of the part before stand for them among its parameters. What
-    runs backward in a part stands, at its start, among the parameters of the part before.
+    runs backward in a part stands, at its start, among the parameters of the part before. `gradient`, f and
+    its slopes by w, and `jacobian`, those of g, are there where CasADi's own take longer, else None.
     """
 
     parts: tuple[NLP, ...]
@@ -40,7 +41,8 @@ class Program:
     f: Any
     g: Any
     link_rows: tuple[Rows, ...]
-    jacobian: ca.Function | None
+    gradient: tuple[Any, Any] | None
+    jacobian: Any
 
     __repr__ = short_repr
 
@@ -251,7 +253,7 @@ def _bounds(program: Program, *parameters: bytes) -> dict[str, Array]:
 
 def alone(nlp: NLP) -> Program:
     """The program of one statement."""
-    common = {name: getattr(nlp, name) for name in ("w", "p", "f", "g", "jacobian")}
+    common = {name: getattr(nlp, name) for name in ("w", "p", "f", "g", "gradient", "jacobian")}
     return Program(parts=(nlp,), links=(), link_rows=(), **common)
 
 
@@ -292,11 +294,17 @@ def joined(chain: Chain, parts: tuple[NLP, ...]) -> Program:
     g = ca.vertcat(*(group for group, _ in groups))
     jacobian = None
     if any(is_dense and group.shape[0] for group, is_dense in groups):
-        blocks = ca.vertcat(*(ca.jacobian(group, w) for group, _ in groups))
-        jacobian = ca.Function("nlp_jac_g", [w, p], [g, blocks], ["x", "p"], ["g", "jac_g_x"])
-    rows = tuple(link_rows)
+        jacobian = ca.vertcat(*(ca.jacobian(group, w) for group, _ in groups))
     return Program(
-        parts=parts, links=chain.links, w=w, p=p, f=cost / cost_scale, g=g, link_rows=rows, jacobian=jacobian
+        parts=parts,
+        links=chain.links,
+        w=w,
+        p=p,
+        f=cost / cost_scale,
+        g=g,
+        link_rows=tuple(link_rows),
+        gradient=None,
+        jacobian=jacobian,
     )
 
 

@@ -67,10 +67,23 @@ def interval_columns(mesh: Mesh, u: Expr, duration: Expr, parameters: Expr) -> I
     return Interval(start, end, s, ds, ca.repmat(duration, 1, n), repeat(parameters, n), reading)
 
 
-def shoot(statement: Statement, mesh: Mesh, variables: Expr, *, passage: Passage = "plain") -> dict[str, Any]:
+def shoot(
+    statement: Statement,
+    mesh: Mesh,
+    variables: Expr,
+    *,
+    passage: Passage = "plain",
+    run: tuple[Any, Any, Any] | None = None,
+) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval.
 
-    `passage`: of eliminated matrices.
+    Args:
+        statement: the problem.
+        mesh: of it.
+        variables: of the NLP.
+        passage: of eliminated matrices.
+        run: what all segments give, where it is known: values at the ends of the intervals and of the substeps, running
+            cost of the intervals, a column each.
     """
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
     if not mesh.eliminated or statement.coupled:
@@ -78,12 +91,13 @@ def shoot(statement: Statement, mesh: Mesh, variables: Expr, *, passage: Passage
         advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
     else:
         start, advance = variables.x, nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = _segments(mesh, advance, start, intervals)
+    ends, fine, cost = _segments(mesh, advance, start, intervals) if run is None else run
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
     gaps = ends[:, last] - start[:, 1:]
     nx = statement.nx
-    result = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
+    result: dict[str, Any] = {"x": nodes[:nx, :], "gap_x": gaps[:nx, :], "gap_e": gaps[nx:, :], "cost": cost}
+    result["run"] = ends, fine, cost
     inside = _inside(mesh)
     if inside:
         result |= {"x_inside": fine[:nx, inside], "e_inside": fine[nx:, inside]}
@@ -97,6 +111,12 @@ def shoot(statement: Statement, mesh: Mesh, variables: Expr, *, passage: Passage
     if inside:
         result["e_inside"] = halves[:, inside]
     return result | {"e": at_nodes, "cost": cost + matrix_cost}
+
+
+def nominal_run(statement: Statement, mesh: Mesh, variables: Expr) -> tuple[Any, Any, Any]:
+    """What `run` of `shoot` is where the nominal runs alone."""
+    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+    return _segments(mesh, nominal_interval(statement, mesh.substeps, mesh.step), variables.x, intervals)
 
 
 def _inside(mesh: Mesh) -> list[int]:

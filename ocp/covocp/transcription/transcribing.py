@@ -17,7 +17,8 @@ from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.scales import limit_units
-from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, shoot
+from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
+from covocp.transcription.staged import Staged, is_staged, staged
 
 # Adjoint sweeps that a Jacobian takes at once.
 LARGEST_DIRECTIONS = 64
@@ -37,10 +38,9 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
     """
     variables = _Variables(statement, mesh, scales)
     passage = passage if compiled_steps(mesh) else "plain"
-    nodes = shoot(statement, mesh, variables, passage=passage)
-    running = ca.sum2(nodes["cost"])
-    last_x, last_e = nodes["x"][:, -1], nodes["e"][:, -1]
-    terminal = statement.terminal(last_x, last_e, variables.duration, variables.parameters)
+    along = _AlongRun(variables) if passage == "compiled" and is_staged(statement, mesh) else None
+    nodes = shoot(statement, mesh, variables, passage=passage) if along is None else along.nodes
+    running, terminal = _costs(variables, nodes)
     rows = _constraints(statement, mesh, scales, variables, nodes)
     g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
     p = ca.vertcat(variables.p)
@@ -49,6 +49,7 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
         seen = shoot(statement, mesh, variables, passage="dependence")
         depending = _dense(_constraints(statement, mesh, scales, variables, seen))
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
+    by_stages = None if along is None else _staged(variables, nodes)
     return NLP(
         statement=statement,
         mesh=mesh,
@@ -58,7 +59,8 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
         f=(running + terminal) / variables.cost_scale,
         g=g,
         rows=rows,
-        jacobian=_jacobian(variables, nodes, rows, g, depending),
+        gradient=None if along is None or by_stages is None else along.gradient(by_stages),
+        jacobian=_jacobian(variables, nodes, rows, depending, by_stages),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
         backward=_backward(statement, mesh, variables, p),
     )
@@ -254,27 +256,82 @@ def _dense(rows: tuple[Rows, ...]) -> Any:
     return ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows if entry.dense))
 
 
-def _jacobian(variables: _Variables, nodes: dict[str, Any], rows: tuple[Rows, ...], g: Expr, depending: Expr) -> Any:
-    """Jacobian of g where CasADi's own takes longer: continuity by intervals, dense rows by their own adjoint sweeps.
+def _staged(variables: _Variables, nodes: dict[str, Any]) -> Staged:
+    """The segments of the NLP by the stages of their steps."""
+    mesh, states = variables.mesh, (nodes["x"], nodes["run"][1])
+    intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+    return staged(variables.statement, mesh, states, intervals, variables.w, variables.x[:, :-1])
+
+
+class _AlongRun:
+    """What follows from the run of the nominal through all segments, as from something that is given."""
+
+    def __init__(self, variables: _Variables) -> None:
+        self._variables = variables
+        self._run = nominal_run(variables.statement, variables.mesh, variables)
+        names = ("ends", "fine", "cost")
+        self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
+        ends, fine, costs = self._given
+        self._nodes = shoot(
+            variables.statement, variables.mesh, variables, passage="compiled", run=(ends, fine, costs)
+        )
+
+    @property
+    def nodes(self) -> dict[str, Any]:
+        """What `shoot` returns, of the run itself."""
+        named = {name: value for name, value in self._nodes.items() if name != "run"}
+        own = [self._variables.w, self._variables.p]
+        function = ca.Function("after_run", [*own, *self._given], list(named.values()))
+        values = function.call([*own, *self._run], True, False)
+        return {**dict(zip(named, values, strict=True)), "run": self._run}
+
+    def gradient(self, by_stages: Staged) -> tuple[Any, Any]:
+        """The cost and its slopes: by what is given by CasADi, of the run by the stages."""
+        variables = self._variables
+        w, p, nx, n = variables.w, variables.p, variables.statement.nx, variables.mesh.intervals
+        cost: Any = sum(_costs(variables, self._nodes)) / variables.cost_scale
+        back = ca.Function("cost", [w, *self._given, p], [cost]).reverse(1)
+        slopes = back(w, *self._given, p, cost, 1.0)[:4]
+        after = ca.Function("cost_after_run", [w, p, *self._given], [cost, *map(ca.densify, slopes)])
+        value, by_w, by_ends, by_fine, by_costs = after(w, p, *self._run)
+        tall = nx * variables.mesh.substeps
+        seeds: Expr = ca.reshape(by_fine, tall, n) + ca.vertcat(ca.DM(tall - nx, n), by_ends)
+        return value, by_w + by_stages.cost_slopes(ca.densify(ca.reshape(seeds, *by_fine.shape)), by_costs)
+
+
+def _costs(variables: _Variables, nodes: dict[str, Any]) -> tuple[Any, Any]:
+    """Running and terminal cost."""
+    last_x, last_e = nodes["x"][:, -1], nodes["e"][:, -1]
+    terminal = variables.statement.terminal(last_x, last_e, variables.duration, variables.parameters)
+    return ca.sum2(nodes["cost"]), terminal
+
+
+def _jacobian(
+    variables: _Variables, nodes: dict[str, Any], rows: tuple[Rows, ...], depending: Expr, by_stages: Staged | None
+) -> Any:
+    """Jacobian of the rows where CasADi's own takes longer: continuity by intervals, dense rows by their own sweeps.
 
     Args:
         variables: of the NLP.
         nodes: values at them.
-        rows: of g; continuity of the states first, dense ones last.
-        g: stacked.
+        rows: continuity of the states first, dense ones last.
         depending: what depends on the variables as the dense rows do, where the sparsity of these cannot be seen.
+        by_stages: the segments, where they are differentiated by the stages of their steps.
 
     Returns:
-        (w, p) -> g, Jacobian; None where CasADi's own will do.
+        An expression; None where CasADi's own will do.
     """
-    dense, w, mesh = _dense(rows), variables.w, variables.mesh
-    chained = chains(variables.statement, mesh)
-    if not dense.shape[0] and not chained:
+    dense, w, mesh, statement = _dense(rows), variables.w, variables.mesh, variables.statement
+    chained = by_stages is None and chains(statement, mesh)
+    if not dense.shape[0] and not chained and by_stages is None:
         return None
     blocks, others = [], [entry.expression for entry in rows if not entry.dense]
-    if chained:
-        intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-        slopes = segment_slopes(variables.statement, mesh, nodes["x"], intervals, w, variables.x[:, :-1])
+    if by_stages is not None or chained:
+        if by_stages is not None:
+            slopes = by_stages.segment_slopes()
+        else:
+            intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
+            slopes = segment_slopes(statement, mesh, nodes["x"], intervals, w, variables.x[:, :-1])
         unscaled = slopes - ca.jacobian(ca.vec(variables.x[:, 1:]), w)
         blocks.append(ca.mtimes(ca.diag(ca.DM(1 / rows[0].scale)), unscaled))
         others = others[1:]
@@ -286,4 +343,4 @@ def _jacobian(variables: _Variables, nodes: dict[str, Any], rows: tuple[Rows, ..
         blocks.append(ca.project(by_w.T, pattern))
     elif dense.shape[0]:
         blocks.append(ca.jacobian(dense, w))
-    return ca.Function("nlp_jac_g", [w, variables.p], [g, ca.vertcat(*blocks)], ["x", "p"], ["g", "jac_g_x"])
+    return ca.vertcat(*blocks)

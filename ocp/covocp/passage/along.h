@@ -1,0 +1,240 @@
+/* Tangents of the passage, and of its slopes. */
+/* X' M = B solved in place, B (n x n); X' = P' L U. */
+INLINE void divide_transposed(const double *RESTRICT factor, const int *RESTRICT swaps, int n, double *RESTRICT B) {
+    for (int k = 0; k < n; ++k) {
+        if (swaps[k] != k)
+            for (int c = 0; c < n; ++c) {
+                const double kept = B[k * n + c];
+                B[k * n + c] = B[swaps[k] * n + c], B[swaps[k] * n + c] = kept;
+            }
+    }
+    for (int i = 1; i < n; ++i) add_rows(B + i * n, -1.0, factor + i * n, 1, B, n, i, n);
+    for (int i = n - 1; i >= 0; --i) {
+        double *RESTRICT own = B + i * n;
+        add_rows(own, -1.0, factor + i * n + i + 1, 1, B + (i + 1) * n, n, n - 1 - i, n);
+        const double inverse = 1.0 / factor[i * n + i];
+        for (int c = 0; c < n; ++c) own[c] *= inverse;
+    }
+}
+
+/* product += share H Y of a matrix H by its nonzeros, Y (2n x n). */
+INLINE void add_sparse(
+    const Passage *p, int n, double share, const double *RESTRICT h, const double *RESTRICT Y, double *RESTRICT product
+) {
+    for (int q = 0; q < p->nnz; ++q) {
+        const double weight = share * h[q];
+        double *RESTRICT own = product + p->row[q] * n;
+        const double *RESTRICT other = Y + p->col[q] * n;
+        for (int j = 0; j < n; ++j) own[j] += weight * other[j];
+    }
+}
+
+/* [top; E], top the identity or zero. */
+INLINE void stack(int n, int identity, const double *RESTRICT E, double *RESTRICT Z) {
+    memset(Z, 0, sizeof(double) * n * n);
+    for (int i = 0; identity && i < n; ++i) Z[i * n + i] = 1.0;
+    memcpy(Z + n * n, E, sizeof(double) * n * n);
+}
+
+/* The tangent of one step: dE becomes that after it; those of the stages and of X are kept. */
+INLINE void tangent_step(
+    Passage *p, int n, int k, const double *E, const double *next, const double *d1, const double *d2,
+    double *RESTRICT dE, double *RESTRICT spare
+) {
+    const int m = 2 * n, w = 3 * n;
+    const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
+    const double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n;
+    double *RESTRICT dY1 = p->moved + (size_t)k * 5 * n * n, *RESTRICT dY2 = dY1 + m * n, *RESTRICT dX = dY2 + m * n;
+    double *RESTRICT a = p->work, *RESTRICT Z = spare, *RESTRICT dZ = Z + m * n, *RESTRICT inner = dZ + m * n;
+    double *RESTRICT right = inner + m * n;
+    stack(n, 1, E, Z);
+    stack(n, 0, dE, dZ);
+    memcpy(right, dZ, sizeof(double) * m * n); /* the tangent of (I - g H2) Z0 - A Y1, Y1 held */
+    add_sparse(p, n, -GAP, h2, dZ, right);
+    add_sparse(p, n, -GAP, d2, Z, right);
+    add_sparse(p, n, 0.25, d1, Y1, right);
+    add_sparse(p, n, 0.25, d2, Y1, right);
+    memset(inner, 0, sizeof(double) * m * n);
+    add_sparse(p, n, 1.0, h1, Y1, inner);
+    add_sparse(p, n, -1.0 / 12.0, d2, inner, right);
+    memset(inner, 0, sizeof(double) * m * n);
+    add_sparse(p, n, 1.0, d1, Y1, inner);
+    add_sparse(p, n, -1.0 / 12.0, h2, inner, right);
+    memcpy(dY1, right, sizeof(double) * m * n);
+    if (!p->order || !solve_sparse(p, n, k, n, dY1)) {
+        solve_full(p, n, k, E, w, right, a);
+        for (int i = 0; i < m; ++i) memcpy(dY1 + i * n, a + i * w + m, sizeof(double) * n);
+    }
+    memcpy(inner, dY1, sizeof(double) * m * n); /* dV = (dY1 - g (dH1 Y1 + H1 dY1) - dZ0)/a */
+    add_sparse(p, n, -GAP, d1, Y1, inner);
+    add_sparse(p, n, -GAP, h1, dY1, inner);
+    for (int i = 0; i < m * n; ++i) inner[i] = (inner[i] - dZ[i]) / SHARE, dY2[i] = dY1[i] + 2.0 * GAP * inner[i];
+    memcpy(dX, inner, sizeof(double) * n * n);
+    product(next, dX, n, n, n, Z);
+    for (int i = 0; i < n; ++i) /* dE+ X = dY - E+ dX, transposed */
+        for (int j = 0; j < n; ++j) right[j * n + i] = dE[i * n + j] + inner[(n + i) * n + j] - Z[i * n + j];
+    divide_transposed(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, right);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) dE[i * n + j] = 0.5 * (right[i * n + j] + right[j * n + i]);
+}
+
+/* The tangent of what reading j does: dE becomes that after it; those of K, A and E+ are kept. */
+INLINE void tangent_reading(Passage *p, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
+    const int r = p->r;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *M = p->told + j * telling(p), *dM = d_told, *K = p->gain + j * tall, *A = p->keep + j * square;
+    const double *after = p->reached + j * square, *S = p->inverse + j * wide;
+    double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    double *one = aside(p), *two = one + tall, *three = two + tall, *noise = three + tall, *other = noise + wide;
+    double *spare = p->work, *more = spare + square;
+    spread(d_told + tall, r, noise); /* dR */
+    product(A, dE, n, n, n, spare);
+    product_turned(spare, A, n, n, n, dAfter); /* A dE A' */
+    product_turned(spare, M, n, n, r, one);    /* dK S = A dE M' + E+ dM' - K (dM E M' + dR) */
+    product_turned(after, dM, n, n, r, two);
+    for (size_t i = 0; i < tall; ++i) one[i] += two[i];
+    product(dM, E, r, n, n, three);
+    product_turned(three, M, r, n, r, other);
+    for (size_t i = 0; i < wide; ++i) other[i] += noise[i];
+    product(K, other, n, r, r, three);
+    for (size_t i = 0; i < tall; ++i) one[i] -= three[i];
+    product(one, S, n, r, r, dK);
+    product(K, noise, n, r, r, one); /* K dR K' - K dM E+ and its transpose */
+    product_turned(one, K, n, r, n, spare);
+    product_turned(K, two, n, r, n, more);
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c)
+            dAfter[i * n + c] += spare[i * n + c] - more[i * n + c] - more[c * n + i];
+    product(dK, M, n, r, n, dA);
+    product(K, dM, n, r, n, spare);
+    for (size_t i = 0; i < square; ++i) dA[i] = -dA[i] - spare[i];
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) dE[i * n + c] = 0.5 * (dAfter[i * n + c] + dAfter[c * n + i]);
+    memcpy(dAfter, dE, sizeof(double) * square);
+}
+
+/* Keep one part of a direction: whether it was the same before. */
+static int same(double **kept, const double *given, size_t count) {
+    double *own = *kept;
+    *kept += count;
+    if (!given || !memcmp(own, given, sizeof(double) * count)) return 1;
+    memcpy(own, given, sizeof(double) * count);
+    return 0;
+}
+
+/* Tangents along the passage, of the half-vectors after each step too; those along the last direction are known. */
+INLINE void tangents(
+    Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
+    const double *d_kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    double *kept = p->direction, *d_after = p->shifted;
+    int known = p->along == (d_kicks ? 2 : 1);
+    known &= same(&kept, d_first, half);
+    known &= same(&kept, d1, nnz * p->moves);
+    known &= same(&kept, d2, nnz * p->moves);
+    known &= same(&kept, d_told, telling(p) * p->reads);
+    known &= same(&kept, d_kicks, half * p->count);
+    if (known) return;
+    p->along = d_kicks ? 2 : 1;
+    double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
+    spread(p->first, n, E);
+    spread(d_first, n, dE);
+    for (int k = 0; k < p->count; ++k) {
+        const double *after = p->after + k * half;
+        spread(after, n, next);
+        if (p->known == 2)
+            for (int j = 0, t = 0; j < n; ++j)
+                for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - p->kicks[k * half + t];
+        const int place = p->place[k];
+        if (place < 0)
+            tangent_reading(p, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
+        else
+            tangent_step(p, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
+        spread(after, n, E);
+        if (d_kicks)
+            for (int j = 0, t = 0; j < n; ++j)
+                for (int i = j; i < n; ++i, ++t) {
+                    dE[i * n + j] += d_kicks[k * half + t];
+                    if (i != j) dE[j * n + i] += d_kicks[k * half + t];
+                }
+        for (int j = 0, t = 0; j < n; ++j)
+            for (int i = j; i < n; ++i, ++t) d_after[k * half + t] = dE[i * n + j];
+    }
+}
+
+/* How the slopes at reading j move: P and dP become those before it. */
+INLINE void back_reading_tangent(
+    Passage *p, int n, int j, double *RESTRICT P, double *RESTRICT dP, double *RESTRICT spare, double *d_by_told
+) {
+    const int r = p->r;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *K = p->gain + j * tall, *A = p->keep + j * square, *after = p->reached + j * square;
+    const double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    double *more = spare + square;
+    if (d_by_told) {
+        double *fed = aside(p), *moved = fed + tall, *other = moved + tall, *noise = other + tall, *part = noise + wide;
+        turned_product(K, P, r, n, n, fed); /* K' P+, and its tangent dK' P+ + K' dP+ */
+        turned_product(dK, P, r, n, n, moved);
+        turned_product(K, dP, r, n, n, other);
+        for (size_t i = 0; i < tall; ++i) moved[i] += other[i];
+        product(moved, K, r, n, r, noise);
+        product(fed, dK, r, n, r, part);
+        for (size_t i = 0; i < wide; ++i) noise[i] += part[i];
+        pack_noise(noise, r, d_by_told + tall);
+        product(moved, after, r, n, n, d_by_told);
+        product(fed, dAfter, r, n, n, other);
+        for (size_t i = 0; i < tall; ++i) d_by_told[i] = -2.0 * (d_by_told[i] + other[i]);
+    }
+    turned_product(A, dP, n, n, n, spare); /* A' dP+ A + A' P+ dA + its transpose */
+    product(spare, A, n, n, n, dP);
+    turned_product(A, P, n, n, n, spare);
+    product(spare, dA, n, n, n, more);
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) dP[i * n + c] += more[i * n + c] + more[c * n + i];
+    product(spare, A, n, n, n, P);
+}
+
+/* How the slopes of `back` move along the tangents. */
+INLINE void back_tangents(
+    Passage *p, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
+    double *d_by_told, double *d_by_kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
+    const int m = 2 * n;
+    double *P = p->work, *dP = P + n * n, *K = dP + n * n, *spare = K + n * n, *left = spare + m * n, *other = left + m * n;
+    memset(P, 0, sizeof(double) * 2 * n * n);
+    for (int at = p->count - 1; at >= 0; --at) {
+        const int k = p->place[at];
+        add_seed(n, seed + at * half, P);
+        if (d_seed) add_seed(n, d_seed + at * half, dP);
+        Slopes s = {0, 1, dP, NULL, NULL};
+        if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + at * half);
+        if (k < 0) {
+            back_reading_tangent(p, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
+            continue;
+        }
+        const double *moved = p->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
+        congruent(p, n, k, P, spare);
+        congruent(p, n, k, dP, spare);
+        memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
+        divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, n, K);
+        product(K, P, n, n, n, spare);
+        for (int i = 0; i < n; ++i)
+            for (int j = 0; j < n; ++j) dP[i * n + j] -= spare[i * n + j] + spare[j * n + i];
+        for (int stage = 0; stage < 2; ++stage) {
+            const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
+            double *out = stage ? d_by_h2 : d_by_h1;
+            if (!out) continue;
+            product(dY, P, m, n, n, left);
+            product(Y, dP, m, n, n, spare);
+            for (int i = 0; i < m * n; ++i) left[i] += spare[i];
+            at_nonzeros(p, n, n, left, Y, out + k * nnz);
+            product(Y, P, m, n, n, left);
+            at_nonzeros(p, n, n, left, dY, other);
+            for (size_t q = 0; q < nnz; ++q) out[k * nnz + q] += other[q];
+        }
+    }
+    Slopes s = {0, 1, dP, NULL, NULL};
+    if (d_by_first) pack_slopes(&s, n, spare, d_by_first);
+}

@@ -1,0 +1,203 @@
+/* Slopes, from the last step to the first. */
+/* M <- X^-1 M, M (n x r) row by row; X' = P' L U. */
+INLINE void divide(const double *RESTRICT factor, const int *RESTRICT swaps, int n, int r, double *RESTRICT M) {
+    for (int i = 0; i < n; ++i) {
+        const double inverse = 1.0 / factor[i * n + i];
+        double *RESTRICT own = M + i * r;
+        add_rows(own, -1.0, factor + i, n, M, r, i, r);
+        for (int c = 0; c < r; ++c) own[c] *= inverse;
+    }
+    for (int i = n - 2; i >= 0; --i)
+        add_rows(M + i * r, -1.0, factor + (i + 1) * n + i, n, M + (i + 1) * r, r, n - 1 - i, r);
+    for (int k = n - 1; k >= 0; --k)
+        if (swaps[k] != k)
+            for (int c = 0; c < r; ++c) {
+                const double kept = M[k * r + c];
+                M[k * r + c] = M[swaps[k] * r + c], M[swaps[k] * r + c] = kept;
+            }
+}
+
+/* -1/2 (J left) right' at the nonzeros, both (2n x r). */
+INLINE void at_nonzeros(
+    const Passage *p, int n, int r, const double *RESTRICT left, const double *RESTRICT right, double *RESTRICT slopes
+) {
+    for (int q = 0; q < p->nnz; ++q) {
+        const int i = p->row[q];
+        const double *RESTRICT one = left + (i < n ? i + n : i - n) * r, *RESTRICT other = right + p->col[q] * r;
+        slopes[q] = (i < n ? -0.5 : 0.5) * dot(one, other, r);
+    }
+}
+
+/* P += the slopes of one step's result. */
+INLINE void add_seed(int n, const double *RESTRICT seed, double *RESTRICT P) {
+    for (int j = 0, t = 0; j < n; ++j)
+        for (int i = j; i < n; ++i, ++t) {
+            P[i * n + j] += i == j ? seed[t] : 0.5 * seed[t];
+            if (i != j) P[j * n + i] += 0.5 * seed[t];
+        }
+}
+
+/* X^-1 P X^-T, symmetric. */
+INLINE void congruent(Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
+    const double *factor = p->factor + (size_t)k * n * n;
+    const int *swaps = p->swaps + (size_t)k * n;
+    divide(factor, swaps, n, n, P);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) spare[i * n + j] = P[j * n + i];
+    divide(factor, swaps, n, n, spare);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) P[i * n + j] = 0.5 * (spare[i * n + j] + spare[j * n + i]);
+}
+
+/* What follows has the slopes P as a matrix (few = 0) or as M C M' with few columns. */
+typedef struct {
+    int few, any;
+    double *P, *M, *C;
+} Slopes;
+
+INLINE void write_out(Slopes *s, int n, double *RESTRICT P) {
+    const int r = s->few;
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j <= i; ++j) {
+            double sum = 0.0;
+            for (int a = 0; a < r; ++a)
+                for (int b = 0; b < r; ++b) sum += s->M[i * r + a] * s->C[a * r + b] * s->M[j * r + b];
+            P[i * n + j] = P[j * n + i] = sum;
+        }
+}
+
+/* The slopes of one step's result join those of what comes after. */
+INLINE void join(Slopes *s, int n, const double *RESTRICT seed) {
+    const int half = n * (n + 1) / 2;
+    int asked = 0;
+    for (int t = 0; t < half && !asked; ++t) asked = seed[t] != 0.0;
+    if (!asked) return;
+    if (!s->any) {
+        int r = 0, *rows = (int *)s->C;
+        memset(s->P, 0, sizeof(double) * n * n);
+        for (int j = 0, t = 0; j < n; ++j)
+            for (int i = j; i < n; ++i, ++t) s->P[i * n + j] = s->P[j * n + i] = i == j ? seed[t] : 0.5 * seed[t];
+        memset(s->M, 0, sizeof(double) * n * n);
+        for (int i = 0; i < n; ++i) {
+            int used = 0;
+            for (int j = 0; j < n && !used; ++j) used = s->P[i * n + j] != 0.0;
+            if (used) rows[r++] = i;
+        }
+        s->any = 1;
+        s->few = 3 * r > n ? 0 : r;
+        if (!s->few) return;
+        for (int a = 0; a < r; ++a) s->M[rows[a] * r + a] = 1.0;
+        double *core = s->C + n; /* past the rows */
+        for (int a = 0; a < r; ++a)
+            for (int b = 0; b < r; ++b) core[a * r + b] = s->P[rows[a] * n + rows[b]];
+        memmove(s->C, core, sizeof(double) * r * r);
+        return;
+    }
+    if (s->few) write_out(s, n, s->P), s->few = 0;
+    add_seed(n, seed, s->P);
+}
+
+INLINE void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRICT half) {
+    double *P = s->P;
+    if (!s->any) {
+        memset(half, 0, sizeof(double) * n * (n + 1) / 2);
+        return;
+    }
+    if (s->few) write_out(s, n, P = spare);
+    for (int j = 0, t = 0; j < n; ++j)
+        for (int i = j; i < n; ++i, ++t) half[t] = i == j ? P[i * n + j] : P[i * n + j] + P[j * n + i];
+}
+
+/* Slopes before a step and by its H: few columns. */
+INLINE void back_few(Passage *p, int n, int r, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
+    double *RESTRICT y = spare, *RESTRICT weighted = spare + 2 * n * r;
+    divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, r, s->M);
+    for (int stage = 0; stage < 2; ++stage) {
+        double *out = stage ? s2 : s1;
+        if (!out) continue;
+        product((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, 2 * n, n, r, y);
+        for (int i = 0; i < 2 * n; ++i)
+            for (int c = 0; c < r; ++c) {
+                double sum = 0.0;
+                for (int q = 0; q < r; ++q) sum += y[i * r + q] * s->C[q * r + c];
+                weighted[i * r + c] = sum;
+            }
+        at_nonzeros(p, n, r, y, weighted, out);
+    }
+}
+
+/* The same with all of P. */
+INLINE void back_all(Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
+    congruent(p, n, k, s->P, spare);
+    for (int stage = 0; stage < 2; ++stage) {
+        const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n;
+        if (!(stage ? s2 : s1)) continue;
+        product(Y, s->P, 2 * n, n, n, spare);
+        at_nonzeros(p, n, n, spare, Y, stage ? s2 : s1);
+    }
+}
+
+/* Half-vector of slopes by a symmetric (r x r) matrix: both places move with one entry. */
+INLINE void pack_noise(const double *RESTRICT slope, int r, double *RESTRICT half) {
+    for (int j = 0, t = 0; j < r; ++j)
+        for (int i = j; i < r; ++i, ++t) half[t] = i == j ? slope[i * r + j] : slope[i * r + j] + slope[j * r + i];
+}
+
+/* Slopes before a reading and by what tells of it: few columns, or all of P. */
+INLINE void back_reading(Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
+    const int r = p->r, few = s->few;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n;
+    const double *K = p->gain + j * tall, *A = p->keep + j * square;
+    if (by_told) {
+        double *fed = aside(p), *seen = fed + tall;
+        double *P = s->P;
+        if (few) write_out(s, n, P = spare);
+        turned_product(K, P, r, n, n, fed); /* K' P+ */
+        product(fed, p->reached + j * square, r, n, n, by_told);
+        for (size_t i = 0; i < tall; ++i) by_told[i] *= -2.0;
+        product(fed, K, r, n, r, seen);
+        pack_noise(seen, r, by_told + tall);
+    }
+    if (few) {
+        turned_product(A, s->M, n, n, few, spare);
+        memcpy(s->M, spare, sizeof(double) * n * few);
+        return;
+    }
+    turned_product(A, s->P, n, n, n, spare);
+    product(spare, A, n, n, n, s->P);
+}
+
+INLINE void back(
+    Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
+    double *by_kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p);
+    double *spare = p->work + 5 * n * n;
+    Slopes s = {0, 0, p->work, p->work + n * n, p->work + 2 * n * n};
+    for (int at = p->count - 1; at >= 0; --at) {
+        const int k = p->place[at];
+        join(&s, n, seed + at * half);
+        if (by_kicks) pack_slopes(&s, n, spare, by_kicks + at * half);
+        if (k < 0) {
+            double *own = by_told ? by_told + (-1 - k) * tells : NULL;
+            if (s.any)
+                back_reading(p, n, -1 - k, &s, spare, own);
+            else if (own)
+                memset(own, 0, sizeof(double) * tells);
+            continue;
+        }
+        double *s1 = by_h1 ? by_h1 + k * nnz : NULL, *s2 = by_h2 ? by_h2 + k * nnz : NULL;
+        if (!s.any) {
+            if (s1) memset(s1, 0, sizeof(double) * nnz);
+            if (s2) memset(s2, 0, sizeof(double) * nnz);
+        } else if (!s.few)
+            back_all(p, n, k, &s, spare, s1, s2);
+        else if (s.few == 1)
+            back_few(p, n, 1, k, &s, spare, s1, s2);
+        else if (s.few == 2)
+            back_few(p, n, 2, k, &s, spare, s1, s2);
+        else
+            back_few(p, n, s.few, k, &s, spare, s1, s2);
+    }
+    if (by_first) pack_slopes(&s, n, spare, by_first);
+}

@@ -1,0 +1,192 @@
+/* Steps and readings forward. */
+/* I - (H1 + H2)/4 + H2 H1/12 beside I - g H2 (2n columns), or beside (I - g H2) Z0 (n columns).
+ *
+ * p->sizes: what each entry of the diagonal is summed from.
+ */
+INLINE void assemble(const Passage *p, int n, int k, const double *RESTRICT E, int w, double *RESTRICT a) {
+    const int m = 2 * n, nnz = p->nnz, transition = w == 2 * m;
+    const double *RESTRICT h1 = p->h1 + (size_t)k * nnz, *RESTRICT h2 = p->h2 + (size_t)k * nnz;
+    double *RESTRICT sizes = p->sizes;
+    memset(a, 0, sizeof(double) * m * w);
+    for (int i = 0; i < m; ++i) a[i * w + i] = sizes[i] = 1.0;
+    for (int i = 0; i < (transition ? m : n); ++i) a[i * w + m + i] = 1.0;
+    if (!transition)
+        for (int i = 0; i < n; ++i) memcpy(a + (n + i) * w + m, E + i * n, sizeof(double) * n);
+    for (int q = 0; q < nnz; ++q) {
+        const int r = p->row[q], c = p->col[q];
+        double *RESTRICT own = a + r * w;
+        const double share = h2[q] / 12.0, moved = -GAP * h2[q];
+        own[c] -= 0.25 * (h1[q] + h2[q]);
+        if (c == r) sizes[r] += 0.25 * fabs(h1[q] + h2[q]);
+        for (int t = p->begin[c]; t < p->begin[c + 1]; ++t) {
+            const double product = share * h1[p->which[t]];
+            own[p->across[t]] += product;
+            if (p->across[t] == r) sizes[r] += fabs(product);
+        }
+        if (transition || c < n)
+            own[m + c] += moved;
+        else
+            for (int j = 0; j < n; ++j) own[m + j] += moved * E[(c - n) * n + j];
+    }
+}
+
+/* The system of step k solved in a (2n x w): for its first stage, or for other right sides; with exchanges if need be. */
+INLINE void solve_full(
+    const Passage *p, int n, int k, const double *RESTRICT E, int w, const double *right, double *RESTRICT a
+) {
+    const int m = 2 * n, columns = w - m;
+    for (int exchanging = 0; exchanging < 2; ++exchanging) {
+        assemble(p, n, k, E, w, a);
+        for (int i = 0; right && i < m; ++i) memcpy(a + i * w + m, right + i * columns, sizeof(double) * columns);
+        if (exchanging)
+            eliminate(a, m, w, p->exchanged);
+        else if (eliminate_steady(a, m, w, p->sizes))
+            return;
+    }
+}
+
+/* V = ((I - g H1) Y1 - Z0)/a, of some columns. */
+INLINE void change(
+    const Passage *p, int n, int k, int columns, const double *RESTRICT Y1, const double *RESTRICT Z0, double *RESTRICT V
+) {
+    const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz;
+    memcpy(V, Y1, sizeof(double) * 2 * n * columns);
+    for (int q = 0; q < p->nnz; ++q) {
+        const double share = -GAP * h1[q];
+        double *RESTRICT own = V + p->row[q] * columns;
+        const double *RESTRICT y = Y1 + p->col[q] * columns;
+        for (int j = 0; j < columns; ++j) own[j] += share * y[j];
+    }
+    for (int i = 0; i < (Z0 ? n : 2 * n); ++i) V[i * columns + i] -= 1.0;
+    if (Z0)
+        for (int i = 0; i < n * n; ++i) V[n * n + i] -= Z0[i];
+    for (int i = 0; i < 2 * n * columns; ++i) V[i] *= 1.0 / SHARE;
+}
+
+/* D [I; E] of a (2n x 2n) matrix. */
+INLINE void applied(const double *RESTRICT D, const double *RESTRICT E, int n, double *RESTRICT product) {
+    for (int i = 0; i < 2 * n; ++i) {
+        double *RESTRICT own = product + i * n;
+        memcpy(own, D + i * 2 * n, sizeof(double) * n);
+        add_rows(own, 1.0, D + i * 2 * n + n, 1, E, n, n, n);
+    }
+}
+
+/* Whether a step measures so much that the covariance loses most of its size: then rounding of E itself would count. */
+static int measures_much(const Passage *p, int k, const double *E) {
+    const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
+    double information = 0.0, largest = 0.0;
+    for (int q = 0; q < p->nnz; ++q)
+        if (p->row[q] < p->n && p->col[q] >= p->n)
+            information = fmax(information, fmax(fabs(h1[q]), fabs(h2[q])));
+    for (int i = 0; i < p->n; ++i) largest = fmax(largest, E[i * p->n + i]);
+    return information * largest > MUCH;
+}
+
+/* One step: E (n x n) becomes the one after it; what slopes need is kept.
+ *
+ * [I; E] goes through the step as it is. Where much is measured the transition D itself is made, from which E's rounding
+ * is apart: the errors of D [I; E] stay in proportion to what they come from.
+ */
+INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
+    const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
+    double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
+    double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n, *RESTRICT Y2 = p->stage2 + (size_t)k * m * n;
+    double *RESTRICT factor = p->factor + (size_t)k * n * n;
+    int *swaps = p->swaps + (size_t)k * n;
+    double *RESTRICT stage = transition ? D : Y1;
+    if (!p->order || !sparse_stage(p, n, k, E, columns, stage)) {
+        solve_full(p, n, k, E, w, NULL, a);
+        for (int i = 0; i < m; ++i) memcpy(stage + i * columns, a + i * w + m, sizeof(double) * columns);
+    }
+    if (transition) { /* the second stage has the place of V meanwhile */
+        change(p, n, k, m, D, NULL, a);
+        applied(D, E, n, Y1);
+        applied(a, E, n, Y2);
+    } else
+        change(p, n, k, n, Y1, E, Y2);
+    /* X' E+ = Y', side by side */
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) {
+            b[i * m + j] = Y2[j * n + i] + (i == j);
+            b[i * m + n + j] = Y2[(n + j) * n + i] + E[j * n + i];
+        }
+    for (int i = 0; i < m * n; ++i) Y2[i] = Y1[i] + 2.0 * GAP * Y2[i];
+    eliminate(b, n, m, swaps);
+    for (int i = 0; i < n; ++i) memcpy(factor + i * n, b + i * m, sizeof(double) * n);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) E[i * n + j] = 0.5 * (b[i * m + n + j] + b[j * m + n + i]);
+}
+
+/* Where readings compute: past what steps use. */
+static double *aside(const Passage *p) { return p->work + 17 * (size_t)p->n * p->n + p->nnz; }
+
+/* What reading j does: E (n x n) becomes the one after it; what slopes need is kept. */
+INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
+    const int r = p->r, w = 2 * r + n;
+    const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
+    const double *M = p->told + j * telling(p), *half = M + tall;
+    double *K = p->gain + j * tall, *A = p->keep + j * square, *S = p->inverse + j * wide, *after = p->reached + j * square;
+    double *a = aside(p), *seen = a + (size_t)r * w, *R = seen + tall, *spare = p->work;
+    product(M, E, r, n, n, seen); /* M E */
+    product_turned(seen, M, r, n, r, S);
+    spread(half, r, R);
+    for (int i = 0; i < r; ++i) {
+        for (int c = 0; c < r; ++c) a[i * w + c] = S[i * r + c] + R[i * r + c], a[i * w + r + c] = i == c;
+        memcpy(a + i * w + 2 * r, seen + i * n, sizeof(double) * n);
+    }
+    eliminate(a, r, w, p->exchanged);
+    for (int i = 0; i < r; ++i) {
+        memcpy(S + i * r, a + i * w + r, sizeof(double) * r);
+        for (int c = 0; c < n; ++c) K[c * r + i] = a[i * w + 2 * r + c];
+    }
+    product(K, M, n, r, n, A);
+    for (size_t i = 0; i < square; ++i) A[i] = (i % (n + 1) == 0) - A[i];
+    product(A, E, n, n, n, spare);
+    product_turned(spare, A, n, n, n, after);
+    product(K, R, n, r, r, seen);
+    product_turned(seen, K, n, r, n, spare);
+    for (size_t i = 0; i < square; ++i) after[i] += spare[i];
+    for (int i = 0; i < n; ++i)
+        for (int c = 0; c < n; ++c) E[i * n + c] = 0.5 * (after[i * n + c] + after[c * n + i]);
+    memcpy(after, E, sizeof(double) * square);
+}
+
+/* Whether the passage at this point is known. */
+static int here(
+    const Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
+) {
+    const size_t half = sizeof(double) * p->n * (p->n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
+    if (!p->known || memcmp(p->first, first, half) || memcmp(p->h1, h1, all) || memcmp(p->h2, h2, all)) return 0;
+    if (p->reads && memcmp(p->told, told, sizeof(double) * telling(p) * p->reads)) return 0;
+    return kicks ? !memcmp(p->kicks, kicks, half * p->count) : p->known == 1;
+}
+
+INLINE void run(
+    Passage *p, int n, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
+) {
+    const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
+    if (here(p, first, h1, h2, told, kicks)) return;
+    p->known = p->along = 0;
+    memcpy(p->first, first, sizeof(double) * half);
+    memcpy(p->h1, h1, all);
+    memcpy(p->h2, h2, all);
+    if (p->reads) memcpy(p->told, told, sizeof(double) * telling(p) * p->reads);
+    if (kicks) memcpy(p->kicks, kicks, sizeof(double) * half * p->count);
+    double *E = p->work + 14 * n * n;
+    spread(first, n, E);
+    for (int k = 0; k < p->count; ++k) {
+        const int place = p->place[k];
+        if (place < 0)
+            reading(p, n, -1 - place, E);
+        else
+            step(p, n, place, E);
+        double *after = p->after + k * half;
+        for (int j = 0, t = 0; j < n; ++j)
+            for (int i = j; i < n; ++i, ++t) after[t] = E[i * n + j];
+        if (!kicks) continue;
+        for (size_t t = 0; t < half; ++t) after[t] += kicks[k * half + t];
+        spread(after, n, E);
+    }
+    p->known = kicks ? 2 : 1;
+}

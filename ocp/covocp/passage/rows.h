@@ -1,0 +1,140 @@
+/* Small dense matrices, row by row. */
+/* own += sign (sum of share_j B_j) over some rows B_j of B, four at a time; shares lie `step` apart, rows `wide`. */
+INLINE void add_rows(
+    double *RESTRICT own, double sign, const double *share, int step, const double *B, int wide, int rows, int columns
+) {
+    int j = 0;
+    for (; j + 4 <= rows; j += 4) {
+        const double a = sign * share[j * step], b = sign * share[(j + 1) * step], c = sign * share[(j + 2) * step],
+                     d = sign * share[(j + 3) * step];
+        if (a == 0.0 && b == 0.0 && c == 0.0 && d == 0.0) continue;
+        const double *RESTRICT one = B + j * wide, *RESTRICT two = one + wide, *RESTRICT three = two + wide,
+                     *RESTRICT four = three + wide;
+        for (int i = 0; i < columns; ++i) own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
+    }
+    for (; j < rows; ++j) {
+        const double a = sign * share[j * step];
+        if (a == 0.0) continue;
+        const double *RESTRICT one = B + j * wide;
+        for (int i = 0; i < columns; ++i) own[i] += a * one[i];
+    }
+}
+
+/* Columns `begin` to `end` of m rows made triangular with partial pivoting of whole rows of w entries. */
+INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, int *RESTRICT swaps) {
+    for (int k = begin; k < end; ++k) {
+        int pivot = k;
+        double largest = fabs(a[k * w + k]);
+        for (int i = k + 1; i < m; ++i) {
+            const double size = fabs(a[i * w + k]);
+            if (size > largest) largest = size, pivot = i;
+        }
+        swaps[k] = pivot;
+        if (pivot != k)
+            for (int j = 0; j < w; ++j) {
+                const double kept = a[k * w + j];
+                a[k * w + j] = a[pivot * w + j], a[pivot * w + j] = kept;
+            }
+        const double inverse = 1.0 / a[k * w + k];
+        for (int i = k + 1; i < m; ++i) {
+            double *own = a + i * w;
+            if (own[k] == 0.0) continue;
+            own[k] *= inverse;
+            for (int j = k + 1; j < end; ++j) own[j] -= own[k] * a[k * w + j];
+        }
+    }
+}
+
+/* The columns past the first m solved, which are triangular. */
+INLINE void solve_upper(double *RESTRICT a, int m, int w) {
+    for (int k = m - 1; k >= 0; --k) {
+        double *own = a + k * w;
+        add_rows(own + m, -1.0, own + k + 1, 1, own + w + m, w, m - 1 - k, w - m);
+        const double inverse = 1.0 / own[k];
+        for (int j = m; j < w; ++j) own[j] *= inverse;
+    }
+}
+
+/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps), the others solved. */
+INLINE void eliminate(double *RESTRICT a, int m, int w, int *RESTRICT swaps) {
+    for (int k = 0; k < m; k += 4) {
+        const int end = k + 4 < m ? k + 4 : m;
+        panel(a, m, w, k, end, swaps);
+        for (int i = k + 1; i < m; ++i)
+            add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, (i < end ? i : end) - k, w - end);
+    }
+    solve_upper(a, m, w);
+}
+
+/* Smallest share of a pivot in the sum of the sizes it was made of, without exchanges of rows. */
+static const double STEADY = 0.03;
+
+/* The same without exchanges; 0 where a pivot is a small remainder of what it was summed from (`sizes`, of the diagonal).
+ *
+ * Which rows are exchanged depends on their units; whether a pivot is good does not where the matrix is that of the
+ * identity and what moves entries of one unit to those of another.
+ */
+INLINE int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT sizes) {
+    for (int k = 0; k < m; k += 4) {
+        const int end = k + 4 < m ? k + 4 : m;
+        for (int c = k; c < end; ++c) {
+            const double *RESTRICT first = a + c * w;
+            if (!(fabs(first[c]) >= STEADY * sizes[c])) return 0; /* NaN neither */
+            const double inverse = 1.0 / first[c];
+            for (int i = c + 1; i < m; ++i) {
+                double *RESTRICT own = a + i * w;
+                if (own[c] == 0.0) continue;
+                own[c] *= inverse;
+                for (int j = c + 1; j < end; ++j) own[j] -= own[c] * first[j];
+                if (i < end) sizes[i] += fabs(own[c] * first[i]);
+            }
+        }
+        for (int i = k + 1; i < m; ++i) {
+            double *own = a + i * w;
+            for (int c = k; i >= end && c < end; ++c) sizes[i] += fabs(own[c] * a[c * w + i]);
+            add_rows(own + end, -1.0, own + k, 1, a + k * w + end, w, (i < end ? i : end) - k, w - end);
+        }
+    }
+    solve_upper(a, m, w);
+    return 1;
+}
+
+/* Half-vector and square matrix. */
+INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) {
+    for (int j = 0, t = 0; j < n; ++j)
+        for (int i = j; i < n; ++i, ++t) square[i * n + j] = square[j * n + i] = half[t];
+}
+
+/* A B, (rows x inner) (inner x columns). */
+INLINE void product(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    memset(result, 0, sizeof(double) * rows * columns);
+    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i * inner, 1, B, columns, inner, columns);
+}
+
+/* a . b, in four sums that do not wait for one another. */
+INLINE double dot(const double *RESTRICT a, const double *RESTRICT b, int size) {
+    double sums[4] = {0.0, 0.0, 0.0, 0.0};
+    int i = 0;
+    for (; i + 4 <= size; i += 4)
+        for (int k = 0; k < 4; ++k) sums[k] += a[i + k] * b[i + k];
+    for (; i < size; ++i) sums[0] += a[i] * b[i];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
+/* A B', (rows x inner) (columns x inner)'. */
+INLINE void product_turned(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    for (int i = 0; i < rows; ++i)
+        for (int c = 0; c < columns; ++c) result[i * columns + c] = dot(A + i * inner, B + c * inner, inner);
+}
+
+/* A' B, (inner x rows)' (inner x columns). */
+INLINE void turned_product(
+    const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
+) {
+    memset(result, 0, sizeof(double) * rows * columns);
+    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i, rows, B, columns, inner, columns);
+}

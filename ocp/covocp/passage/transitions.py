@@ -1,0 +1,118 @@
+"""Slopes through shooting segments of Runge-Kutta steps, in compiled code, as nodes of expressions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.passage.library import functions
+from covocp.passage.sweep import address
+
+STAGES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Steps of shooting segments, and what their slopes are told by.
+
+    rows: states. pattern: rows and columns of the nonzeros of a stage's slopes, column by column: those of the states'
+    rates and last of the cost's, by the state and by the rest. steps: of an interval. lengths: intervals of each
+    segment. places: of the rest of each interval, the columns of the slopes of its segment, which begin with those by
+    the state at its start. active: columns that an interval and those before it in its segment reach.
+    """
+
+    rows: int
+    pattern: tuple[tuple[int, ...], tuple[int, ...]]
+    steps: int
+    lengths: tuple[int, ...]
+    places: tuple[tuple[int, ...], ...]
+    active: tuple[int, ...]
+
+    @property
+    def widths(self) -> list[int]:
+        """Columns of the slopes of each segment."""
+        return [self.active[end - 1] for end in np.cumsum(self.lengths)]
+
+
+def transitions(steps: Steps, slopes: Any) -> Any:
+    """Slopes of the ends of all segments, side by side, (rows, sum of their widths); without derivatives.
+
+    Args:
+        steps: of the segments.
+        slopes: nonzeros of the stages' slopes, a column for each stage of each step.
+    """
+    return _node(steps, "transitions")(slopes)
+
+
+def passed_back(steps: Steps, slopes: Any, by_states: Any, by_costs: Any) -> Any:
+    """Slopes of a number by what each segment starts from and takes, one below the other; without derivatives.
+
+    Args:
+        steps: of the segments.
+        slopes: nonzeros of the stages' slopes, a column for each stage of each step.
+        by_states: its slopes by the states after each step, (rows, steps).
+        by_costs: its slopes by the running cost of each interval, (1, intervals).
+    """
+    return _node(steps, "passed_back")(slopes, by_states, by_costs)
+
+
+@cache
+def _node(steps: Steps, name: str) -> _Node:
+    """CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
+    return _Node(steps, name)
+
+
+class _Node(ca.Callback):
+    """One of the functions of the library on some steps."""
+
+    def __init__(self, steps: Steps, name: str) -> None:
+        ca.Callback.__init__(self)
+        there = functions()
+        assert there is not None
+        self._run = there[name]
+        entries, intervals = len(steps.pattern[0]), sum(steps.lengths)
+        slopes = ca.Sparsity.dense(entries, STAGES * steps.steps * intervals)
+        if name == "transitions":
+            self._inputs, self._output = [slopes], ca.Sparsity.dense(steps.rows, sum(steps.widths))
+        else:
+            states = ca.Sparsity.dense(steps.rows, steps.steps * intervals)
+            self._inputs = [slopes, states, ca.Sparsity.dense(1, intervals)]
+            self._output = ca.Sparsity.dense(sum(steps.widths), 1)
+        parts = (*steps.pattern, steps.lengths, steps.places, steps.active)
+        self._kept = [np.array(part, dtype=np.intc) for part in parts]
+        row, column, *others = (array.ctypes.data for array in self._kept)
+        numbers = (steps.rows, entries, row, column, len(steps.places[0]), steps.steps, len(steps.lengths))
+        self._arguments = (*numbers, *others)
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Of CasADi."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """Of CasADi."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        return self._inputs[i]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Of CasADi."""
+        return self._output
+
+    def has_eval_buffer(self) -> bool:
+        """Of CasADi."""
+        return True
+
+    def eval_buffer(self, arguments: tuple[memoryview | None, ...], results: tuple[memoryview | None, ...]) -> int:
+        """Of CasADi."""
+        kept = [np.zeros(shape.nnz()) if given is None else given for given, shape in zip(arguments, self._inputs, strict=True)]
+        out = address(results[0])
+        if out is None:
+            return 0
+        return int(self._run(*self._arguments, *(address(memoryview(given)) for given in kept), out))

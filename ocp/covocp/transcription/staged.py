@@ -1,0 +1,174 @@
+"""Slopes through the shooting segments by the stages of their Runge-Kutta steps, in compiled code.
+
+Differentiated by CasADi a segment passes each of its directions through thousands of scalar operations. Here the slopes
+of the rates at all stages are had once, a few nonzeros each, and pass through compiled code: forward for the slopes of
+the ends of the segments (`segment_slopes`), back for the slopes of a cost (`cost_slopes`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.expressions import Expr
+from covocp.base.quadrature import classical_step
+from covocp.base.short_repr import short_repr
+from covocp.passage.transitions import Steps, passed_back, transitions
+from covocp.statement.interval import Interval
+from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT, slopes_wanted
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.shooting import compiled_steps
+
+# States from which on it is less work.
+SMALLEST_STAGED = 8
+
+
+def is_staged(statement: Statement, mesh: Mesh) -> bool:
+    """Whether segments are differentiated so: more than a few states alone, in a plain space, by explicit steps."""
+    alone = mesh.eliminated and not statement.coupled and statement.nu > 0
+    plain = statement.geometry.plain and mesh.step != "rodas" and compiled_steps(mesh)
+    return alone and plain and statement.nx >= SMALLEST_STAGED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Staged:
+    """The segments of a program, their slopes by the stages, and what those are slopes by.
+
+    steps: of the segments. slopes: nonzeros of the stages' slopes, a column for each. count: segments. spans: of what
+    the segments start from and take (linear in the variables), what each of them has. linear: slopes of that by the
+    variables, constant.
+    """
+
+    steps: Steps
+    slopes: Any
+    count: int
+    spans: tuple[tuple[int, ...], ...]
+    linear: ca.DM
+
+    __repr__ = short_repr
+
+    def segment_slopes(self) -> Any:
+        """Slopes of the states at the ends of all segments by the variables, (nx segments, variables), sparse."""
+        nx = self.steps.rows
+        rows = [s * nx + r for s, own in enumerate(self.spans) for _ in own for r in range(nx)]
+        columns = [c for own in self.spans for c in own for _ in range(nx)]
+        order = np.lexsort((rows, columns))  # nonzeros of a sparsity lie column by column
+        shape = ca.Sparsity.triplet(nx * self.count, self.linear.shape[0], rows, columns)
+        dense = ca.vec(transitions(self.steps, self.slopes))
+        return ca.mtimes(ca.sparsity_cast(dense[order.tolist()], shape), self.linear)
+
+    def cost_slopes(self, by_states: Expr, by_costs: Expr) -> Any:
+        """Slopes by the variables of what has these slopes by the states after all steps, and by the running costs.
+
+        Args:
+            by_states: (nx, N substeps).
+            by_costs: of the intervals, (1, N).
+        """
+        own = self.linear[[c for span in self.spans for c in span], :]
+        return ca.mtimes(own.T, passed_back(self.steps, self.slopes, by_states, by_costs))
+
+
+def staged(
+    statement: Statement, mesh: Mesh, states: tuple[Expr, Expr], intervals: Interval, w: Expr, starts: Expr
+) -> Staged:
+    """The segments of a program.
+
+    Args:
+        statement: a problem that `is_staged`.
+        mesh: of it.
+        states: at the nodes, (nx, N + 1), and at the ends of all substeps, (nx, N substeps).
+        intervals: a column for each.
+        w: the variables.
+        starts: states at the starts of the segments, linear in w.
+    """
+    x, fine = states
+    nx, nu, free = statement.nx, statement.nu, int(statement.duration.free)
+    function, pattern = _stage_slopes(statement, mesh.substeps)
+    linear = mesh.control == "linear"
+    active, places, spans = [], [], []
+    inside: list[Expr] = [ca.vec(starts), *([intervals.duration[0]] if free else [])]
+    times, offset = range(nx * len(mesh.segments), nx * len(mesh.segments) + free), starts.numel() + free
+    for s, (i, j) in enumerate(pairwise(mesh.starts)):
+        for first in range(nx + free, nx + free + (j - i) * nu, nu):
+            after = first + nu if linear else first
+            places.append((*range(first, first + nu), *range(after, after + nu), *range(nx, nx + free)))
+            active.append(after + nu)
+        controls = ca.horzcat(intervals.start[:, i:j], *([intervals.end[:, j - 1]] if linear else []))
+        inside.append(ca.vec(controls))
+        spans.append((*range(s * nx, (s + 1) * nx), *times, *range(offset, offset + controls.numel())))
+        offset += controls.numel()
+    slope = ca.jacobian(ca.vertcat(*inside), w)
+    (constant,) = ca.Function("linear", [w], [slope]).call([ca.DM.zeros(w.shape[0])])
+    steps = Steps(
+        rows=nx,
+        pattern=pattern,
+        steps=mesh.substeps,
+        lengths=tuple(mesh.segments),
+        places=tuple(places),
+        active=tuple(active),
+    )
+    return Staged(
+        steps=steps,
+        slopes=function.map(mesh.intervals)(x[:, : mesh.intervals], fine, *intervals),
+        count=len(mesh.segments),
+        spans=tuple(spans),
+        linear=constant,
+    )
+
+
+@lru_cache(maxsize=KEPT)
+def _stage_slopes(
+    statement: Statement, substeps: int
+) -> tuple[ca.Function, tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Slopes of h times the rates of state and cost at the stages of all steps of an interval.
+
+    Returns:
+        (x, states at the ends of the substeps, *interval) -> nonzeros of the slopes by the state, by the controls at
+        both ends and, where it is free, by T, a column for each stage; rows and columns of the nonzeros.
+    """
+    symbolic: Any = statement.symbolic
+    x, fine = symbolic.sym("x", statement.nx), symbolic.sym("fine", statement.nx, substeps)
+    interval, rates = Interval.symbols(statement), _rate_slopes(statement)
+    found = []
+    for j in range(substeps):
+        part, stages = interval.part(j / substeps, (j + 1) / substeps), []
+
+        def rate(value: Expr, c: float, part: Interval = part, stages: list[Any] = stages) -> Expr:
+            stages.append((value, c))
+            return statement.nominal(*part.at(c, value))[0]  # type: ignore[misc]
+
+        classical_step(rate, x if j == 0 else fine[:, j - 1], part.h)
+        for value, c in stages:
+            moved, by_x, by_u, by_time, by_duration = rates(*part.at(c, value))
+            share, h = (j + c) / substeps, part.h
+            blocks = [h * by_x, (1 - share) * h * by_u, share * h * by_u]
+            if statement.duration.free:
+                blocks.append(part.ds * moved + h * (by_time * part.place(c) + by_duration))
+            found.append(ca.horzcat(*blocks))
+    pattern = found[0].sparsity()
+    for slope in found:
+        pattern = pattern + slope.sparsity()
+    shape = ca.Sparsity.dense(pattern.nnz(), 1)
+    columns = ca.horzcat(*(ca.sparsity_cast(ca.project(slope, pattern), shape) for slope in found))
+    row, column = pattern.get_triplet()
+    function = ca.Function("stage_slopes", [x, fine, *interval], [columns], slopes_wanted(statement, 2))
+    return function, (tuple(row), tuple(column))
+
+
+@lru_cache(maxsize=KEPT)
+def _rate_slopes(statement: Statement) -> ca.Function:
+    """(x, u, t, T, p) -> rates of state and running cost, their slopes by x, by u, by t and by T."""
+    assert statement.nominal is not None
+    symbols = [statement.symbolic.sym(f"a{i}", count) for i, count in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
+    rates = ca.vertcat(*statement.nominal(*symbols))
+    slopes = ca.horzsplit(
+        ca.jacobian(rates, ca.vertcat(*symbols[:4])),
+        np.cumsum([0, statement.nx, statement.nu, 1, 1]).tolist(),
+    )
+    return ca.Function("rate_slopes", symbols, [ca.densify(rates), *slopes])

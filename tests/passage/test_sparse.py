@@ -1,0 +1,170 @@
+"""Steps whose system is eliminated by its nonzeros: the same numbers as with exchanges of rows, at any step."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from longer import in_long_double
+from scipy.integrate import solve_ivp
+
+from covocp.base.matrices import half_length, pack, unpack
+from covocp.passage import library, ordering
+from covocp.passage.sweep import _Sweep, passed_by
+
+pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
+
+STEPS = 5
+KEPT: list[_Sweep] = []
+
+
+def kept(*given: object) -> _Sweep:
+    """A new sweep; CasADi's expressions do not keep it."""
+    KEPT.append(_Sweep(*given))  # type: ignore[arg-type]
+    return KEPT[-1]
+
+
+def chain(n: int, *, stiffness: float = 2.0, damping: float = 0.3, units: float = 1.0) -> tuple[np.ndarray, ...]:
+    """F, Q and W of n/2 masses in a row, the last one measured; positions in other units than speeds."""
+    m = n // 2
+    D = np.eye(m) - np.eye(m, k=-1)
+    F = np.block([[np.zeros((m, m)), np.eye(m)], [-stiffness * D.T @ D, -damping * D.T @ D]])
+    Q, W = np.zeros((n, n)), np.zeros((n, n))
+    Q[m:, m:] = 0.01 * np.eye(m)
+    W[m - 1, m - 1] = 100.0
+    S = np.diag([units] * m + [1.0] * m)
+    T = np.linalg.inv(S)
+    return S @ F @ T, S @ Q @ S, T @ W @ T
+
+
+def points(n: int, h: float, seed: int = 0, **changes: float) -> tuple[np.ndarray, np.ndarray]:
+    """h H at both points of some steps that differ by one percent, side by side."""
+    F, Q, W = chain(n, **changes)
+    rng = np.random.default_rng(seed)
+
+    def one() -> np.ndarray:
+        moved = [M * (1 + 0.01 * rng.normal(size=M.shape)) for M in (F, Q, W)]
+        moved[1:] = [(M + M.T) / 2 for M in moved[1:]]
+        return h * np.block([[-moved[0].T, moved[2]], [moved[1], moved[0]]])
+
+    first, second = (np.hstack([one() for _ in range(STEPS)]) for _ in range(2))
+    return first, second
+
+
+def prior(n: int, size: float = 1.0, units: float = 1.0) -> np.ndarray:
+    """A full covariance."""
+    A = np.random.default_rng(n).normal(size=(n, n))
+    S = np.diag([units] * (n // 2) + [1.0] * (n // 2))
+    return size * S @ (A @ A.T / n + np.eye(n)) @ S
+
+
+def passages(monkeypatch: pytest.MonkeyPatch, pattern: ca.Sparsity) -> list[ca.Function]:
+    """The passage and its slopes and their tangents: by nonzeros, and with exchanges of rows."""
+    n = pattern.shape[0] // 2
+    functions = []
+    for share in (1e9, 0.0):
+        monkeypatch.setattr(ordering, "LARGEST_SHARE", share)
+        monkeypatch.setattr(ordering, "SMALLEST", 1)
+        monkeypatch.setattr("covocp.passage.sweep._sweep", kept)
+        wide = ca.repmat(pattern, 1, STEPS)
+        arguments = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
+        seeds, along = ca.MX.sym("s", half_length(n), STEPS), [ca.MX.sym("d", a.sparsity()) for a in arguments]
+        after = passed_by(arguments[0], arguments[1:], n)
+        slopes = [ca.jtimes(after, a, seeds, True) for a in arguments]
+        moved: list[ca.MX] = [
+            sum((ca.jtimes(slope, a, d) for a, d in zip(arguments, along, strict=True)), ca.MX(0)) for slope in slopes
+        ]
+        functions.append(ca.Function("passage", [*arguments, seeds, *along], [after, *slopes, *moved]))
+    return functions
+
+
+def arguments(n: int, h: float, size: float = 1.0, units: float = 1.0) -> tuple[ca.Sparsity, list[object], np.ndarray]:
+    """Pattern of a step, what the passages take, and E."""
+    h1, h2 = points(n, h, units=units)
+    pattern = ca.sparsify(ca.DM(np.abs(h1[:, : 2 * n]))).sparsity()
+    wide, E, rng = ca.repmat(pattern, 1, STEPS), prior(n, size, units), np.random.default_rng(7)
+    along = [0.1 * ca.DM(wide, rng.normal(size=wide.nnz())) * ca.project(ca.DM(k), wide) for k in (h1, h2)]
+    seeds = rng.normal(size=(half_length(n), STEPS))
+    return pattern, [pack(E), *(ca.project(ca.DM(k), wide) for k in (h1, h2)), seeds, pack(0.01 * E), *along], E
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
+@pytest.mark.parametrize(
+    ("h", "size", "units", "allowed"),
+    [
+        (0.3, 1.0, 1.0, 1e-13),
+        (2.5, 1.0, 1.0, 1e-12),
+        (5.0, 1.0, 1.0, 1e-11),
+        (0.3, 1.0, 1e3, 1e-13),
+        (0.3, 1e4, 1.0, 1e-10),
+        (0.3, 1e4, 1e-4, 1e-9),
+    ],
+)
+@pytest.mark.parametrize("n", [6, 10, 30])
+def test_last_covariance_in_longer_arithmetic(monkeypatch, n, h, size, units, allowed):
+    """In any units: exchanges of rows are not invariant, and lose five digits with positions in millimetres."""
+    pattern, given, E = arguments(n, h, size, units)
+    by_nonzeros, _ = passages(monkeypatch, pattern)
+    found = unpack(np.asarray(by_nonzeros(*given)[0].full())[:, -1], n)
+    exact = in_long_double(E, *(np.asarray(ca.DM(k).full()) for k in given[1:3]), steps=STEPS)
+    deviation = np.sqrt(np.diag(exact))
+    assert np.abs((found - exact) / np.outer(deviation, deviation)).max() < allowed
+
+
+@pytest.mark.parametrize("h", [0.02, 0.3, 2.5])
+@pytest.mark.parametrize("n", [2, 6, 10, 30])
+def test_slopes_and_their_tangents_are_those_with_exchanges_of_rows(monkeypatch, n, h):
+    pattern, given, _ = arguments(n, h)
+    by_nonzeros, exchanged = passages(monkeypatch, pattern)
+    for one, other in zip(by_nonzeros(*given), exchanged(*given), strict=True):
+        a, b = np.asarray(ca.DM(one).full()), np.asarray(ca.DM(other).full())
+        assert np.abs(a - b).max() <= 1e-11 * np.abs(b).max()
+
+
+@pytest.mark.parametrize("share", [0.98, 1.0 - 1e-9, 1.0])
+def test_a_pivot_that_vanishes_is_exchanged(monkeypatch, share):
+    """1 - (h w)^2/12 is zero for an oscillator at h w = sqrt(12), where no order of elimination helps."""
+    n, h = 2, share * np.sqrt(12.0)
+    F = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    pattern = ca.Sparsity.triplet(4, 4, [0, 1, 2, 3], [1, 0, 3, 2])
+    by_nonzeros, _ = passages(monkeypatch, pattern)
+    H = np.hstack([h * np.block([[-F.T, np.zeros((2, 2))], [np.zeros((2, 2)), F]])] * STEPS)
+    wide, E = ca.repmat(pattern, 1, STEPS), prior(2)
+    moves, zero = ca.project(ca.DM(H), wide), ca.DM(wide, 0.0)
+    found = np.asarray(by_nonzeros(pack(E), moves, moves, np.zeros((3, STEPS)), pack(0 * E), zero, zero)[0].full())
+    # two stages: the transition of a constant F is (I - z/2 + z^2/12)^-1 (I + z/2 + z^2/12), a rotation here
+    z = h * F
+    D = np.linalg.solve(np.eye(2) - z / 2 + z @ z / 12, np.eye(2) + z / 2 + z @ z / 12)
+    exact = E
+    for k in range(STEPS):
+        exact = D @ exact @ D.T
+        assert np.allclose(unpack(found[:, k], n), exact, rtol=1e-12, atol=1e-12)
+
+
+def test_a_large_chain_is_the_differential_equation():
+    """Order 4 against scipy, with the order of elimination that is chosen by default."""
+    n = 24
+    F, Q, W = chain(n)
+    E = prior(n)
+    assert ordering.ordering(n, *ca.sparsify(ca.DM(np.block([[-F.T, W], [Q, F]]))).sparsity().get_triplet()) is not None
+
+    def rate(t: float, e: np.ndarray) -> np.ndarray:
+        V = e.reshape(n, n)
+        return np.asarray(F @ V + V @ F.T + Q - V @ W @ V).ravel()
+
+    exact = solve_ivp(rate, (0, 1.0), E.ravel(), rtol=1e-12, atol=1e-13, method="DOP853").y[:, -1].reshape(n, n)
+    errors = []
+    for count in (10, 20, 40):
+        H = ca.sparsify(ca.DM(np.block([[-F.T, W], [Q, F]]) / count))
+        passed = passed_by(ca.DM(pack(E)), [ca.repmat(H, 1, count)] * 2, n)
+        last = unpack(np.asarray(ca.DM(passed).full())[:, -1], n)
+        errors.append(np.abs(last - exact).max())
+    assert errors[2] < 1e-5 * np.abs(exact).max()
+    assert np.log2(errors[0] / errors[1]) > 3.7
+    assert np.log2(errors[1] / errors[2]) > 3.7
+
+
+def test_full_systems_and_small_ones_are_not_ordered():
+    assert ordering.ordering(12, *ca.Sparsity.dense(24, 24).get_triplet()) is None
+    assert ordering.ordering(2, *ca.Sparsity.diag(4).get_triplet()) is None
+    assert ordering.ordering(20, *ca.Sparsity.diag(40).get_triplet()) is not None
