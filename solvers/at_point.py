@@ -19,7 +19,7 @@ KEPT = 3
 
 
 class AtPoint:
-    """The functions of a program, with slopes of first order; the last points are kept, whatever the scale of the cost."""
+    """The functions of a program with slopes of first order; the last points are kept, in any unit of the cost."""
 
     def __init__(self, program: Program) -> None:
         """Make the functions, called through buffers.
@@ -31,6 +31,7 @@ class AtPoint:
         cost, gradient = program.gradient or (program.f, ca.gradient(program.f, w))
         rows = ca.jacobian(program.g, w) if program.jacobian is None else program.jacobian
         self.pattern = rows.sparsity()
+        self._rows, self._columns = np.array(self.pattern.row(), np.intp), np.array(self.pattern.get_col(), np.intp)
         outputs = [ca.densify(program.g), ca.densify(gradient), rows]
         self._full = Buffered(ca.Function("full", [w, p], [cost, *outputs]))
         self._value = Buffered(ca.Function("value", [w, p], [program.f, *outputs[:1]]))
@@ -56,6 +57,11 @@ class AtPoint:
             self._trial = key, self._value(w, np.append(p[:-1], 1.0))
         return _scaled(self._trial[1], p)
 
+    def weighed(self, entries: Array, weights: Array) -> Array:
+        """The slope of the sum of the rows with these weights, from the entries of their Jacobian."""
+        products = entries * weights[self._rows]
+        return np.asarray(np.bincount(self._columns, products, self.pattern.shape[1]), dtype=float)
+
     @staticmethod
     def _key(w: Array, p: Array) -> bytes:
         return np.concatenate([w, p[:-1]]).tobytes()
@@ -77,13 +83,13 @@ class Nodes:
 
     def __init__(self, program: Program) -> None:
         """Make them; they have to be kept as long as a solver uses them."""
-        self._of = AtPoint(program)
+        self.of = AtPoint(program)
         self._whole = True
         shapes = {
             "f": ca.Sparsity.scalar(),
             "g": ca.Sparsity.dense(program.g.shape[0], 1),
             "grad_f": ca.Sparsity.dense(program.w.shape[0], 1),
-            "jac_g": self._of.pattern,
+            "jac_g": self.of.pattern,
         }
         inputs = [ca.Sparsity.dense(symbol.shape[0], 1) for symbol in (program.w, program.p)]
         self._nodes = {
@@ -97,7 +103,7 @@ class Nodes:
     def _asked(self, w: Array, p: Array, names: tuple[str, ...]) -> list[Array] | None:
         """Some of what is had at a point."""
         slopes = names != ("f", "g")
-        outputs = self._of.full(w, p) if slopes or self._whole else self._of.value(w, p)
+        outputs = self.of.full(w, p) if slopes or self._whole else self.of.value(w, p)
         self._whole = slopes
         places = {"f": 0, "g": 1, "grad_f": 2, "jac_g": 3}
         return None if outputs is None else [outputs[places[name]] for name in names]

@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
 from covocp.base.short_repr import short_repr
+from covocp.solvers.at_point import AtPoint
 from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.scales import choose_scales, magnitudes
@@ -84,32 +85,41 @@ class Round:
 class FirstOrder:
     """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
 
-    def __init__(self, nlp: Program, solver: Any) -> None:
-        """Take the functions of a solver that tells them, or make one for a solver that does not (None)."""
-        self.nlp = nlp
+    def __init__(self, nlp: Program, solver: Any, together: AtPoint | None = None) -> None:
+        """Take the functions that are had together, those of a solver that tells them, or, without both, make some."""
+        self.nlp, self._together = nlp, together
         self._gradient: Any = None
         self._jacobian: Any = None
-        if solver is not None:
+        if together is None and solver is not None:
             self._gradient, self._jacobian = solver.get_function("nlp_grad_f"), solver.get_function("nlp_jac_g")
 
     def cost(self, w: Array, parameters: Arrays) -> tuple[float, Array]:
-        """The cost and its gradient by the variables."""
+        """The cost and its gradient by the variables; NaN where the model fails."""
+        p = self.nlp.p_of(parameters, 1.0)
+        if self._together is not None:
+            outputs = self._together.full(w, p)
+            return (np.nan, np.full(w.size, np.nan)) if outputs is None else (float(outputs[0][0]), outputs[2])
         if self._gradient is None:
-            outputs = [self.nlp.f, ca.gradient(self.nlp.f, self.nlp.w)]
-            self._gradient = ca.Function("gradient", [self.nlp.w, self.nlp.p], outputs)
-        value, slope = self._gradient(w, self.nlp.p_of(parameters, 1.0))
+            slopes = [self.nlp.f, ca.gradient(self.nlp.f, self.nlp.w)]
+            self._gradient = ca.Function("gradient", [self.nlp.w, self.nlp.p], slopes)
+        value, slope = self._gradient(w, p)
         return float(value), np.asarray(slope.full()).ravel()
 
     def constraints(self, w: Array, parameters: Arrays, weights: Array) -> tuple[Array, Array]:
         """The constraints, and the slope by the variables of their sum with these weights."""
         p = self.nlp.p_of(parameters, 1.0)
+        if self._together is not None:
+            outputs = self._together.full(w, p)
+            if outputs is None:
+                return np.full(weights.size, np.nan), np.full(w.size, np.nan)
+            return outputs[1], self._together.weighed(outputs[3], weights)
         if self._jacobian is not None:
             values, jacobian = self._jacobian(w, p)
             slope = ca.mtimes(jacobian.T, ca.DM(weights)).full()  # not by scipy: importing it takes longer than a solve
         else:
             lam = ca.MX.sym("lam", weights.size)
-            outputs = [self.nlp.g, ca.jtimes(self.nlp.g, self.nlp.w, lam, True)]
-            values, slope = ca.Function("weighted", [self.nlp.w, self.nlp.p, lam], outputs)(w, p, weights)
+            both = [self.nlp.g, ca.jtimes(self.nlp.g, self.nlp.w, lam, True)]
+            values, slope = ca.Function("weighted", [self.nlp.w, self.nlp.p, lam], both)(w, p, weights)
             slope = slope.full()
         return np.asarray(values.full()).ravel(), np.asarray(slope).ravel()
 

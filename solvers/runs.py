@@ -15,7 +15,7 @@ from covocp.base.progress import Progress
 from covocp.base.residuals import VIOLATION, Residuals
 from covocp.extremal.costates import without_passage
 from covocp.extremal.extremal import ENDED, STOPPED, Extremal, Guess, Outcome
-from covocp.solvers.at_point import Nodes
+from covocp.solvers.at_point import AtPoint, Nodes
 from covocp.solvers.endings import Ending
 from covocp.solvers.monitor import Monitor
 from covocp.solvers.plugins import silent
@@ -167,7 +167,7 @@ class Runs:
         status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
-        first = FirstOrder(nlp, self._functions if self._open else None)
+        first = FirstOrder(nlp, self._functions if self._open else None, self._together())
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
@@ -203,12 +203,12 @@ class Runs:
         try:
             result = solver(**arguments)
         except RuntimeError as error:  # a plugin that gives up by raising; its last iterate is lost, the start is not
-            result = {"x": ca.DM(w0), "lam_x": ca.DM.zeros(w0.size), "lam_g": ca.DM.zeros(bounds["lbg"].size)}
+            result = {"x": w0, "lam_x": np.zeros(w0.size), "lam_g": np.zeros(bounds["lbg"].size)}
             reason = str(error).strip().splitlines()[-1]
             stats: dict[str, Any] = {"success": False, "return_status": f"{self._plugin} gave up: {reason}"}
         else:
             stats = solver.stats()
-        w, lam_x, lam_g = (np.asarray(result[name].full()).ravel() for name in ("x", "lam_x", "lam_g"))
+        w, lam_x, lam_g = (_numbers(result[name]) for name in ("x", "lam_x", "lam_g"))
         if not stats["success"] and progress.spent and self._monitor is not None and self._monitor.best is not None:
             best = self._monitor.best
             w, lam_x, lam_g = best.w, best.lam_x, best.lam_g
@@ -341,24 +341,34 @@ class Runs:
         if not self._open:  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
-            return self._share * self._curvature_along(solver.get_function("nlp_grad_f"), w0, parameters)
+            assert self._nlp is not None
+            first = FirstOrder(self._nlp, solver, self._together())
+            return self._share * self._curvature_along(first, w0, parameters)
 
-    def _curvature_along(self, gradient: ca.Function, w0: Array, parameters: Arrays) -> float:
+    def _together(self) -> AtPoint | None:
+        """The functions of the present program, where they are had together."""
+        return None if self._nodes is None else self._nodes.of
+
+    def _curvature_along(self, of: FirstOrder, w0: Array, parameters: Arrays) -> float:
         """|g' H g| / g' g of the cost, g its slopes, and what stands for it where it is no number."""
         assert self._nlp is not None
-        p = self._nlp.p_of(parameters, 1.0)
-        value, first = (np.asarray(v.full()).ravel() for v in gradient(w0, p))
-        if not np.isfinite(value[0]):
+        value, first = of.cost(w0, parameters)
+        if not np.isfinite(value):
             self._nlp.check_finite(w0, parameters)
         size = float(np.linalg.norm(first))
-        largest = max(abs(float(value[0])), float(np.abs(first[self._nlp.chosen]).max(initial=0.0)))
+        largest = max(abs(value), float(np.abs(first[self._nlp.chosen]).max(initial=0.0)))
         if not np.isfinite(size) or size == 0.0:
             return 1.0
         largest = largest if largest > 0.0 else size
         step = PROBE / size
-        second = np.asarray(gradient(w0 - step * first, p)[1].full()).ravel()
+        _, second = of.cost(w0 - step * first, parameters)
         curvature = abs(float((first - second) @ first)) / (step * size**2)
         return float(np.clip(curvature, SMALLEST_CURVATURE * largest, largest)) if np.isfinite(curvature) else largest
+
+
+def _numbers(value: Any) -> Array:
+    """What a solver gives, a matrix of CasADi's or an array, as numbers one after the other."""
+    return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float).ravel()
 
 
 def share_for(times: float) -> float:

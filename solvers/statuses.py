@@ -32,6 +32,11 @@ class Status(Ending):
     STOPPED = ("User_Requested_Stop", "interrupted by the user", "")
     DIVERGING = ("Diverging_Iterates", "the iterates diverge", "the cost may be unbounded below; add bounds")
     NO_PROGRESS = ("Search_Direction_Becomes_Too_Small", "no further progress is possible at this accuracy", "")
+    NO_STEP = (
+        "Error_In_Step_Computation",
+        "no step from there leads on at this accuracy",
+        "method='reduced' or hessian='exact' may find a way",
+    )
     NO_NUMBER = (
         "Invalid_Number_Detected",
         "the model became NaN or inf",
@@ -50,7 +55,7 @@ class Status(Ending):
     @property
     def judged(self) -> bool:
         """Whether the point may be stationary, although Ipopt does not say so."""
-        return self in (Status.ACCEPTABLE, Status.NO_PROGRESS)
+        return self in (Status.ACCEPTABLE, Status.NO_PROGRESS, Status.NO_STEP)
 
 
 def status_of(name: str) -> Status | None:

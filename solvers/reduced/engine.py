@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
@@ -39,7 +38,7 @@ class Engine:
 
     def __call__(
         self, *, x0: Array, p: Array, lam_x0: Any = None, lam_g0: Any = None, **limits: Array
-    ) -> dict[str, Any]:
+    ) -> dict[str, Array]:
         """Solve; arguments and results by the names of CasADi's solvers. Multipliers to start from are not needed."""
         bounds = Bounds(**{name: np.asarray(value, dtype=float) for name, value in limits.items()})
         layout = self._layout_of(bounds)
@@ -47,7 +46,7 @@ class Engine:
         if start is None:
             self._program.check_finite(x0, (p[:-1],))
             self._stats = {"success": False, "return_status": str(Status.NO_NUMBER), "iter_count": 0}
-            return {"x": ca.DM(x0), "lam_x": ca.DM.zeros(x0.size), "lam_g": ca.DM.zeros(bounds.lbg.size)}
+            return {"x": x0, "lam_x": np.zeros(x0.size), "lam_g": np.zeros(bounds.lbg.size)}
         sequence = Sequence(
             Functions(full=self._at(layout, p), value=self._values(p)),
             layout,
@@ -68,7 +67,7 @@ class Engine:
             "return_status": str(ended.status),
             "iter_count": ended.iterations,
         }
-        return {"x": ca.DM(ended.place.w), "lam_x": ca.DM(ended.lam_x), "lam_g": ca.DM(ended.lam_g)}
+        return {"x": ended.place.w, "lam_x": ended.lam_x, "lam_g": ended.lam_g}
 
     def _layout_of(self, bounds: Bounds) -> Layout:
         """The layout for these bounds; that of the last call where the same are fixed or infinite."""
@@ -82,18 +81,10 @@ class Engine:
         """How the last call ended."""
         return self._stats
 
-    def get_function(self, name: str) -> Callable[[Array, Array], tuple[Any, Any]]:
-        """Cost and slope ('nlp_grad_f'), or rows and their Jacobian ('nlp_jac_g'), at a point."""
-        of_rows = {"nlp_grad_f": False, "nlp_jac_g": True}[name]
-
-        def chosen(w: Array, p: Array) -> tuple[Any, Any]:
-            outputs = self._of.full(np.asarray(w, dtype=float), p)
-            if outputs is None:
-                raise RuntimeError("the model fails")
-            cost, rows, slope, entries = outputs
-            return (ca.DM(rows), ca.DM(self._of.pattern, entries)) if of_rows else (ca.DM(cost), ca.DM(slope))
-
-        return chosen
+    @property
+    def functions(self) -> AtPoint:
+        """Of the program."""
+        return self._of
 
     def _at(self, layout: Layout, p: Array) -> Callable[[Array], Place | None]:
         """Everything at a point."""

@@ -17,6 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
 from covocp.extremal.extremal import Guess, Outcome
+from covocp.solvers.at_point import AtPoint
 from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes
 from covocp.solvers.reduced.engine import Engine
@@ -125,6 +126,11 @@ class ReducedRuns(Runs):
         assert isinstance(engine, Engine)
         engine.tolerance = self._tolerance * self._strictness
         return engine
+
+    def _together(self) -> AtPoint | None:
+        """Those of the sequence on the present program."""
+        engine = self._solvers.get(False)
+        return None if engine is None else engine.functions
 
     def _tighten(self, found: Residuals) -> None:
         """All by the tolerance: nothing here is compared with one."""

@@ -39,9 +39,7 @@ def two_controls(*, free: bool = False, conditions: bool = False) -> co.Problem:
     if conditions:
         ocp.subject_to(x[2] ** 2, upper=25.0, name="path")
         ocp.subject_to(E[b, b], upper=0.15, at="final")
-    ocp.minimize(
-        running=ca.sumsqr(u) + 0.1 * ca.sumsqr(x) * (1 + 0.2 * t), terminal=E[b, b] + x[0] ** 2 + 0.1 * T
-    )
+    ocp.minimize(running=ca.sumsqr(u) + 0.1 * ca.sumsqr(x) * (1 + 0.2 * t), terminal=E[b, b] + x[0] ** 2 + 0.1 * T)
     return ocp
 
 

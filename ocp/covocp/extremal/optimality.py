@@ -144,10 +144,13 @@ def assess(
     control_slope, control_error = (None, None) if _path_acts(extremal) else (0.0, 0.0)
     if st.nu and free is not None and control_slope is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
-        free = free & ~_beside(extremal)[:, None]
+        beside = _beside(extremal)[:, None]
+        free = free & ~beside
         control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2))) / scale
         others = 0.0 if within is None else within.size
-        control_error = _control_error(extremal, costates, free[:-1] & free[1:], others)
+        whole = free[:-1] & free[1:]
+        bounded = ~whole & ~(beside[:-1] | beside[1:])
+        control_error = _control_error(extremal, costates, (whole, bounded), others)
     return Optimality(
         stationarity=_stationarity(extremal, residual, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
         control_slope=control_slope,
@@ -250,6 +253,10 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
     }
 
 
+# A truth value for each control of each interval.
+Mask = NDArray[np.bool_]
+
+
 class _AtNodes(NamedTuple):
     """H_u (K, nu), H_uu (K, nu, nu), H and the sum of its absolute terms (K, 2), sizes of H_u (K, nu)."""
 
@@ -299,17 +306,21 @@ def _limit_slopes(extremal: Extremal) -> Array:
     return mesh.gathered(result)
 
 
-def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool_], others: float) -> float:
+def _control_error(extremal: Extremal, costates: Costates, kinds: tuple[Mask, Mask], others: float) -> float:
     """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
 
     H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
-    (not `free`, of each interval) do not count. Intervals in which H_uu is not positive definite count with what the
-    Hamiltonian is above its value with the control of one of their ends, by Simpson's rule.
+    somewhere in it count with what the Hamiltonian, quadratic in each of them, can fall between the bounds, by
+    Simpson's rule. Intervals in which H_uu is not positive definite count with what the Hamiltonian is above its value
+    with the control of one of their ends, by the same rule.
+
+    `kinds`: of the controls in each interval, (N, nu): free in all of it; at a bound somewhere. Others do not count.
     """
     points = extremal.mesh.points
     if points > 1:  # costates jump inside the intervals
         fine = refined(extremal)
-        return _control_error(fine, discrete_costates(fine)[0], np.repeat(free, points, axis=0), others)
+        inside = [np.repeat(kind, points, axis=0) for kind in kinds]
+        return _control_error(fine, discrete_costates(fine)[0], (inside[0], inside[1]), others)
     st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
     values = fine_trajectory(extremal, 2 * mesh.substeps)
     h = np.diff(extremal.time)[:, None]
@@ -318,7 +329,8 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
     u = extremal.controls
     ends = u[:-1] if mesh.control == "constant" else u[1:]
     function = hamiltonian(st)("point", lambda v, x, w, e, t: [v, ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
-    slopes, curvatures, above = [], [], np.zeros((3, n))
+    slopes, curvatures, above, held_back = [], [], np.zeros((3, n)), np.zeros((3, n))
+    (free, bounded), (lower, upper) = kinds, st.control_bounds
     for j, costate in enumerate((after[:-1], middle, after[1:])):
         z = values[:, j * mesh.substeps, :]
         arguments = (
@@ -333,14 +345,24 @@ def _control_error(extremal: Extremal, costates: Costates, free: NDArray[np.bool
         value, slope, curvature = (stacked(v, n) for v in function(*arguments))
         held = [stacked(function(arguments[0], w.T, *arguments[2:])[0], n) for w in (u[:-1], ends)]
         above[j] = (value - np.minimum(np.minimum(*held), value)).ravel()
+        fall = _fall(arguments[1].T, slope[:, :, 0], curvature, lower, upper)
+        held_back[j] = np.where(bounded, fall, 0.0).sum(axis=1)
         slopes.append(np.where(free, slope[:, :, 0], 0.0))
         curvatures.append(curvature)
     definite = np.asarray((np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0))
     curvature = np.where(definite[:, None, None], curvatures[1], np.eye(st.nu))
     steps = np.linalg.solve(curvature, np.array(slopes)[..., None])[..., 0]
     gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)
-    total = h[:, 0] @ np.where(definite, gained, SIMPSON @ above)
+    total = h[:, 0] @ np.where(definite, gained + SIMPSON @ held_back, SIMPSON @ above)
     return float(total / max(_absolute_cost(extremal) + others, np.finfo(float).tiny))
+
+
+def _fall(u: Array, slope: Array, curvature: Array, lower: Array, upper: Array) -> Array:
+    """What a function with these slopes and curvatures, (n, nu, nu), falls where entries of u move within bounds."""
+    bend = np.diagonal(curvature, axis1=1, axis2=2)
+    bend = np.where(bend > 0, bend, 1.0)
+    move = np.clip(u - slope / bend, lower, upper) - u
+    return np.asarray(np.maximum(-(slope * move + bend / 2 * move**2), 0.0))
 
 
 def _absolute_cost(extremal: Extremal) -> float:

@@ -91,9 +91,10 @@ static int measures_much(const Passage *p, int k, const double *E) {
 INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
     const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
     double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
-    double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n, *RESTRICT Y2 = p->stage2 + (size_t)k * m * n;
-    double *RESTRICT factor = p->factor + (size_t)k * n * n;
-    int *swaps = p->swaps + (size_t)k * n;
+    const size_t place = p->lean ? 0 : (size_t)k;
+    double *RESTRICT Y1 = p->stage1 + place * m * n, *RESTRICT Y2 = p->stage2 + place * m * n;
+    double *RESTRICT factor = p->factor + place * n * n;
+    int *swaps = p->swaps + place * n;
     double *RESTRICT stage = transition ? D : Y1;
     if (!p->order || !sparse_stage(p, n, k, E, columns, stage)) {
         solve_full(p, n, k, E, w, NULL, a);

@@ -12,11 +12,11 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 4
+VERSION = 5
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE) + (_ADDRESS,) * 4),
+    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE) + (_ADDRESS,) * 4 + (_WHOLE,)),
     "passage_free": (None, (_ADDRESS,)),
     "passage_forward": (None, (_ADDRESS,) * 7),
     "passage_reverse": (None, (_ADDRESS,) * 12),

@@ -35,6 +35,7 @@ static const double MUCH = 100.0;
 
 typedef struct {
     int n, nnz, count, known;
+    int lean; /* nothing is kept of the steps: no slopes */
     int r, moves, reads, *place; /* of each step among those that move, or -1 - that among those that read */
     int *row, *col;              /* nonzeros of H, column by column */
     int *begin, *across, *which; /* the same row by row: places, columns, positions among them */
@@ -104,14 +105,15 @@ static int ordered(Passage *p, const int *order, const int *right, const int *be
  *
  * Steps with `read` read up to r rows, the others move; read is NULL where all of them do. `order`: of elimination, 2n
  * rows, `right` and `behind`: the pattern behind its diagonal, row by row, rising; NULL where rows are exchanged.
+ * `lean`: for values alone.
  */
 EXPORT Passage *passage_new(
     int n, int nnz, const int *row, const int *col, int count, int r, const int *read, const int *order,
-    const int *right, const int *behind
+    const int *right, const int *behind, int lean
 ) {
     Passage *p = calloc(1, sizeof *p);
     if (!p) return NULL;
-    p->n = n, p->nnz = nnz, p->count = count, p->r = r;
+    p->n = n, p->nnz = nnz, p->count = count, p->r = r, p->lean = lean;
     p->place = room(count, sizeof(int));
     if (!p->place) {
         passage_free(p);
@@ -119,12 +121,13 @@ EXPORT Passage *passage_new(
     }
     for (int k = 0; k < count; ++k) p->place[k] = read && read[k] ? -1 - p->reads++ : p->moves++;
     const size_t d = sizeof(double), all = (size_t)count, steps = (size_t)p->moves, reads = (size_t)p->reads;
+    const size_t whole = lean && p->moves ? 1 : steps; /* steps of which all is kept */
     const size_t square = (size_t)n * n, half = square / 2 + n / 2 + 1, tall = (size_t)r * n, wide = (size_t)r * r;
     p->row = room(nnz, sizeof(int)), p->col = room(nnz, sizeof(int)), p->begin = room(2 * n + 1, sizeof(int));
-    p->across = room(nnz, sizeof(int)), p->which = room(nnz, sizeof(int)), p->swaps = room(steps * n, sizeof(int));
+    p->across = room(nnz, sizeof(int)), p->which = room(nnz, sizeof(int)), p->swaps = room(whole * n, sizeof(int));
     p->first = room(half, d), p->h1 = room(steps * nnz, d), p->h2 = room(steps * nnz, d);
-    p->kicks = room(all * half, d), p->after = room(all * half, d), p->factor = room(steps * square, d);
-    p->stage1 = room(steps * 2 * square, d), p->stage2 = room(steps * 2 * square, d), p->work = room(17 * square + nnz + 4 * (wide + tall), d);
+    p->kicks = room(all * half, d), p->after = room(all * half, d), p->factor = room(whole * square, d);
+    p->stage1 = room(whole * 2 * square, d), p->stage2 = room(whole * 2 * square, d), p->work = room(17 * square + nnz + 4 * (wide + tall), d);
     p->told = room(reads * telling(p), d), p->gain = room(reads * tall, d), p->keep = room(reads * square, d);
     p->inverse = room(reads * wide, d), p->reached = room(reads * square, d);
     p->exchanged = room(2 * n + r, sizeof(int)), p->sizes = room(2 * n, d);

@@ -8,6 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.short_repr import short_repr
+
 # Largest share of the operations on the whole matrix: those by nonzeros are slower, three times on chains of masses.
 LARGEST_SHARE = 0.3
 # Rows of a covariance from which on it is looked at.
@@ -18,13 +20,15 @@ SMALLEST = 8
 class Ordering:
     """Rows of the order of elimination, and the pattern behind the diagonal that it leads to.
 
-    order: the row that is eliminated first, second, ... begins: where the columns behind the diagonal of each begin, and
-    their end. columns: rising, counted in the order.
+    order: the row that is eliminated first, second, ... begins: where the columns behind the diagonal of each begin,
+    and their end. columns: rising, counted in the order.
     """
 
     order: NDArray[np.intc]
     begins: NDArray[np.intc]
     columns: NDArray[np.intc]
+
+    __repr__ = short_repr
 
 
 def ordering(size: int, rows: list[int], columns: list[int]) -> Ordering | None:

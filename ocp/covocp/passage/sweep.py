@@ -57,7 +57,8 @@ def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None
     wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, moves)
     entries = [ca.sparsity_cast(ca.project(point, wide), shape) for point in points]
     steps, height = ((), 0) if told is None else (told.steps, told.rows)
-    sweep = _sweep(size, (tuple(rows), tuple(columns)), moves + len(steps), kicks is not None, steps, height)
+    numbers = isinstance(first, ca.DM) and all(isinstance(point, ca.DM) for point in points)
+    sweep = _sweep(size, (tuple(rows), tuple(columns)), moves + len(steps), kicks is not None, steps, height, numbers)
     others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
     return sweep(first, *entries, *others)
 
@@ -95,19 +96,24 @@ class _Workspaces:
         self._lock = threading.Lock()
 
     def take(self, sweep: _Sweep) -> int:
-        """The last memory of a sweep, or new memory."""
+        """The last memory of a sweep, or new memory, for which the oldest is freed where all would be too much."""
         with self._lock:
             for place in range(len(self._kept) - 1, -1, -1):
                 if self._kept[place][0] is sweep:
                     return self._kept.pop(place)[1]
+            self._free(sweep.bytes, 0)
         return sweep.new_memory()
 
     def give(self, sweep: _Sweep, memory: int) -> None:
         """Keep memory for the next call, and free the oldest where it has become too much."""
         with self._lock:
             self._kept.append((sweep, memory))
-            while len(self._kept) > 1 and sum(owner.bytes for owner, _ in self._kept) > KEPT_BYTES:
-                _library()["passage_free"](self._kept.pop(0)[1])
+            self._free(0, 1)
+
+    def _free(self, more: int, least: int) -> None:
+        """Free the oldest, down to so many, until there is room for more bytes."""
+        while len(self._kept) > least and more + sum(owner.bytes for owner, _ in self._kept) > KEPT_BYTES:
+            _library()["passage_free"](self._kept.pop(0)[1])
 
 
 _WORKSPACES = _Workspaces()
@@ -121,18 +127,22 @@ def _library() -> dict[str, Callable[..., Any]]:
 
 
 @cache
-def _sweep(size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int) -> _Sweep:
+def _sweep(
+    size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool
+) -> _Sweep:
     """A sweep; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
-    return _Sweep(size, pattern, count, kicked, reads, height)
+    return _Sweep(size, pattern, count, kicked, reads, height, lean)
 
 
 class _Sweep(ca.Callback):
     """(half-vector at the start, entries of h H at both points[, what is read][, kicks]) -> half-vectors."""
 
     def __init__(
-        self, size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int
+        self, size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool
     ) -> None:
+        """Keep what the library is told; `lean`: for values alone, of which no steps are kept."""
         ca.Callback.__init__(self)
+        self._lean = lean
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
         self._size, self._height = size, height
         self._read = np.zeros(count, dtype=np.intc)
@@ -140,7 +150,7 @@ class _Sweep(ca.Callback):
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
         self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
         self._ordering = ordering(size, *(list(part) for part in pattern))
-        steps = self.moves * (10 * size * size + 2 * self.entries) + 2 * count * self.half
+        steps = (1 if lean else self.moves) * 10 * size * size + 2 * self.moves * self.entries + 2 * count * self.half
         readings = self.reads * (4 * size * size + 2 * height * (size + height) + self.telling)
         self.bytes = 8 * (steps + readings + 17 * size * size)
         self._reverse: dict[int, _Slopes] = {}
@@ -154,7 +164,7 @@ class _Sweep(ca.Callback):
         read, own = self._read.ctypes.data, self._ordering
         order = [None] * 3 if own is None else [part.ctypes.data for part in (own.order, own.begins, own.columns)]
         numbers = (self._size, self.entries, rows, columns, self.count, self._height, read)
-        memory = _library()["passage_new"](*numbers, *order)
+        memory = _library()["passage_new"](*numbers, *order, int(self._lean))
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
@@ -228,7 +238,7 @@ class _Sweep(ca.Callback):
 
     def has_reverse(self, nadj: int) -> bool:
         """Of CasADi."""
-        return True
+        return not self._lean
 
     def get_reverse(
         self, nadj: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Given
@@ -240,7 +250,7 @@ class _Sweep(ca.Callback):
 
     def has_forward(self, nfwd: int) -> bool:
         """Of CasADi."""
-        return True
+        return not self._lean
 
     def get_forward(
         self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Given

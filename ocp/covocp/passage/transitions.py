@@ -111,8 +111,11 @@ class _Node(ca.Callback):
 
     def eval_buffer(self, arguments: tuple[memoryview | None, ...], results: tuple[memoryview | None, ...]) -> int:
         """Of CasADi."""
-        kept = [np.zeros(shape.nnz()) if given is None else given for given, shape in zip(arguments, self._inputs, strict=True)]
         out = address(results[0])
         if out is None:
             return 0
-        return int(self._run(*self._arguments, *(address(memoryview(given)) for given in kept), out))
+        missing = [argument is None for argument in arguments]  # what CasADi leaves out is zero
+        zeros = [np.zeros(shape.nnz() if left else 0) for shape, left in zip(self._inputs, missing, strict=True)]
+        pairs = zip(arguments, zeros, strict=True)
+        given = [zero.ctypes.data if argument is None else address(argument) for argument, zero in pairs]
+        return int(self._run(*self._arguments, *given, out))

@@ -143,6 +143,14 @@ def plot_solutions(
     given = list(solutions)
     legend = _labels(given, labels)
     known = {block.name: block.unit for solution in given for block in solution.blocks}
+    strange = [name for name in units or {} if name not in known]
+    if strange:
+        raise ProblemError(
+            f"The units of '{strange[0]}' are those of nothing in the solution.",
+            expected=f"names among {', '.join(sorted(known))}",
+            received=f"units={{'{strange[0]}': ...}}",
+            remedy="correct the name, or leave it out",
+        )
     words = known | dict(units or {})
     panels = choose_panels(given, names, costates=costates, gains=gains, over=over, units=words)
     abscissa = "time [s]" if over is None else abscissa_label(given, over, words)

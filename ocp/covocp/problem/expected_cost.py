@@ -408,6 +408,13 @@ def _gain_entries(gain: Gain, shape: tuple[int, int]) -> _GainEntries:
                 received=f"shape {numbers.shape}",
                 remedy=f"correct Gain({what}=...)",
             )
+        if what == "structure" and not np.isin(numbers, (0.0, 1.0)).all():
+            raise ProblemError(
+                "The structure of the gain does not say which entries there are.",
+                expected="True where an entry may differ from zero, False where it is zero",
+                received=f"structure={gain.structure!r}"[:200],
+                remedy="correct Gain(structure=...); bounds of entries are lower= and upper=",
+            )
         values.append(numbers)
     pattern, low, high, guess = values
     if not pattern.any() or (low > high).any():

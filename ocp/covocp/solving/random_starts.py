@@ -72,13 +72,13 @@ def phase_seed(seed: int, phase: int) -> int:
     return int(np.random.SeedSequence((seed, phase)).generate_state(1, np.uint64)[0])
 
 
-def check_multistart(guess: str, starts: Given, seed: Given) -> None:
+def check_multistart(guess: Given, starts: Given, seed: Given) -> None:
     """A guess that is a word, and the options that belong to it.
 
     Raises:
-        ProblemError: another word than "multistart", or numbers that are none.
+        ProblemError: another word than "multistart", numbers that are none, or that belong to no guess.
     """
-    if guess != MULTISTART:
+    if isinstance(guess, str) and guess != MULTISTART:
         raise ProblemError(
             "The guess is an unknown word.",
             expected="None, 'multistart', a Solution, or a dict of name to guess",
@@ -93,6 +93,14 @@ def check_multistart(guess: str, starts: Given, seed: Given) -> None:
                 received=repr(number),
                 remedy=f"correct {name}=",
             )
+    if not isinstance(guess, str) and (starts != STARTS or seed != 0):
+        name, number = ("starts", starts) if starts != STARTS else ("seed", seed)
+        raise ProblemError(
+            f"The option '{name}' belongs to guess='multistart'.",
+            expected="guess='multistart', the best of several random starts",
+            received=f"{name}={number!r} beside another guess",
+            remedy=f"give guess='multistart', or leave {name}= out",
+        )
 
 
 def multistart(guess: Given, options: dict[str, Any]) -> tuple[int, int] | None:

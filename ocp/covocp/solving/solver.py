@@ -244,6 +244,7 @@ class Solver:
                 time_limit=time_limit,
                 iteration_limit=iteration_limit,
             )
+        check_multistart(guess, starts, seed)
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
             self._keep(*self._first)
@@ -443,7 +444,6 @@ class Solver:
 
     def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
         """The best of the problem's own start and several random ones."""
-        check_multistart(guess, starts, seed)
         guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
         outcome: Outcome = best_of(self._prepared, values, guesses, starts + 1, reporter)
         return outcome

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,6 +22,8 @@ from covocp.transcription.covariance_steps import StepKind
 
 # Control intervals where none are asked for.
 INTERVALS = 100
+# And as many as can be: with a covariance of 12 rows 100 000 of them take 8 GB.
+MOST_INTERVALS = 100_000
 # Shooting segments where matrices are eliminated; where there are many states as few as these, about so many states at
 # the starts of all: an iteration of Ipopt takes as long as an evaluation there (chain of masses of 28 and 58 states).
 ELIMINATED_SEGMENTS, FEWEST_SEGMENTS, SEGMENT_STATES = 10, 5, 120
@@ -93,7 +96,7 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
-        _whole("intervals", self.intervals)
+        _whole("intervals", self.intervals, most=MOST_INTERVALS)
         _choice("control", self.control, ("linear", "constant"))
         _choice("covariances", self.covariances, ("auto", "eliminated", "states"))
         _choice("covariance_step", self.covariance_step, ("auto", "gauss", "strang", "rk4"))
@@ -238,7 +241,7 @@ class Mesh:
         np.add.at(result, self.stand_ins, slopes)
         return result
 
-    @property
+    @cached_property
     def starts(self) -> tuple[int, ...]:
         """Node at which each segment starts, and the last node."""
         return tuple(np.cumsum([0, *self.segments]).tolist())
@@ -521,11 +524,11 @@ def _bounded_matrices(statement: Statement) -> list[str]:
     return names
 
 
-def _whole(name: str, value: Given, expected: str = "1, 2, 3, ...") -> None:
-    if not is_whole(value):
+def _whole(name: str, value: Given, expected: str = "1, 2, 3, ...", most: int = MOST) -> None:
+    if not is_whole(value, 1, most):
         raise ProblemError(
             f"The option '{name}' must be a positive whole number.",
-            expected=f"{expected}, at most {MOST:.3g}",
+            expected=f"{expected}, at most {most:.3g}",
             received=repr(value),
             remedy=f"correct {name}=",
         )

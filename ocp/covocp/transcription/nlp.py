@@ -60,8 +60,8 @@ class NLP:
 
     `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
     nodes (columns), the terminal time, running cost, terminal cost and g. `backward` maps them to the half-vectors at
-    the start of the matrices that run backward; None where none does. `gradient`, f and its slopes by w, and `jacobian`,
-    those of g, are there where CasADi's own take longer, else None.
+    the start of the matrices that run backward; None where none does. `gradient`, f and its slopes by w, and
+    `jacobian`, the slopes of g, are there where CasADi's own take longer, else None.
     """
 
     statement: Statement

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -56,11 +56,11 @@ class Program:
         """Of all parts, then of the links."""
         return (*(rows for part in self.parts for rows in part.rows), *self.link_rows)
 
-    @property
+    @cached_property
     def chosen(self) -> list[int]:
         """Variables that are controls or durations."""
         places: list[int] = []
-        for part, span in zip(self.parts, self._spans(), strict=True):
+        for part, span in zip(self.parts, self._spans, strict=True):
             count = part.mesh.control_nodes * part.statement.nu + int(part.statement.duration.free)
             places += range(span.stop - count, span.stop)
         return places
@@ -92,7 +92,7 @@ class Program:
         rows: list[Array] = []
         used: list[Array] = []
         parameters = self._weighed(w, parameters)
-        for i, (part, span) in enumerate(zip(self.parts, self._spans(), strict=True)):
+        for i, (part, span) in enumerate(zip(self.parts, self._spans, strict=True)):
             used.append(parameters[i])
             if i:
                 given = self._given(i - 1, found[-1], used[-2], used[-1])
@@ -120,7 +120,7 @@ class Program:
 
     def _weighed(self, w: Array, parameters: Arrays) -> Arrays:
         """The parameters of each part, with the half-vectors that run backward from the part after it."""
-        result, spans = list(parameters), self._spans()
+        result, spans = list(parameters), self._spans
         for i in range(len(self.links) - 1, -1, -1):
             backward = self.parts[i + 1].backward
             if self.links[i].weights and backward is not None:
@@ -161,7 +161,7 @@ class Program:
         bounds = self.bounds(parameters)
         excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
         excess = np.where(np.isfinite(g), excess, np.inf)
-        for part, own, span in zip(self.parts, parameters, self._row_spans(), strict=True):
+        for part, own, span in zip(self.parts, parameters, self._row_spans, strict=True):
             prefix = f"{part.statement.name}: " if self.links else ""
             result |= {prefix + name: value for name, value in part.violations(excess[span], own).items()}
         values = g[g.size - sum(rows.lower.size for rows in self.link_rows) :]
@@ -178,7 +178,7 @@ class Program:
         self, lam_x: Array, lam_g: Array, trajectories: Trajectories, parameters: Arrays
     ) -> tuple[Multipliers, ...]:
         """Multipliers of the statements from those of the program (for a cost scale of 1)."""
-        spans = zip(self._spans(), self._row_spans(), strict=True)
+        spans = zip(self._spans, self._row_spans, strict=True)
         return tuple(
             part.unpack_multipliers(lam_x[span], lam_g[rows], trajectory, own)
             for (part, trajectory, own), (span, rows) in zip(self.each(trajectories, parameters), spans, strict=True)
@@ -195,7 +195,7 @@ class Program:
 
     def bounds_at_ends(self, lam_x: Array) -> tuple[tuple[Array, Array], ...]:
         """Multipliers of the bounds on the states where each part begins and ends (for a cost scale of 1)."""
-        return tuple(part.bounds_at_ends(lam_x[span]) for part, span in zip(self.parts, self._spans(), strict=True))
+        return tuple(part.bounds_at_ends(lam_x[span]) for part, span in zip(self.parts, self._spans, strict=True))
 
     def units(self, scales: tuple[Scales, ...]) -> Array:
         """Other magnitudes of the variables, in the units of this program, an entry for each variable."""
@@ -233,10 +233,12 @@ class Program:
             result.append((value[entries] - wanted) / _scale(part.scales, kind, entries))
         return result
 
+    @cached_property
     def _spans(self) -> list[slice]:
         """The variables of each part."""
         return _consecutive([part.w.shape[0] for part in self.parts])
 
+    @cached_property
     def _row_spans(self) -> list[slice]:
         """The rows of g of each part."""
         return _consecutive([part.g.shape[0] for part in self.parts])

@@ -123,9 +123,7 @@ def staged(
 
 
 @lru_cache(maxsize=KEPT)
-def _stage_slopes(
-    statement: Statement, substeps: int
-) -> tuple[ca.Function, tuple[tuple[int, ...], tuple[int, ...]]]:
+def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tuple[tuple[int, ...], tuple[int, ...]]]:
     """Slopes of h times the rates of state and cost at the stages of all steps of an interval.
 
     Returns:
@@ -137,7 +135,8 @@ def _stage_slopes(
     interval, rates = Interval.symbols(statement), _rate_slopes(statement)
     found = []
     for j in range(substeps):
-        part, stages = interval.part(j / substeps, (j + 1) / substeps), []
+        part = interval.part(j / substeps, (j + 1) / substeps)
+        stages: list[Any] = []
 
         def rate(value: Expr, c: float, part: Interval = part, stages: list[Any] = stages) -> Expr:
             stages.append((value, c))
@@ -165,10 +164,10 @@ def _stage_slopes(
 def _rate_slopes(statement: Statement) -> ca.Function:
     """(x, u, t, T, p) -> rates of state and running cost, their slopes by x, by u, by t and by T."""
     assert statement.nominal is not None
-    symbols = [statement.symbolic.sym(f"a{i}", count) for i, count in enumerate((statement.nx, statement.nu, 1, 1, statement.np))]
+    kind: Any = statement.symbolic
+    sizes = (statement.nx, statement.nu, 1, 1, statement.np)
+    symbols = [kind.sym(f"a{i}", size) for i, size in enumerate(sizes)]
     rates = ca.vertcat(*statement.nominal(*symbols))
-    slopes = ca.horzsplit(
-        ca.jacobian(rates, ca.vertcat(*symbols[:4])),
-        np.cumsum([0, statement.nx, statement.nu, 1, 1]).tolist(),
-    )
+    offsets = np.cumsum([0, *sizes[:4]]).tolist()
+    slopes = ca.horzsplit(ca.jacobian(rates, ca.vertcat(*symbols[:4])), offsets)
     return ca.Function("rate_slopes", symbols, [ca.densify(rates), *slopes])

@@ -17,7 +17,14 @@ from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.scales import limit_units
-from covocp.transcription.shooting import Passage, backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
+from covocp.transcription.shooting import (
+    Passage,
+    backward_at_start,
+    compiled_steps,
+    interval_columns,
+    nominal_run,
+    shoot,
+)
 from covocp.transcription.staged import Staged, is_staged, staged
 
 # Adjoint sweeps that a Jacobian takes at once.
@@ -272,9 +279,7 @@ class _AlongRun:
         names = ("ends", "fine", "cost")
         self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
         ends, fine, costs = self._given
-        self._nodes = shoot(
-            variables.statement, variables.mesh, variables, passage="compiled", run=(ends, fine, costs)
-        )
+        self._nodes = shoot(variables.statement, variables.mesh, variables, passage="compiled", run=(ends, fine, costs))
 
     @property
     def nodes(self) -> dict[str, Any]:
