@@ -244,7 +244,8 @@ class ShootingSolver:
     ) -> None:
         """Keep the settings; see `prepare`. `limit`: of the residuals of a converged point."""
         self._statement, self._mesh = statement, mesh
-        self._runs = Runs(_builder(None, (statement,), (mesh,), limited), plugin, settings, limited, limit)
+        stages = plugin == "ipopt"  # others differentiate the Jacobian themselves
+        self._runs = Runs(_builder(None, (statement,), (mesh,), limited, stages), plugin, settings, limited, limit)
 
     @property
     def mesh(self) -> Mesh:
@@ -294,7 +295,11 @@ class ChainSolver:
 
 
 def _builder(
-    chain: Chain | None, statements: tuple[Statement, ...], meshes: tuple[Mesh, ...], limited: bool
+    chain: Chain | None,
+    statements: tuple[Statement, ...],
+    meshes: tuple[Mesh, ...],
+    limited: bool,
+    stages: bool = False,
 ) -> Callable[[Magnitudes | None, Trajectories, Arrays], Program]:
     """What makes the program in some magnitudes, or in those of trajectories where there are none."""
 
@@ -307,7 +312,8 @@ def _builder(
             scales = tuple(choose_scales(*pair, trajectory, own) for pair, trajectory, own in along)
         if limited:
             scales = tuple(evened(own, mesh) for own, mesh in zip(scales, meshes, strict=True))
-        parts = tuple(transcribe(*pair, own, passage) for pair, own in zip(pairs, scales, strict=True))
+        made = zip(pairs, scales, strict=True)
+        parts = tuple(transcribe(*pair, own, passage, stages=stages) for pair, own in made)
         return alone(parts[0]) if chain is None else joined(chain, parts)
 
     return build

@@ -92,12 +92,32 @@ def test_gradient_by_differences():
     assert (ahead - behind) / (2 * step) == pytest.approx(slope @ direction, rel=1e-8)
 
 
-def test_stages_of_curved_stiff_and_small_problems_are_not_taken():
-    statement = mass_chain.problem(masses=2).statement()
-    assert not is_staged(statement, resolve_mesh(statement, Options(intervals=20), statement.values))
+def test_stages_of_curved_and_stiff_problems_are_not_taken():
     large = mass_chain.problem(masses=5).statement()
     assert is_staged(large, resolve_mesh(large, Options(intervals=20), large.values))
     assert not is_staged(large, resolve_mesh(large, Options(intervals=20, step="rodas"), large.values))
+    ocp = co.Problem(1.0)
+    rate = ocp.control("w", 3)
+    ocp.attitude("C", initial=np.eye(3), rate=rate)
+    ocp.minimize(running=ca.sumsqr(rate))
+    curved = ocp.statement()
+    assert not is_staged(curved, resolve_mesh(curved, Options(intervals=20), curved.values))
+
+
+def test_plain_problems_have_the_jacobian_of_casadi():
+    """With an exact Hessian, of which the compiled slopes are no part: the quadratic has its closed form."""
+    n = 6
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", n, initial=1.0), ocp.control("u", n)
+    ocp.dynamics(x, -x + u)
+    ocp.minimize(running=0.5 * (ca.sumsqr(x) + ca.sumsqr(u)))
+    solution = co.solve(ocp, intervals=200, progress=False)
+    # s' = 2 s + s^2 - 1 backward from s = 0
+    root = np.sqrt(2.0)
+    s = np.sinh(2 * root) / (root * np.cosh(2 * root) + np.sinh(2 * root))
+    assert solution.stats["hessian"] == "exact"
+    assert solution.cost == pytest.approx(0.5 * n * s, rel=1e-6)
+    assert solution.stats["iterations"] <= 2
 
 
 @pytest.mark.parametrize("method", ["ipopt", "reduced"])

@@ -24,12 +24,14 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, pack_symbolic, stacked, unpack, unpack_symbolic
+from covocp.base.matrices import Array, pack, pack_symbolic, stacked, unpack, unpack_symbolic
 from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after, simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
 from covocp.extremal.readings import Readings, readings_along
+from covocp.passage.library import functions
+from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval, model_symbols, one_sided
 from covocp.statement.statement import Loop, Statement
 from covocp.transcription.covariance_steps import KEPT
@@ -165,12 +167,17 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, 
     common = tuple(np.asarray(ca.DM(c)) for c in extremal.intervals.substeps(m))
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
-    step = _joint_step(st, statistics.density).map(n * m)(before, after, *common, q)
+    points = _joint_points(st, statistics.density).map(n * m)(before, after, *common, q)
     jumps = {entry.interval: _jump(extremal, entry, statistics) for entry in readings_along(extremal)}
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
     values[0, :size, :size] = statistics.initial
     if start is not None:
         values[0] = start
+    if functions() is not None and not jumps:
+        passed = passed_by(ca.DM(pack(values[0])), points, 2 * size)
+        values[1:] = unpack(np.asarray(ca.DM(passed).full()).T, 2 * size)
+        return values
+    step = _joint_step(2 * size).map(n * m)(*(ca.densify(point) for point in points))
     for k, D in enumerate(stacked(step, n * m)):
         values[k + 1] = lyapunov_after(D, values[k])
         if k % m == m - 1 and k // m in jumps:
@@ -255,8 +262,15 @@ def _loop(statement: Statement) -> Loop:
 
 
 @lru_cache(maxsize=KEPT)
-def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
-    """(z at both ends of a substep, *common, parameters of the truth) -> step matrix of [E Z; Z' Xhat], 4n x 4n.
+def _joint_step(size: int) -> ca.Function:
+    """(h H at both points) -> step matrix of a covariance of so many rows."""
+    points = [ca.MX.sym(name, 2 * size, 2 * size) for name in ("first", "second")]
+    return ca.Function("joint_step", points, [gauss_matrix(points, size, LINEAR_SOLVER)])
+
+
+@lru_cache(maxsize=KEPT)
+def _joint_points(statement: Statement, density: ca.Function) -> ca.Function:
+    """(z at both ends of a substep, *common, parameters of the truth) -> h H of [E Z; Z' Xhat] at both Gauss points.
 
     x, E, S of the design between the ends by cubic Hermite polynomials.
     """
@@ -274,14 +288,11 @@ def _joint_step(statement: Statement, density: ca.Function) -> ca.Function:
         C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
         K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][statement.estimation.span], size), (t, duration, p))
         noise, measured = density(z[:nx], u, t, duration, q)
-        drift = ca.blockcat([[F - K @ M, symbolic.zeros(size, size)], [-K @ M, F - G @ C]])
+        drift = ca.blockcat([[F - K @ M, symbolic(size, size)], [-K @ M, F - G @ C]])
         spread = K @ measured @ K.T
         driven = ca.blockcat([[spread + noise, spread], [spread, spread]])
-        points.append(h * ca.blockcat([[-drift.T, symbolic.zeros(2 * size, 2 * size)], [driven, drift]]))
-    inner = ca.Function("points", [za, zb, *common, q], points)
-    outer = inner.mx_in()
-    value = gauss_matrix(inner(*outer), 2 * size, LINEAR_SOLVER)
-    return ca.Function("joint_step", outer, [value])
+        points.append(h * ca.blockcat([[-drift.T, symbolic(2 * size, 2 * size)], [driven, drift]]))
+    return ca.Function("joint_points", [za, zb, *common, q], points)
 
 
 def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:

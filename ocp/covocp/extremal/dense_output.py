@@ -447,7 +447,8 @@ def _corrections(steps: _Steps, pieces: _Pieces, missed: Array) -> Array:
         if block.covariance and st.nx + block.span.start in steps.rows:
             where = [steps.rows.index(st.nx + i) for i in range(block.span.start, block.span.stop)]
             good = _semidefinite(pieces.high[:, where], block.size) & (pieces.d < 1.0)
-            bad = np.unique(pieces.k[good & ~_semidefinite(corrected[:, where], block.size)])
+            bad = np.zeros(len(result), dtype=bool)
+            bad[pieces.k[good & ~_semidefinite(corrected[:, where], block.size)]] = True
             result[np.ix_(bad, np.array(where))] = 0.0
     return result
 

@@ -25,15 +25,14 @@ from covocp.transcription.covariance_steps import KEPT, slopes_wanted
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps
 
-# States from which on it is less work.
-SMALLEST_STAGED = 8
+# States from which on it is less work where no covariance passes in compiled code.
+SMALLEST_ALONE = 4
 
 
 def is_staged(statement: Statement, mesh: Mesh) -> bool:
-    """Whether segments are differentiated so: more than a few states alone, in a plain space, by explicit steps."""
-    alone = mesh.eliminated and not statement.coupled and statement.nu > 0
-    plain = statement.geometry.plain and mesh.step != "rodas" and compiled_steps(mesh)
-    return alone and plain and statement.nx >= SMALLEST_STAGED
+    """Whether segments can be differentiated so: states alone, in a plain space, by explicit steps."""
+    alone = mesh.eliminated and not statement.coupled and statement.nu > 0 and statement.nx > 0
+    return alone and statement.geometry.plain and mesh.step != "rodas" and compiled_steps(mesh)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,13 +25,15 @@ from covocp.transcription.shooting import (
     nominal_run,
     shoot,
 )
-from covocp.transcription.staged import Staged, is_staged, staged
+from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
 
 # Adjoint sweeps that a Jacobian takes at once.
 LARGEST_DIRECTIONS = 64
 
 
-def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = "plain") -> NLP:
+def transcribe(
+    statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = "plain", *, stages: bool = False
+) -> NLP:
     """Build the NLP of a statement on a mesh.
 
     Args:
@@ -39,6 +41,7 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
         mesh: nodes, segments, formulation.
         scales: magnitudes in which the NLP works.
         passage: of eliminated matrices; compiled, the NLP has slopes of first order only.
+        stages: whether slopes of segments may be taken in compiled code, which has no further slopes.
 
     Returns:
         The NLP; its functions are not yet differentiated.
@@ -56,7 +59,8 @@ def transcribe(statement: Statement, mesh: Mesh, scales: Scales, passage: Passag
         seen = shoot(statement, mesh, variables, passage="dependence")
         depending = _dense(_constraints(statement, mesh, scales, variables, seen))
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
-    by_stages = None if along is None else _staged(variables, nodes)
+    stages = stages and statement.nx >= SMALLEST_ALONE and is_staged(statement, mesh)
+    by_stages = _staged(variables, nodes) if stages or along is not None else None
     return NLP(
         statement=statement,
         mesh=mesh,
