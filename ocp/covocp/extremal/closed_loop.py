@@ -167,7 +167,7 @@ def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, 
     common = tuple(np.asarray(ca.DM(c)) for c in extremal.intervals.substeps(m))
     before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
     q = np.tile(statistics.parameters[:, None], (1, n * m))
-    points = _joint_points(st, statistics.density).map(n * m)(before, after, *common, q)
+    points: Any = _joint_points(st, statistics.density).map(n * m)(before, after, *common, q)
     jumps = {entry.interval: _jump(extremal, entry, statistics) for entry in readings_along(extremal)}
     values = np.zeros((n * m + 1, 2 * size, 2 * size))
     values[0, :size, :size] = statistics.initial
