@@ -305,7 +305,8 @@ class Runs:
         assert nlp is not None
         settings = {**self._settings, **functions}
         problem: dict[str, Any] = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
-        if nlp.gradient is not None and self._open:  # slopes that are had together, in compiled code
+        # slopes that are had together, in compiled code, unless Ipopt is asked for others
+        if nlp.gradient is not None and self._open and settings.get("no_nlp_grad"):
             self._nodes = self._nodes or Nodes(nlp)
             problem, settings = self._nodes.problem, {**settings, **self._nodes.slopes}
         elif nlp.jacobian is not None and "jac_g" not in settings:

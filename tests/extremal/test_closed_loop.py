@@ -15,6 +15,7 @@ from problems import graded, order, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
+from covocp.extremal import closed_loop
 from covocp.extremal.costates import discrete_costates, integrated_costates
 from covocp.models import unknown_lag
 
@@ -44,6 +45,16 @@ def histories(found, exact):
 
 
 # --- against the reference integrator ---------------------------------------------------------------------------------
+
+
+def test_covariances_without_the_compiled_passage_are_the_same(monkeypatch):
+    extremal = evaluated().extremal
+    fast = closed_loop.close_loop(extremal)
+    monkeypatch.setattr(closed_loop, "functions", lambda: None)
+    plain = closed_loop.close_loop(extremal)
+    for one, two in ((fast.E, plain.E), (fast.Xhat, plain.Xhat), (fast.Z, plain.Z), (fast.gain, plain.gain)):
+        np.testing.assert_allclose(one, two, atol=1e-12)
+    assert fast.expected_cost == pytest.approx(plain.expected_cost, rel=1e-12)
 
 
 def test_covariances_gains_and_costs():
