@@ -49,7 +49,7 @@ def evaluations(size: int, rounds: int) -> list[float]:
         nlp = transcribe(statement, mesh, choose_scales(statement, mesh, trajectory, statement.values), passage)
         w, p = nlp.pack(trajectory), np.append(statement.values, 1.0)
         value = ca.Function("f", [nlp.w, nlp.p], [nlp.f])
-        both = ca.Function("g", [nlp.w, nlp.p], [nlp.f, ca.gradient(nlp.f, nlp.w)])
+        both = ca.Function("g", [nlp.w, nlp.p], list(nlp.gradient or (nlp.f, ca.gradient(nlp.f, nlp.w))))
         for function in (value, both):
             points = iter(np.outer(1 + 1e-9 * np.arange(10 * rounds), w))  # the last point is remembered
             result.append(median_of(lambda f=function, at=points, q=p: f(next(at), q), rounds))
