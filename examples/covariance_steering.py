@@ -36,6 +36,8 @@ for solution in (free, kept):
     print(f", deviation at the end {solution.deviation('x')[-1]:.4f} m")
 runs = co.simulate(kept, runs=20000, seed=1)
 print(runs)
-plot_solutions(
-    [free, kept], "x", ("rms", "x"), "C", labels=["best gain", "keeps clear"], path="covariance_steering.png"
-)
+# bands of three deviations: one of them keeps clear of the wall
+figure = plot_solutions([free, kept], "x", ("rms", "x"), "C", labels=["best gain", "keeps clear"], sigmas=(3,))
+figure.axes[0].axhline(2.0, color="black", linestyle="--", linewidth=1.0)
+figure.axes[0].annotate("wall", (0.2, 2.0), xytext=(0, -3), textcoords="offset points", va="top")
+figure.savefig("covariance_steering.png")

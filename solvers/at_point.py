@@ -44,7 +44,7 @@ class AtPoint:
         if key not in self._points:
             while len(self._points) >= KEPT:
                 del self._points[next(iter(self._points))]
-            self._points[key] = self._full(w, np.append(p[:-1], 1.0))
+            self._points[key] = _kept(self._full(w, np.append(p[:-1], 1.0)))
         return _scaled(self._points[key], p)
 
     def value(self, w: Array, p: Array) -> Outputs | None:
@@ -54,7 +54,7 @@ class AtPoint:
             outputs = self._points[key]
             return _scaled(outputs if outputs is None else outputs[:2], p)
         if self._trial[0] != key:
-            self._trial = key, self._value(w, np.append(p[:-1], 1.0))
+            self._trial = key, _kept(self._value(w, np.append(p[:-1], 1.0)))
         return _scaled(self._trial[1], p)
 
     def weighed(self, entries: Array, weights: Array) -> Array:
@@ -65,6 +65,13 @@ class AtPoint:
     @staticmethod
     def _key(w: Array, p: Array) -> bytes:
         return np.concatenate([w, p[:-1]]).tobytes()
+
+
+def _kept(outputs: Outputs | None) -> Outputs | None:
+    """What several are given, read-only."""
+    for values in outputs or ():
+        values.flags.writeable = False
+    return outputs
 
 
 def _scaled(outputs: Outputs | None, p: Array) -> Outputs | None:

@@ -35,6 +35,9 @@ StepKind = Literal["gauss", "strang", "rk4", "rodas"]
 # Rows of a covariance up to which a step of matrices that feed each other is written out in scalars: its exact second
 # derivatives take 5 ms on 40 intervals with two rows, with calls of linear solvers 31; with three rows 22 and 72.
 SCALAR_ROWS = 4
+# The same of matrices that do not: an integrator with one row takes 45 ms on 100 intervals, with calls 66; a lag with two
+# takes 340, with calls 160.
+SCALAR_ROWS_ALONE = 1
 
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16
@@ -193,9 +196,9 @@ def fed(statement: Statement, positions: tuple[int, ...]) -> bool:
 
 def scalar_solver(statement: Statement, positions: tuple[int, ...], solver: str) -> str:
     """The linear solver of a step, that of scalars where all is written out in them."""
-    written = statement.symbolic is ca.SX and fed(statement, positions)
-    small = written and max(statement.matrices[i].size for i in positions) <= SCALAR_ROWS
-    return SCALAR_SOLVER if small else solver
+    most = SCALAR_ROWS if fed(statement, positions) else SCALAR_ROWS_ALONE if solver == LINEAR_SOLVER else 0
+    small = max((statement.matrices[i].size for i in positions), default=0) <= most
+    return SCALAR_SOLVER if small and statement.symbolic is ca.SX else solver
 
 
 @lru_cache(maxsize=KEPT)

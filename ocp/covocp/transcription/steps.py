@@ -231,6 +231,7 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     _, states, cost = nominal_interval(statement, substeps, step)(x, *interval)
     starts = ca.horzcat(x, states[:, : substeps - 1])
     stepped = statement.ahead + statement.behind  # what is variable at both ends runs forward here
+    solver = scalar_solver(statement, stepped, solver)
     move = moving_step(statement, stepped, step, solver)
     own, gathered = e[statement.entries(stepped), :], e[statement.entries(statement.summed), :]
     columns = []
@@ -255,8 +256,7 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
     fine = ca.vertcat(states, halves)
     options = slopes_wanted(statement, 1)
     function = ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], options)
-    scalar = scalar_solver(statement, stepped, solver) == SCALAR_SOLVER
-    return function.expand("full_interval", options | {"cse": True}) if scalar else function
+    return function.expand("full_interval", options | {"cse": True}) if solver == SCALAR_SOLVER else function
 
 
 def ahead_size(statement: Statement) -> int:
