@@ -9,10 +9,10 @@ import numpy as np
 
 from covocp.base.buffered import Buffered
 from covocp.base.matrices import Array
+from covocp.base.nodes import Buffers, Node
 from covocp.transcription.program import Program
 
 Outputs = tuple[Array, ...]
-
 
 # Points that are kept: where a run starts, where its scale is probed, the last one.
 KEPT = 3
@@ -100,7 +100,7 @@ class Nodes:
         }
         inputs = [ca.Sparsity.dense(symbol.shape[0], 1) for symbol in (program.w, program.p)]
         self._nodes = {
-            name: _Node(name, self._asked, inputs, [shapes[k] for k in names], names)
+            name: _Asked(name, self._asked, inputs, [shapes[k] for k in names], names)
             for name, names in (("values", ("f", "g")), ("grad_f", ("f", "grad_f")), ("jac_g", ("g", "jac_g")))
         }
         cost, rows = self._nodes["values"](program.w, program.p)
@@ -116,37 +116,16 @@ class Nodes:
         return None if outputs is None else [outputs[places[name]] for name in names]
 
 
-class _Node(ca.Callback):
+class _Asked(Node):
     """(w, p) -> some of what is had at a point."""
 
     def __init__(
         self, name: str, asked: Any, inputs: list[ca.Sparsity], outputs: list[ca.Sparsity], names: tuple[str, ...]
     ) -> None:
-        ca.Callback.__init__(self)
-        self._asked, self._inputs, self._outputs, self._names = asked, inputs, outputs, names
-        self.construct(f"nlp_{name}", {})
+        self._asked, self._names = asked, names
+        super().__init__(f"nlp_{name}", inputs, outputs)
 
-    def get_n_in(self) -> int:
-        """Of CasADi."""
-        return 2
-
-    def get_n_out(self) -> int:
-        """Of CasADi."""
-        return len(self._outputs)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._outputs[i]
-
-    def has_eval_buffer(self) -> bool:
-        """Of CasADi."""
-        return True
-
-    def eval_buffer(self, arguments: tuple[memoryview | None, ...], results: tuple[memoryview | None, ...]) -> int:
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         w, p = (
             np.zeros(shape.nnz()) if given is None else np.frombuffer(given)

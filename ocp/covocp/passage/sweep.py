@@ -13,6 +13,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
+from covocp.base.nodes import Buffers, Node, address
 from covocp.passage.library import functions
 from covocp.passage.ordering import ordering
 
@@ -20,7 +21,6 @@ from covocp.passage.ordering import ordering
 KEPT_BYTES = 50_000_000
 
 Pattern = tuple[tuple[int, ...], tuple[int, ...]]
-Buffers = tuple[memoryview | None, ...]
 Given = Mapping[str, Any]
 
 
@@ -134,14 +134,13 @@ def _sweep(
     return _Sweep(size, pattern, count, kicked, reads, height, lean)
 
 
-class _Sweep(ca.Callback):
+class _Sweep(Node):
     """(half-vector at the start, entries of h H at both points[, what is read][, kicks]) -> half-vectors."""
 
     def __init__(
         self, size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool
     ) -> None:
         """Keep what the library is told; `lean`: for values alone, of which no steps are kept."""
-        ca.Callback.__init__(self)
         self._lean = lean
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
         self._size, self._height = size, height
@@ -155,8 +154,12 @@ class _Sweep(ca.Callback):
         self.bytes = 8 * (steps + readings + 17 * size * size)
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
-        self.construct("passage", {})
+        sizes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
+        sizes += [(self.telling, self.reads)] if self.reads else []
+        sizes += [(self.half, count)] if kicked else []
+        self.shapes = [ca.Sparsity.dense(*size) for size in sizes]
         self._lengths = [8 * shape.nnz() for shape in self.shapes]
+        super().__init__("passage", self.shapes, [ca.Sparsity.dense(self.half, count)])
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
@@ -168,11 +171,6 @@ class _Sweep(ca.Callback):
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
-
-    @property
-    def shapes(self) -> list[ca.Sparsity]:
-        """Of the arguments."""
-        return [self.get_sparsity_in(i) for i in range(self.get_n_in())]
 
     def padded(self, addresses: list[int | None]) -> list[int | None]:
         """With places for what is read and for the kicks, which the library has always."""
@@ -205,28 +203,6 @@ class _Sweep(ca.Callback):
         _WORKSPACES.give(self, memory)
         if failed:
             raise MemoryError(f"no memory for the tangents of {self.count} steps")
-
-    def get_n_in(self) -> int:
-        """Of CasADi."""
-        return 3 + (self.reads > 0) + self.kicked
-
-    def get_n_out(self) -> int:
-        """Of CasADi."""
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        shapes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
-        shapes += [(self.telling, self.reads)] if self.reads else []
-        return ca.Sparsity.dense(*[*shapes, (self.half, self.count)][i])
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return ca.Sparsity.dense(self.half, self.count)
-
-    def has_eval_buffer(self) -> bool:
-        """Of CasADi."""
-        return True
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -261,36 +237,7 @@ class _Sweep(ca.Callback):
         return self._forward[nfwd]
 
 
-class _Derived(ca.Callback):
-    """What the derivatives of a sweep have in common: sparsities that are given, evaluation through buffers."""
-
-    def __init__(self, inputs: list[ca.Sparsity], outputs: list[ca.Sparsity], name: str, options: Given) -> None:
-        ca.Callback.__init__(self)
-        self._inputs, self._outputs = inputs, outputs
-        self.construct(name, dict(options))
-
-    def get_n_in(self) -> int:
-        """Of CasADi."""
-        return len(self._inputs)
-
-    def get_n_out(self) -> int:
-        """Of CasADi."""
-        return len(self._outputs)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._outputs[i]
-
-    def has_eval_buffer(self) -> bool:
-        """Of CasADi."""
-        return True
-
-
-class _Slopes(_Derived):
+class _Slopes(Node):
     """(arguments of a sweep, its result, seeds) -> slopes by the arguments, for some directions side by side."""
 
     def __init__(self, sweep: _Sweep, directions: int, name: str, options: Given) -> None:
@@ -298,7 +245,7 @@ class _Slopes(_Derived):
         self._forward: dict[int, _MovedSlopes] = {}
         result = sweep.get_sparsity_out(0)
         inputs = [*sweep.shapes, result, ca.repmat(result, 1, directions)]
-        super().__init__(inputs, [ca.repmat(shape, 1, directions) for shape in sweep.shapes], name, options)
+        super().__init__(name, inputs, [ca.repmat(shape, 1, directions) for shape in sweep.shapes], options)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -325,14 +272,14 @@ class _Slopes(_Derived):
         return self._forward[nfwd]
 
 
-class _Tangents(_Derived):
+class _Tangents(Node):
     """(arguments of a sweep, its result, tangents of the arguments) -> tangents of the result, side by side."""
 
     def __init__(self, sweep: _Sweep, tangents: int, name: str, options: Given) -> None:
         self._sweep, self._tangents = sweep, tangents
         result = sweep.get_sparsity_out(0)
         inputs = [*sweep.shapes, result, *(ca.repmat(shape, 1, tangents) for shape in sweep.shapes)]
-        super().__init__(inputs, [ca.repmat(result, 1, tangents)], name, options)
+        super().__init__(name, inputs, [ca.repmat(result, 1, tangents)], options)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -345,7 +292,7 @@ class _Tangents(_Derived):
         return 0
 
 
-class _MovedSlopes(_Derived):
+class _MovedSlopes(Node):
     """Tangents of `_Slopes`: (its arguments, its results, tangents of its arguments) -> tangents of its results."""
 
     def __init__(self, sweep: _Sweep, directions: int, tangents: int, name: str, options: Given) -> None:
@@ -354,7 +301,7 @@ class _MovedSlopes(_Derived):
         of = [*sweep.shapes, result, ca.repmat(result, 1, directions)]
         slopes = [ca.repmat(shape, 1, directions) for shape in sweep.shapes]
         moved = [[ca.repmat(shape, 1, tangents) for shape in shapes] for shapes in (of, slopes)]
-        super().__init__([*of, *slopes, *moved[0]], moved[1], name, options)
+        super().__init__(name, [*of, *slopes, *moved[0]], moved[1], options)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -370,8 +317,3 @@ class _MovedSlopes(_Derived):
                 own = sweep.padded(sweep.direction(slopes, place))
                 sweep.tangent(given, sweep.seed(seeds, k), along, sweep.seed(moved_seeds, place), None, own)
         return 0
-
-
-def address(view: memoryview | None) -> int | None:
-    """Where the numbers of CasADi's buffer lie; None: no numbers are given or wanted."""
-    return None if view is None else int(np.frombuffer(view).ctypes.data)

@@ -9,8 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.nodes import Buffers, Node, address
 from covocp.passage.library import functions
-from covocp.passage.sweep import address
 
 STAGES = 4
 
@@ -61,55 +61,34 @@ def passed_back(steps: Steps, slopes: Any, by_states: Any, by_costs: Any) -> Any
 
 
 @cache
-def _node(steps: Steps, name: str) -> _Node:
+def _node(steps: Steps, name: str) -> _Passed:
     """CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
-    return _Node(steps, name)
+    return _Passed(steps, name)
 
 
-class _Node(ca.Callback):
+class _Passed(Node):
     """One of the functions of the library on some steps."""
 
     def __init__(self, steps: Steps, name: str) -> None:
-        ca.Callback.__init__(self)
         there = functions()
         assert there is not None
         self._run = there[name]
         entries, intervals = len(steps.pattern[0]), sum(steps.lengths)
         slopes = ca.Sparsity.dense(entries, STAGES * steps.steps * intervals)
         if name == "transitions":
-            self._inputs, self._output = [slopes], ca.Sparsity.dense(steps.rows, sum(steps.widths))
+            inputs, output = [slopes], ca.Sparsity.dense(steps.rows, sum(steps.widths))
         else:
             states = ca.Sparsity.dense(steps.rows, steps.steps * intervals)
-            self._inputs = [slopes, states, ca.Sparsity.dense(1, intervals)]
-            self._output = ca.Sparsity.dense(sum(steps.widths), 1)
+            inputs = [slopes, states, ca.Sparsity.dense(1, intervals)]
+            output = ca.Sparsity.dense(sum(steps.widths), 1)
         parts = (*steps.pattern, steps.lengths, steps.places, steps.active)
         self._kept = [np.array(part, dtype=np.intc) for part in parts]
         row, column, *others = (array.ctypes.data for array in self._kept)
         numbers = (steps.rows, entries, row, column, len(steps.places[0]), steps.steps, len(steps.lengths))
         self._arguments = (*numbers, *others)
-        self.construct(name, {})
+        super().__init__(name, inputs, [output])
 
-    def get_n_in(self) -> int:
-        """Of CasADi."""
-        return len(self._inputs)
-
-    def get_n_out(self) -> int:
-        """Of CasADi."""
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Of CasADi."""
-        return self._output
-
-    def has_eval_buffer(self) -> bool:
-        """Of CasADi."""
-        return True
-
-    def eval_buffer(self, arguments: tuple[memoryview | None, ...], results: tuple[memoryview | None, ...]) -> int:
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         out = address(results[0])
         if out is None:
