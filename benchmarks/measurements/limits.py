@@ -17,6 +17,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from passage import median_of
 
 import covocp as co
 from covocp.base.buffered import Buffered
@@ -25,16 +26,6 @@ from covocp.models import mass_chain, unknown_lag
 from covocp.passage.sweep import passed_by
 
 SWEEPS, AGAIN, PENDULUM_INTERVALS = 20, 100, 20
-
-
-def median_of(run: Callable[[], object], rounds: int) -> float:
-    """Median of the processor seconds of a call."""
-    seconds = []
-    for _ in range(rounds):
-        begin = time.process_time()
-        run()
-        seconds.append(time.process_time() - begin)
-    return statistics.median(seconds)
 
 
 def sweep_seconds(rows: int, steps: int) -> float:

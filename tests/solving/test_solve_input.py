@@ -223,13 +223,18 @@ def test_what_is_no_parameter_is_called_what_it_is():
             co.solve(ocp, parameters={name: 2.0}, progress=False)
 
 
-def test_a_problem_without_unknowns_takes_no_means():
+def moved() -> co.Problem:
+    """An integrator that is moved with least energy."""
     ocp = co.Problem(1.0)
     x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
     ocp.dynamics(x, u)
     ocp.minimize(running=u**2)
+    return ocp
+
+
+def test_a_problem_without_unknowns_takes_no_means():
     with pytest.raises(co.ProblemError, match="means= was given something") as caught:
-        co.Solver(ocp, intervals=10).solve(means={"b": 1.0})
+        co.Solver(moved(), intervals=10).solve(means={"b": 1.0})
     assert caught.value.expected == "one of none: the problem has nothing of that kind"
 
 
@@ -256,10 +261,28 @@ def test_a_control_that_nothing_stops_is_named():
 
 
 def test_how_many_intervals_there_may_be_is_told():
-    ocp = co.Problem(1.0)
-    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
-    ocp.dynamics(x, u)
-    ocp.minimize(running=u**2)
     with pytest.raises(co.ProblemError, match="'intervals'") as caught:
-        co.solve(ocp, intervals=10**10, progress=False)
+        co.solve(moved(), intervals=10**6, progress=False)
     assert caught.value.expected.endswith("at most 1e+05")
+
+
+@pytest.mark.parametrize(("name", "value"), [("starts", 3), ("seed", 2)])
+def test_what_belongs_to_random_starts_is_not_taken_silently(name, value):
+    with pytest.raises(co.ProblemError, match=f"The option '{name}' belongs to guess='multistart'"):
+        co.Solver(moved(), intervals=10).solve(progress=False, **{name: value})
+
+
+def test_units_of_nothing_are_refused():
+    solution = co.solve(moved(), intervals=10, progress=False)
+    with pytest.raises(co.ProblemError, match="units of 'zz'"):
+        solution.plot(units={"zz": "m"})
+
+
+def test_a_structure_says_yes_or_no():
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", initial=1.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.1)
+    ocp.measurement("y", x, noise=0.1)
+    ocp.minimize_expected(running=x**2 + u**2, gain=co.Gain(structure=0.5))
+    with pytest.raises(co.ProblemError, match="structure of the gain"):
+        co.solve(ocp, progress=False)
