@@ -1,13 +1,7 @@
 /* Tangents of the passage, and of its slopes. */
 /* X' M = B solved in place, B (n x n); X' = P' L U. */
-INLINE void divide_transposed(const double *RESTRICT factor, const int *RESTRICT swaps, int n, double *RESTRICT B) {
-    for (int k = 0; k < n; ++k) {
-        if (swaps[k] != k)
-            for (int c = 0; c < n; ++c) {
-                const double kept = B[k * n + c];
-                B[k * n + c] = B[swaps[k] * n + c], B[swaps[k] * n + c] = kept;
-            }
-    }
+INLINE void divide_transposed(const double *RESTRICT factor, const double *RESTRICT swaps, int n, double *RESTRICT B) {
+    for (int k = 0; k < n; ++k) exchange(B, n, k, (int)swaps[k]);
     for (int i = 1; i < n; ++i) add_rows(B + i * n, -1.0, factor + i * n, 1, B, n, i, n);
     for (int i = n - 1; i >= 0; --i) {
         double *RESTRICT own = B + i * n;
@@ -38,13 +32,14 @@ INLINE void stack(int n, int identity, const double *RESTRICT E, double *RESTRIC
 
 /* The tangent of one step: dE becomes that after it; those of the stages and of X are kept. */
 INLINE void tangent_step(
-    Passage *p, int n, int k, const double *E, const double *next, const double *d1, const double *d2,
+    Kept *kept, int n, int k, const double *E, const double *next, const double *d1, const double *d2,
     double *RESTRICT dE, double *RESTRICT spare
 ) {
+    const Passage *p = &kept->p;
     const int m = 2 * n, w = 3 * n;
     const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
     const double *RESTRICT Y1 = p->stage1 + (size_t)k * m * n;
-    double *RESTRICT dY1 = p->moved + (size_t)k * 5 * n * n, *RESTRICT dY2 = dY1 + m * n, *RESTRICT dX = dY2 + m * n;
+    double *RESTRICT dY1 = kept->moved + (size_t)k * 5 * n * n, *RESTRICT dY2 = dY1 + m * n, *RESTRICT dX = dY2 + m * n;
     double *RESTRICT a = p->work, *RESTRICT Z = spare, *RESTRICT dZ = Z + m * n, *RESTRICT inner = dZ + m * n;
     double *RESTRICT right = inner + m * n;
     stack(n, 1, E, Z);
@@ -79,12 +74,13 @@ INLINE void tangent_step(
 }
 
 /* The tangent of what reading j does: dE becomes that after it; those of K, A and E+ are kept. */
-INLINE void tangent_reading(Passage *p, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
+INLINE void tangent_reading(Kept *kept, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
+    const Passage *p = &kept->p;
     const int r = p->r;
     const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
     const double *M = p->told + j * telling(p), *dM = d_told, *K = p->gain + j * tall, *A = p->keep + j * square;
     const double *after = p->reached + j * square, *S = p->inverse + j * wide;
-    double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    double *dK = kept->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
     double *one = aside(p), *two = one + tall, *three = two + tall, *noise = three + tall, *other = noise + wide;
     double *spare = p->work, *more = spare + square;
     spread(d_told + tall, r, noise); /* dR */
@@ -124,33 +120,34 @@ static int same(double **kept, const double *given, size_t count) {
 
 /* Tangents along the passage, of the half-vectors after each step too; those along the last direction are known. */
 INLINE void tangents(
-    Passage *p, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
+    Kept *kept, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
     const double *d_kicks
 ) {
+    const Passage *p = &kept->p;
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
-    double *kept = p->direction, *d_after = p->shifted;
-    int known = p->along == (d_kicks ? 2 : 1);
-    known &= same(&kept, d_first, half);
-    known &= same(&kept, d1, nnz * p->moves);
-    known &= same(&kept, d2, nnz * p->moves);
-    known &= same(&kept, d_told, telling(p) * p->reads);
-    known &= same(&kept, d_kicks, half * p->count);
+    double *last = kept->direction, *d_after = kept->shifted;
+    int known = kept->along == (d_kicks ? 2 : 1);
+    known &= same(&last, d_first, half);
+    known &= same(&last, d1, nnz * p->moves);
+    known &= same(&last, d2, nnz * p->moves);
+    known &= same(&last, d_told, telling(p) * p->reads);
+    known &= same(&last, d_kicks, half * p->count);
     if (known) return;
-    p->along = d_kicks ? 2 : 1;
+    kept->along = d_kicks ? 2 : 1;
     double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
-    spread(p->first, n, E);
+    spread(kept->first, n, E);
     spread(d_first, n, dE);
     for (int k = 0; k < p->count; ++k) {
         const double *after = p->after + k * half;
         spread(after, n, next);
-        if (p->known == 2)
+        if (kept->known == 2)
             for (int j = 0, t = 0; j < n; ++j)
-                for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - p->kicks[k * half + t];
+                for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - kept->kicks[k * half + t];
         const int place = p->place[k];
         if (place < 0)
-            tangent_reading(p, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
+            tangent_reading(kept, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
         else
-            tangent_step(p, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
+            tangent_step(kept, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
         spread(after, n, E);
         if (d_kicks)
             for (int j = 0, t = 0; j < n; ++j)
@@ -165,12 +162,13 @@ INLINE void tangents(
 
 /* How the slopes at reading j move: P and dP become those before it. */
 INLINE void back_reading_tangent(
-    Passage *p, int n, int j, double *RESTRICT P, double *RESTRICT dP, double *RESTRICT spare, double *d_by_told
+    const Kept *kept, int n, int j, double *RESTRICT P, double *RESTRICT dP, double *RESTRICT spare, double *d_by_told
 ) {
+    const Passage *p = &kept->p;
     const int r = p->r;
     const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
     const double *K = p->gain + j * tall, *A = p->keep + j * square, *after = p->reached + j * square;
-    const double *dK = p->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
+    const double *dK = kept->turned + j * (tall + 2 * square), *dA = dK + tall, *dAfter = dA + square;
     double *more = spare + square;
     if (d_by_told) {
         double *fed = aside(p), *moved = fed + tall, *other = moved + tall, *noise = other + tall, *part = noise + wide;
@@ -197,9 +195,10 @@ INLINE void back_reading_tangent(
 
 /* How the slopes of `back` move along the tangents. */
 INLINE void back_tangents(
-    Passage *p, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
+    const Kept *kept, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
     double *d_by_told, double *d_by_kicks
 ) {
+    const Passage *p = &kept->p;
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
     const int m = 2 * n;
     double *P = p->work, *dP = P + n * n, *K = dP + n * n, *spare = K + n * n, *left = spare + m * n, *other = left + m * n;
@@ -211,10 +210,10 @@ INLINE void back_tangents(
         Slopes s = {0, 1, dP, NULL, NULL};
         if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + at * half);
         if (k < 0) {
-            back_reading_tangent(p, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
+            back_reading_tangent(kept, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
             continue;
         }
-        const double *moved = p->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
+        const double *moved = kept->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
         congruent(p, n, k, P, spare);
         congruent(p, n, k, dP, spare);
         memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */

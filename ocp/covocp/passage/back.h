@@ -1,6 +1,6 @@
 /* Slopes, from the last step to the first. */
 /* M <- X^-1 M, M (n x r) row by row; X' = P' L U. */
-INLINE void divide(const double *RESTRICT factor, const int *RESTRICT swaps, int n, int r, double *RESTRICT M) {
+INLINE void divide(const double *RESTRICT factor, const double *RESTRICT swaps, int n, int r, double *RESTRICT M) {
     for (int i = 0; i < n; ++i) {
         const double inverse = 1.0 / factor[i * n + i];
         double *RESTRICT own = M + i * r;
@@ -9,12 +9,7 @@ INLINE void divide(const double *RESTRICT factor, const int *RESTRICT swaps, int
     }
     for (int i = n - 2; i >= 0; --i)
         add_rows(M + i * r, -1.0, factor + (i + 1) * n + i, n, M + (i + 1) * r, r, n - 1 - i, r);
-    for (int k = n - 1; k >= 0; --k)
-        if (swaps[k] != k)
-            for (int c = 0; c < r; ++c) {
-                const double kept = M[k * r + c];
-                M[k * r + c] = M[swaps[k] * r + c], M[swaps[k] * r + c] = kept;
-            }
+    for (int k = n - 1; k >= 0; --k) exchange(M, r, k, (int)swaps[k]);
 }
 
 /* -1/2 (J left) right' at the nonzeros, both (2n x r). */
@@ -38,9 +33,9 @@ INLINE void add_seed(int n, const double *RESTRICT seed, double *RESTRICT P) {
 }
 
 /* X^-1 P X^-T, symmetric. */
-INLINE void congruent(Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
+INLINE void congruent(const Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
     const double *factor = p->factor + (size_t)k * n * n;
-    const int *swaps = p->swaps + (size_t)k * n;
+    const double *swaps = p->swaps + (size_t)k * n;
     divide(factor, swaps, n, n, P);
     for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) spare[i * n + j] = P[j * n + i];
@@ -109,7 +104,7 @@ INLINE void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRI
 }
 
 /* Slopes before a step and by its H: few columns. */
-INLINE void back_few(Passage *p, int n, int r, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
+INLINE void back_few(const Passage *p, int n, int r, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
     double *RESTRICT y = spare, *RESTRICT weighted = spare + 2 * n * r;
     divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, r, s->M);
     for (int stage = 0; stage < 2; ++stage) {
@@ -127,7 +122,7 @@ INLINE void back_few(Passage *p, int n, int r, int k, Slopes *s, double *RESTRIC
 }
 
 /* The same with all of P. */
-INLINE void back_all(Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
+INLINE void back_all(const Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
     congruent(p, n, k, s->P, spare);
     for (int stage = 0; stage < 2; ++stage) {
         const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n;
@@ -144,7 +139,7 @@ INLINE void pack_noise(const double *RESTRICT slope, int r, double *RESTRICT hal
 }
 
 /* Slopes before a reading and by what tells of it: few columns, or all of P. */
-INLINE void back_reading(Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
+INLINE void back_reading(const Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
     const int r = p->r, few = s->few;
     const size_t square = (size_t)n * n, tall = (size_t)r * n;
     const double *K = p->gain + j * tall, *A = p->keep + j * square;
@@ -168,7 +163,7 @@ INLINE void back_reading(Passage *p, int n, int j, Slopes *s, double *RESTRICT s
 }
 
 INLINE void back(
-    Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
+    const Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
     double *by_kicks
 ) {
     const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p);

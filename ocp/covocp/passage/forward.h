@@ -39,7 +39,7 @@ INLINE void solve_full(
         assemble(p, n, k, E, w, a);
         for (int i = 0; right && i < m; ++i) memcpy(a + i * w + m, right + i * columns, sizeof(double) * columns);
         if (exchanging)
-            eliminate(a, m, w, p->exchanged);
+            eliminate(a, m, w, NULL);
         else if (eliminate_steady(a, m, w, p->sizes))
             return;
     }
@@ -94,7 +94,7 @@ INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
     const size_t place = p->lean ? 0 : (size_t)k;
     double *RESTRICT Y1 = p->stage1 + place * m * n, *RESTRICT Y2 = p->stage2 + place * m * n;
     double *RESTRICT factor = p->factor + place * n * n;
-    int *swaps = p->swaps + place * n;
+    double *swaps = p->swaps + place * n;
     double *RESTRICT stage = transition ? D : Y1;
     if (!p->order || !sparse_stage(p, n, k, E, columns, stage)) {
         solve_full(p, n, k, E, w, NULL, a);
@@ -136,7 +136,7 @@ INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
         for (int c = 0; c < r; ++c) a[i * w + c] = S[i * r + c] + R[i * r + c], a[i * w + r + c] = i == c;
         memcpy(a + i * w + 2 * r, seen + i * n, sizeof(double) * n);
     }
-    eliminate(a, r, w, p->exchanged);
+    eliminate(a, r, w, NULL);
     for (int i = 0; i < r; ++i) {
         memcpy(S + i * r, a + i * w + r, sizeof(double) * r);
         for (int c = 0; c < n; ++c) K[c * r + i] = a[i * w + 2 * r + c];
@@ -153,27 +153,9 @@ INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
     memcpy(after, E, sizeof(double) * square);
 }
 
-/* Whether the passage at this point is known. */
-static int here(
-    const Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
-) {
-    const size_t half = sizeof(double) * p->n * (p->n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
-    if (!p->known || memcmp(p->first, first, half) || memcmp(p->h1, h1, all) || memcmp(p->h2, h2, all)) return 0;
-    if (p->reads && memcmp(p->told, told, sizeof(double) * telling(p) * p->reads)) return 0;
-    return kicks ? !memcmp(p->kicks, kicks, half * p->count) : p->known == 1;
-}
-
-INLINE void run(
-    Passage *p, int n, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
-) {
-    const size_t half = (size_t)n * (n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
-    if (here(p, first, h1, h2, told, kicks)) return;
-    p->known = p->along = 0;
-    memcpy(p->first, first, sizeof(double) * half);
-    memcpy(p->h1, h1, all);
-    memcpy(p->h2, h2, all);
-    if (p->reads) memcpy(p->told, told, sizeof(double) * telling(p) * p->reads);
-    if (kicks) memcpy(p->kicks, kicks, sizeof(double) * half * p->count);
+/* The passage from the first half-vector on, at p->h1, p->h2, p->told; kicks are added to what passes, NULL: nothing. */
+INLINE void passes(Passage *p, int n, const double *first, const double *kicks) {
+    const size_t half = (size_t)n * (n + 1) / 2;
     double *E = p->work + 14 * n * n;
     spread(first, n, E);
     for (int k = 0; k < p->count; ++k) {
@@ -189,5 +171,4 @@ INLINE void run(
         for (size_t t = 0; t < half; ++t) after[t] += kicks[k * half + t];
         spread(after, n, E);
     }
-    p->known = kicks ? 2 : 1;
 }

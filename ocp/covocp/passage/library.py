@@ -12,15 +12,19 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 5
+VERSION = 6
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "passage_new": (_ADDRESS, (_WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE) + (_ADDRESS,) * 4 + (_WHOLE,)),
+    "passage_new": (_ADDRESS, (_ADDRESS, _WHOLE, _WHOLE)),
+    "passage_bytes": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
     "passage_free": (None, (_ADDRESS,)),
     "passage_forward": (None, (_ADDRESS,) * 7),
     "passage_reverse": (None, (_ADDRESS,) * 12),
     "passage_tangent": (_WHOLE, (_ADDRESS,) * 19),
+    "exported_length": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
+    "exported_forward": (None, (_ADDRESS,) * 7),
+    "exported_slopes": (None, (_ADDRESS,) * 8),
     "transitions": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 5),
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }

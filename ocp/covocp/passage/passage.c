@@ -34,33 +34,49 @@
 #define Py_LIMITED_API 0x030b0000
 #include <Python.h>
 
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+/* One file for all machines: where the loader can choose, there is a second version for newer processors. */
+#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define VERSIONS __attribute__((target_clones("arch=x86-64-v3", "default")))
+#else
+#define VERSIONS
+#endif
+
 #include "memory.h"
 #include "rows.h"
 #include "sparse.h"
 #include "forward.h"
 #include "back.h"
+#include "written.h"
+#include "kept.h"
 #include "along.h"
 #include "transitions.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 5; }
+EXPORT int passage_version(void) { return 6; }
 
 /* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT VERSIONS void passage_forward(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
     double *after
 ) {
-    run(p, p->n, first, h1, h2, told, kicks);
+    const Passage *p = &k->p;
+    run(k, p->n, first, h1, h2, told, kicks);
     if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
 }
 
 /* Slopes of seed . after by the arguments; those that are NULL are left out. */
 EXPORT VERSIONS void passage_reverse(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
     const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told, double *by_kicks
 ) {
-    run(p, p->n, first, h1, h2, told, kicks);
-    back(p, p->n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+    run(k, k->p.n, first, h1, h2, told, kicks);
+    back(&k->p, k->p.n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
 }
 
 /* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
@@ -69,24 +85,41 @@ EXPORT VERSIONS void passage_reverse(
  * are zero.
  */
 EXPORT VERSIONS int passage_tangent(
-    Passage *p, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
     const double *seed, const double *d_first, const double *d_h1, const double *d_h2, const double *d_told,
     const double *d_kicks, const double *d_seed, double *d_after, double *d_by_first, double *d_by_h1,
     double *d_by_h2, double *d_by_told, double *d_by_kicks
 ) {
+    const Passage *p = &k->p;
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
-    const size_t half = square / 2 + p->n / 2 + 1, all = half * p->count, d = sizeof(double);
-    const size_t point = half + all + 2 * (size_t)p->nnz * p->moves + telling(p) * p->reads;
-    if (!p->moved) p->moved = room((size_t)p->moves * 5 * square, d);
-    if (!p->turned) p->turned = room((size_t)p->reads * turned, d);
-    if (!p->direction) p->direction = calloc(point, d); /* compared before it is first written */
-    if (!p->shifted) p->shifted = room(all, d);
-    if (!p->moved || !p->turned || !p->direction || !p->shifted) return 1;
-    run(p, p->n, first, h1, h2, told, kicks);
-    tangents(p, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
-    if (d_after) memcpy(d_after, p->shifted, d * ((size_t)p->n * (p->n + 1) / 2) * p->count);
-    if (seed) back_tangents(p, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
+    const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->count, d = sizeof(double);
+    if (!k->moved) k->moved = room((size_t)p->moves * 5 * square, d);
+    if (!k->turned) k->turned = room((size_t)p->reads * turned, d);
+    if (!k->direction) k->direction = calloc(numbers(p), d); /* compared before it is first written */
+    if (!k->shifted) k->shifted = room(all, d);
+    if (!k->moved || !k->turned || !k->direction || !k->shifted) return 1;
+    run(k, p->n, first, h1, h2, told, kicks);
+    tangents(k, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
+    if (d_after) memcpy(d_after, k->shifted, d * all);
+    if (seed) back_tangents(k, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
     return 0;
+}
+
+/* What exported code computes, compiled as it is there: the same numbers to the last digit. */
+EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }
+
+EXPORT void exported_forward(
+    const int *shape, int *chosen, const double *first, const double *h1, const double *h2, const double *told,
+    double *result
+) {
+    written_forward(shape, chosen, first, h1, h2, told, result);
+}
+
+EXPORT void exported_slopes(
+    const int *shape, int *chosen, const double *h1, const double *h2, const double *told, const double *passed,
+    const double *seed, double *result
+) {
+    written_slopes(shape, chosen, h1, h2, told, passed, seed, result);
 }
 
 static struct PyModuleDef definition = {

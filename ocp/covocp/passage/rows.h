@@ -20,8 +20,16 @@ INLINE void add_rows(
     }
 }
 
+/* Two rows of w entries change places. */
+INLINE void exchange(double *RESTRICT a, int w, int one, int other) {
+    for (int j = 0; one != other && j < w; ++j) {
+        const double kept = a[one * w + j];
+        a[one * w + j] = a[other * w + j], a[other * w + j] = kept;
+    }
+}
+
 /* Columns `begin` to `end` of m rows made triangular with partial pivoting of whole rows of w entries. */
-INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, int *RESTRICT swaps) {
+INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, double *RESTRICT swaps) {
     for (int k = begin; k < end; ++k) {
         int pivot = k;
         double largest = fabs(a[k * w + k]);
@@ -29,12 +37,8 @@ INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, int *RES
             const double size = fabs(a[i * w + k]);
             if (size > largest) largest = size, pivot = i;
         }
-        swaps[k] = pivot;
-        if (pivot != k)
-            for (int j = 0; j < w; ++j) {
-                const double kept = a[k * w + j];
-                a[k * w + j] = a[pivot * w + j], a[pivot * w + j] = kept;
-            }
+        if (swaps) swaps[k] = pivot;
+        exchange(a, w, k, pivot);
         const double inverse = 1.0 / a[k * w + k];
         for (int i = k + 1; i < m; ++i) {
             double *own = a + i * w;
@@ -55,8 +59,9 @@ INLINE void solve_upper(double *RESTRICT a, int m, int w) {
     }
 }
 
-/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps), the others solved. */
-INLINE void eliminate(double *RESTRICT a, int m, int w, int *RESTRICT swaps) {
+/* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL), the
+ * others solved. */
+INLINE void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) {
     for (int k = 0; k < m; k += 4) {
         const int end = k + 4 < m ? k + 4 : m;
         panel(a, m, w, k, end, swaps);

@@ -15,12 +15,11 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.nodes import Buffers, Node, address
 from covocp.passage.library import functions
-from covocp.passage.ordering import ordering
+from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
 KEPT_BYTES = 50_000_000
 
-Pattern = tuple[tuple[int, ...], tuple[int, ...]]
 Given = Mapping[str, Any]
 
 
@@ -143,15 +142,9 @@ class _Sweep(Node):
         """Keep what the library is told; `lean`: for values alone, of which no steps are kept."""
         self._lean = lean
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
-        self._size, self._height = size, height
-        self._read = np.zeros(count, dtype=np.intc)
-        self._read[list(reads)] = 1
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
-        self._rows, self._columns = (np.array(part, dtype=np.intc) for part in pattern)
-        self._ordering = ordering(size, *(list(part) for part in pattern))
-        steps = (1 if lean else self.moves) * 10 * size * size + 2 * self.moves * self.entries + 2 * count * self.half
-        readings = self.reads * (4 * size * size + 2 * height * (size + height) + self.telling)
-        self.bytes = 8 * (steps + readings + 17 * size * size)
+        self._shape = shape(size, pattern, count, reads, height)
+        self.bytes = int(_library()["passage_bytes"](self._shape.ctypes.data, int(lean)))
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
         sizes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
@@ -163,11 +156,7 @@ class _Sweep(Node):
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
-        rows, columns = self._rows.ctypes.data, self._columns.ctypes.data
-        read, own = self._read.ctypes.data, self._ordering
-        order = [None] * 3 if own is None else [part.ctypes.data for part in (own.order, own.begins, own.columns)]
-        numbers = (self._size, self.entries, rows, columns, self.count, self._height, read)
-        memory = _library()["passage_new"](*numbers, *order, int(self._lean))
+        memory = _library()["passage_new"](self._shape.ctypes.data, self._shape.size, int(self._lean))
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
