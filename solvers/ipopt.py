@@ -19,6 +19,7 @@ from covocp.base.residuals import LIMIT
 from covocp.extremal.extremal import Guess, Outcome
 from covocp.extremal.links import ChainOutcome
 from covocp.passage.library import build_info
+from covocp.passage.sweep import passed_by
 from covocp.solvers.plugins import merged
 from covocp.solvers.reached import Magnitudes
 from covocp.solvers.runs import MAX_ITERATIONS, Runs, extremals
@@ -303,7 +304,7 @@ def _builder(
 ) -> Callable[[Magnitudes | None, Trajectories, Arrays], Program]:
     """What makes the program in some magnitudes, or in those of trajectories where there are none."""
 
-    passage: Passage = "compiled" if limited and chain is None else "plain"
+    passage: Passage = passed_by if limited and chain is None else None
 
     def build(scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> Program:
         pairs = list(zip(statements, meshes, strict=True))

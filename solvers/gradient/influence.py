@@ -40,6 +40,7 @@ from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import backward_interval, forward_costates, reading_slopes
 from covocp.extremal.hamiltonian import hamiltonian
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
+from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -201,7 +202,7 @@ def _passage(statement: Statement, mesh: Mesh) -> ca.Function:
     ends, fine, cost = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("passage", n)(start[:nx], *common)
     x = ca.horzcat(start[:nx], ends)
     e, matrix_cost = matrices_along(
-        statement, mesh, x, fine, common, common.parameters[:, 0], start[nx:], passage="compiled"
+        statement, mesh, x, fine, common, common.parameters[:, 0], start[nx:], passage=passed_by
     )
     return ca.Function("forward", [start, *common], [ca.vertcat(x, e), cost + matrix_cost])
 

@@ -17,6 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.residuals import LIMIT, Residuals
 from covocp.extremal.extremal import Guess, Outcome
+from covocp.passage.sweep import passed_by
 from covocp.solvers.at_point import AtPoint
 from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes
@@ -108,7 +109,7 @@ class ReducedRuns(Runs):
         def build(scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> Program:
             if scales is None:
                 scales = (choose_scales(statement, mesh, trajectories[0], parameters[0]),)
-            return alone(transcribe(statement, mesh, evened(scales[0], mesh), "compiled"))
+            return alone(transcribe(statement, mesh, evened(scales[0], mesh), passed_by))
 
         super().__init__(build, "reduced", {}, True, max(LIMIT, LIMIT_PER_TOLERANCE * tolerance))
         self._open = True

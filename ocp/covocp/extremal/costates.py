@@ -21,6 +21,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
 from covocp.extremal.hamiltonian import Costates, state_slope
 from covocp.extremal.inside import instant_jumps
+from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, StepKind
@@ -220,7 +221,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     weights = ca.MX.sym("weights", statement.ne, n + 1)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(n)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage="compiled")
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage=passed_by)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes = slopes_by(value, (x, u, duration, kicks))
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)

@@ -16,6 +16,7 @@ from covocp.base.matrices import Array, stacked
 from covocp.extremal.active_constraints import Entries
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.hamiltonian import Costates
+from covocp.passage.sweep import passed_by
 from covocp.statement.conditions import Columns, Conditions, Inside
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
@@ -85,7 +86,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         e = seen = ca.MX(0, n + 1)
         if st.matrices:
             passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1])
-            e, matrix_cost = matrices_along(*passing, passage="compiled")
+            e, matrix_cost = matrices_along(*passing, passage=passed_by)
             seen = matrices_along(*passing)[0] if compiled_steps(mesh) and _sees_matrices(st, held) else e
             cost += matrix_cost
     value = ca.sum2(cost) + st.terminal(x[:, -1], e[:, -1], duration, p) + ca.dot(costate[:, 1:], ends - z[:, 1:])

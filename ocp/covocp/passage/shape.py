@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ def shape(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], heigh
     return np.concatenate([np.asarray(part, dtype=np.intc) for part in parts])
 
 
-def _factors(own: Ordering) -> list[NDArray[np.intp]]:
+def _factors(own: Ordering) -> list[NDArray[Any]]:
     """Order, its inverse, and the pattern of the factors before and behind the diagonal of each row."""
     height = own.order.size
     rank = np.argsort(own.order)

@@ -50,16 +50,23 @@ def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None
         A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps),
         but its sparsity is not seen: no Jacobians of it.
     """
-    rows, columns = _pattern(points, size)
-    moves = points[0].shape[1] // (2 * size)
-    shape = ca.Sparsity.dense(len(rows), moves)
-    wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, moves)
-    entries = [ca.sparsity_cast(ca.project(point, wide), shape) for point in points]
+    pattern, given = entries(points, size)
     steps, height = ((), 0) if told is None else (told.steps, told.rows)
     numbers = isinstance(first, ca.DM) and all(isinstance(point, ca.DM) for point in points)
-    sweep = _sweep(size, (tuple(rows), tuple(columns)), moves + len(steps), kicks is not None, steps, height, numbers)
+    count = given[0].shape[1] + len(steps)
+    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, numbers)
     others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
-    return sweep(first, *entries, *others)
+    return sweep(first, *given, *others)
+
+
+def entries(points: Sequence[Expr], size: int) -> tuple[Pattern, list[Any]]:
+    """Rows and columns of what may be nonzero in some step, and what is there at both points, a column a step."""
+    rows, columns = _pattern(points, size)
+    moves = points[0].shape[1] // (2 * size)
+    dense = ca.Sparsity.dense(len(rows), moves)
+    wide = ca.repmat(ca.Sparsity.triplet(2 * size, 2 * size, rows, columns), 1, moves)
+    given = [ca.sparsity_cast(ca.project(point, wide), dense) for point in points]
+    return (tuple(rows), tuple(columns)), given
 
 
 def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None) -> Any:

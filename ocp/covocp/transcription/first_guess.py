@@ -14,6 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, pack, real_numbers, unpack
 from covocp.base.quadrature import interpolated
+from covocp.passage.sweep import passed_by
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
@@ -271,5 +272,5 @@ def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, passage="compiled")
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, passage=passed_by)
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])

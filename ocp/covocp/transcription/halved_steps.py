@@ -11,6 +11,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.passage.sweep import passed_by
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import NUMERIC_RUN, interval_columns, shoot
@@ -59,7 +60,7 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
         duration=ca.DM(trajectory.duration),
         parameters=ca.DM(parameters),
     )
-    values = shoot(statement, divided, start, passage="compiled")
+    values = shoot(statement, divided, start, passage=passed_by)
     jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
     states, matrices = (np.asarray(ca.DM(values[name][:, ::parts]).full()).T for name in ("x", "e"))
     costs = np.asarray(ca.DM(values["cost"]).full()).reshape(mesh.intervals, parts).sum(axis=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,7 +18,7 @@ from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import half_length
 from covocp.passage.library import functions
-from covocp.passage.sweep import Told, depends, passed_by
+from covocp.passage.sweep import Told, passed_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import fed, gauss_points, moving_step, propagate_step, step_matrix
@@ -39,9 +39,9 @@ from covocp.transcription.steps import (
 # Steps that a sequence of numbers takes at a time.
 NUMERIC_RUN = 10
 
-# How eliminated matrices pass: by CasADi's operations; where the steps allow it in compiled code, of which CasADi sees
-# no sparsity (slopes along directions, no Jacobians); or something that depends on what they depend on.
-Passage = Literal["plain", "compiled", "dependence"]
+# How eliminated matrices pass: by CasADi's operations (None); where the steps allow it in compiled code (`passed_by`),
+# of which CasADi sees no sparsity (slopes along directions, no Jacobians); or by what has the same arguments.
+Passage = Callable[..., Any] | None
 
 # (value, arguments, count) -> what a sequence of steps gives, a column for each step.
 Run = Callable[[Any, list[Any], int], list[Any]]
@@ -72,7 +72,7 @@ def shoot(
     mesh: Mesh,
     variables: Expr,
     *,
-    passage: Passage = "plain",
+    passage: Passage = None,
     run: tuple[Any, Any, Any] | None = None,
 ) -> dict[str, Any]:
     """States and half-vectors at all nodes, gaps at the ends of the segments, running cost of each interval.
@@ -163,7 +163,7 @@ def matrices_along(
     e0: Expr = None,
     kicks: Expr = None,
     *,
-    passage: Passage = "plain",
+    passage: Passage = None,
 ) -> tuple[Any, Any]:
     """Propagate the matrices along a nominal: those that run backward from its end, the others from its start.
 
@@ -196,7 +196,7 @@ def passages(
     e0: Expr = None,
     kicks: Expr = None,
     *,
-    passage: Passage = "plain",
+    passage: Passage = None,
 ) -> tuple[Any, Any, Any]:
     """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
     n = mesh.intervals
@@ -206,7 +206,8 @@ def passages(
         ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     columns = _substeps(statement, mesh, x, fine, intervals)
-    sequence = partial(_sequence, statement, mesh, passage if compiled_steps(mesh) else "plain")
+    own = None if passage is passed_by and not compiled_steps(mesh) else passage
+    sequence = partial(_sequence, statement, mesh, own)
     first = e0[statement.entries(statement.ahead)]
     groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
     if statement.matrix_end is not None:
@@ -239,7 +240,7 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
     columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
     assert statement.matrix_end is not None
     last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)
-    sequence = partial(_sequence, statement, mesh, "plain")
+    sequence = partial(_sequence, statement, mesh, None)
     return _backward(statement, mesh, sequence, last, columns, None)[0][:, 0]
 
 
@@ -344,7 +345,7 @@ def _sequence(
     """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
     count = mesh.intervals * mesh.substeps
     reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
-    if reads and passage != "plain" and len(positions) == 1:
+    if reads and passage is not None and len(positions) == 1:
         return _reading_passage(statement, mesh, passage, positions[0], first, columns, kicks)
     moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
     chosen = [column[:, moving] for column in columns] if reads else columns
@@ -370,10 +371,10 @@ def _steps(
         step = moving_step(statement, positions, mesh.step, mesh.linear_solver)
         step = _kicked(step) if kicked else step
         return lambda columns, _: (list(columns), partial(_accumulated, step))
-    if passage != "plain":
+    if passage is not None:
         sizes = [statement.matrices[i].size for i in positions]
         kinds = [gauss_points(statement, i, mesh.step) for i in positions]
-        run = partial(_compiled, passed_by if passage == "compiled" else depends, sizes, kicked)
+        run = partial(_compiled, passage, sizes, kicked)
         return lambda columns, count: ([h for kind in kinds for h in kind.map(count).call(list(columns))], run)
     if mesh.step == "rk4":
         step = runge_kutta_step(statement, positions)
@@ -402,7 +403,7 @@ def _compiled(
 def _reading_passage(
     statement: Statement,
     mesh: Mesh,
-    passage: Passage,
+    passage: Callable[..., Any],
     position: int,
     first: Expr,
     columns: tuple[Any, ...],
@@ -425,13 +426,12 @@ def _reading_passage(
     told = Told(steps=steps, rows=height, columns=told_at(statement).map(len(reads))(*chosen))
     points = gauss_points(statement, position, mesh.step).map(len(moving)).call([c[:, moving] for c in columns])
     size = statement.matrices[position].size
-    passing = passed_by if passage == "compiled" else depends
     if kicks is None:
-        values = passing(first, points, size, None, told)[:, last.tolist()]
+        values = passage(first, points, size, None, told)[:, last.tolist()]
         return values, values
     later = ca.MX(first.shape[0], int(last[-1]) + 1)
     later[:, last[mesh.substeps - 1 :: mesh.substeps].tolist()] = kicks
-    passed = passing(first, points, size, ca.densify(later), told)[:, last.tolist()]
+    passed = passage(first, points, size, ca.densify(later), told)[:, last.tolist()]
     at_nodes = ca.MX(first.shape[0], count)
     at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
     return passed - at_nodes, passed
@@ -520,7 +520,7 @@ def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any,
     x = ca.horzcat(x0, ends)
     if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost
-    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0, passage="compiled")
+    e, matrix_cost = matrices_along(statement, mesh, x, fine, intervals, p, e0, passage=passed_by)
     return x, e, cost + matrix_cost
 
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
+from covocp.passage.sweep import depends, passed_by
+from covocp.passage.written import Tape
 from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
@@ -26,13 +28,14 @@ from covocp.transcription.shooting import (
     shoot,
 )
 from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
+from covocp.transcription.taped import Taped
 
 # Adjoint sweeps that a Jacobian takes at once.
 LARGEST_DIRECTIONS = 64
 
 
 def transcribe(
-    statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = "plain", *, stages: bool = False
+    statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = None, *, stages: bool = False
 ) -> NLP:
     """Build the NLP of a statement on a mesh.
 
@@ -47,17 +50,16 @@ def transcribe(
         The NLP; its functions are not yet differentiated.
     """
     variables = _Variables(statement, mesh, scales)
-    passage = passage if compiled_steps(mesh) else "plain"
-    along = _AlongRun(variables) if passage == "compiled" and is_staged(statement, mesh) else None
+    passage = passage if compiled_steps(mesh) else None
+    along = _AlongRun(variables) if passage is not None and is_staged(statement, mesh) else None
     nodes = shoot(statement, mesh, variables, passage=passage) if along is None else along.nodes
     running, terminal = _costs(variables, nodes)
     rows = _constraints(statement, mesh, scales, variables, nodes)
     g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
     p = ca.vertcat(variables.p)
     depending = None
-    if passage == "compiled" and any(entry.dense for entry in rows):
-        seen = shoot(statement, mesh, variables, passage="dependence")
-        depending = _dense(_constraints(statement, mesh, scales, variables, seen))
+    if passage is not None and any(entry.dense for entry in rows):
+        depending = _depending(variables, scales)
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
     stages = stages and statement.nx >= SMALLEST_ALONE and is_staged(statement, mesh)
     by_stages = _staged(variables, nodes) if stages or along is not None else None
@@ -75,6 +77,51 @@ def transcribe(
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
         backward=_backward(statement, mesh, variables, p),
     )
+
+
+def written_out(statement: Statement, mesh: Mesh, scales: Scales, tape: Tape) -> NLP:
+    """The NLP of a statement of which matrices pass alone, for C code: the passages are those of a tape.
+
+    Args:
+        statement: the problem.
+        mesh: nodes and segments; its matrices are eliminated, its steps those of Gauss.
+        scales: magnitudes in which the NLP works.
+        tape: takes the passages.
+    """
+    variables = _Variables(statement, mesh, scales)
+    taped = Taped(statement, mesh, variables, tape)
+    running, terminal = _costs(variables, taped.nodes)
+    rows = _constraints(statement, mesh, scales, variables, taped.nodes)
+    f = (running + terminal) / variables.cost_scale
+    cost = sum(_costs(variables, taped.given)) / variables.cost_scale
+    gradient, dense = taped.slopes(cost, _dense(_constraints(statement, mesh, scales, variables, taped.given)))
+    others = ca.jacobian(ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows if not entry.dense)), variables.w)
+    if dense.shape[0]:
+        dense = ca.project(dense, ca.jacobian_sparsity(_depending(variables, scales), variables.w))
+    g = ca.vertcat(ca.MX(0, 1), *(entry.expression for entry in rows))
+    nodes = taped.nodes
+    outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
+    return NLP(
+        statement=statement,
+        mesh=mesh,
+        scales=scales,
+        w=variables.w,
+        p=ca.vertcat(variables.p),
+        f=f,
+        g=g,
+        rows=rows,
+        gradient=(f, gradient),
+        jacobian=ca.vertcat(others, dense),
+        evaluate=ca.Function("evaluate", [variables.w, variables.p], outputs),
+        backward=_backward(statement, mesh, variables, variables.p),
+    )
+
+
+def _depending(variables: _Variables, scales: Scales) -> Any:
+    """What depends on the variables as the dense rows do, where the sparsity of these cannot be seen."""
+    statement, mesh = variables.statement, variables.mesh
+    seen = shoot(statement, mesh, variables, passage=depends)
+    return _dense(_constraints(statement, mesh, scales, variables, seen))
 
 
 def _backward(statement: Statement, mesh: Mesh, variables: _Variables, p: Expr) -> ca.Function | None:
@@ -283,7 +330,7 @@ class _AlongRun:
         names = ("ends", "fine", "cost")
         self._given = [ca.MX.sym(name, *value.shape) for name, value in zip(names, self._run, strict=True)]
         ends, fine, costs = self._given
-        self._nodes = shoot(variables.statement, variables.mesh, variables, passage="compiled", run=(ends, fine, costs))
+        self._nodes = shoot(variables.statement, variables.mesh, variables, passage=passed_by, run=(ends, fine, costs))
 
     @property
     def nodes(self) -> dict[str, Any]:

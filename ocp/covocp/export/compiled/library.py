@@ -7,7 +7,6 @@ import ctypes
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -194,7 +193,7 @@ class Call:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what belongs to this process."""
-        law = replace(self.law, points=no_points)
+        law = self.law.sent(evaluated=self._library is None)
         return {name: value for name, value in self.__dict__.items() if name != "_backend"} | {"law": law}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -382,8 +381,3 @@ class Laws(Mapping[str, Call]):
 def laws_of(laws: tuple[Law, ...], library: Library | None) -> Laws:
     """The laws as functions of Python, of a library or, without one, of CasADi."""
     return Laws({law.name: (Controller if law.kind == "controller" else Call)(law, library) for law in laws})
-
-
-def no_points(random: np.random.Generator, count: int) -> Array:
-    """Stands for the points of a law in another process, where nothing is compared."""
-    raise NotImplementedError

@@ -7,7 +7,7 @@ flat *row by row*, as C has it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -16,6 +16,7 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.passage.written import Written
 
 Kind = Literal["function", "sample", "controller", "solver"]
 Points = Callable[[np.random.Generator, int], Array]
@@ -102,6 +103,8 @@ class Law:
         notes: what the package says of the law where it is printed.
         most: largest number of points.
         tolerance: largest deviation of C from Python, relative.
+        code: of the core, where another form of it is written out; passages: C code that this form calls; plain: makes
+            a core that other processes can have; all of them None where the core itself will do.
     """
 
     name: str
@@ -120,8 +123,23 @@ class Law:
     notes: tuple[str, ...] = ()
     most: int = 100_000
     tolerance: float = 1e-12
+    code: ca.Function | None = field(default=None, repr=False)
+    passages: Written | None = None
+    plain: Callable[[], ca.Function] | None = field(default=None, repr=False)
 
     __repr__ = short_repr
+
+    @property
+    def written(self) -> ca.Function:
+        """What is written out."""
+        return self.core if self.code is None else self.code
+
+    def sent(self, *, evaluated: bool) -> Law:
+        """What another process needs of it, with a core where that is evaluated there."""
+        core = self.core
+        if self.plain is not None:
+            core = self.plain() if evaluated else ca.Function("none", [], [])
+        return replace(self, core=core, points=_no_points, code=None, passages=None, plain=None)
 
     @property
     def arguments(self) -> tuple[Port, ...]:
@@ -169,6 +187,11 @@ class Law:
             if np.isfinite(values).all():
                 return values
         return np.append(self.safe[:-1], float(CODES[reason]))
+
+
+def _no_points(random: np.random.Generator, count: int) -> Array:
+    """Stands for the points of a law in another process, where nothing is compared."""
+    raise NotImplementedError
 
 
 def span(ports: tuple[Port, ...], name: str) -> slice:

@@ -22,13 +22,15 @@ from covocp.export.compiled.linking import PLUGINS, Linking
 from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.laws.replanning import Replannable, replannable, stacked
 from covocp.export.text.names import identifier
+from covocp.passage.written import Tape
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.solver import Solver
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import NLP, QUIET
 from covocp.transcription.scales import choose_scales, evened
-from covocp.transcription.transcribing import transcribe
+from covocp.transcription.shooting import compiled_steps
+from covocp.transcription.transcribing import transcribe, written_out
 
 # In the NLP's own units: what counts as solved, and what the solvers are asked for. Interior-point methods end with a
 # barrier of a tenth of what they are asked for, which the cost has in it for each bound that is reached.
@@ -73,6 +75,7 @@ class _Task:
         solution: of the export.
         scale: of the cost.
         multipliers: of the solution in units of the NLP, of the variables and of the constraints.
+        written: the transcription that is written out, with the passages of its tape; None: `nlp` itself.
     """
 
     made: Replannable
@@ -80,6 +83,7 @@ class _Task:
     solution: Solution
     scale: float
     multipliers: tuple[Array, Array]
+    written: tuple[NLP, Tape] | None
 
     __repr__ = short_repr
 
@@ -115,18 +119,23 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     for name in options:
         if name not in known:
             raise no_export_option("a problem", name, options[name], allowed)
-    task = _task(problem, {name: value for name, value in options.items() if name != "plugin_options"})
+    made = replannable(problem)
+    chosen = {name: value for name, value in options.items() if name != "plugin_options"}
+    solution = Solver(made.fixed, **chosen).solve(progress=False)
     own = dict(options.get("plugin_options") or {})
-    failure = ""
-    for exact in _hessians(task.nlp, method, own):
+    alone = solution.mesh.eliminated and len(made.statement.matrices) > 0
+    failed = ""
+    for exact in _hessians(method, own, alone=alone):
+        task = _task(made, solution, limited=not exact)
         law = _law(task, method, _settings(method, exact, own))
         failure = _failure(law)
         if not failure:
             return law, PLUGINS[method]
+        failed = f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints; {failure}"
     raise ExportError(
         f"The method '{method}' does not solve '{problem.name}' again from its own solution.",
         expected="a plan near that of the export, for initial values near those of the problem",
-        received=f"{task.nlp.w.shape[0]} variables, {task.nlp.g.shape[0]} constraints; {failure}",
+        received=failed,
         remedy=("another method" if method == "ipopt" else "method='ipopt' (linked)")
         + ", fewer intervals, or plugin_options such as {'max_iter': 1000}",
     )
@@ -145,19 +154,24 @@ def _failure(law: Law) -> str:
     return ""
 
 
-def _task(problem: Problem, options: dict[str, Any]) -> _Task:
-    """Reference solution and transcription."""
-    made = replannable(problem)
-    solution = Solver(made.fixed, **options).solve(progress=False)
+def _task(made: Replannable, solution: Solution, *, limited: bool) -> _Task:
+    """Transcription near a reference solution; `limited`: for slopes of first order."""
     statement = made.statement
     mesh = replace(solution.mesh, linear_solver=COMPILED_SOLVER)
     scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
-    if mesh.eliminated and statement.matrices:
+    alone = mesh.eliminated and len(statement.matrices) > 0
+    if alone:
         scales = evened(scales, mesh)
-    nlp = transcribe(statement, mesh, scales)
+    written = None
+    if limited and alone and not statement.coupled and compiled_steps(solution.mesh):
+        nlp = written_out(statement, mesh, scales, Tape("evaluated"))
+        tape = Tape("written")
+        written = written_out(statement, mesh, scales, tape), tape
+    else:
+        nlp = transcribe(statement, mesh, scales)
     scale = _cost_scale(nlp, solution)
     multipliers = _multipliers(nlp, solution, scale)
-    return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers)
+    return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers, written=written)
 
 
 def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Array]:
@@ -169,9 +183,7 @@ def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Arr
     _, constraints = nlp.pack_multipliers(solution.multipliers, (costates.state, costates.matrices))
     weights, bounds, w = constraints / scale, nlp.bounds(nlp.statement.values), nlp.pack(solution.trajectory)
     weights[np.abs(weights) < UNREACHED] = 0.0
-    given = ca.MX.sym("given", nlp.g.shape[0])
-    slope = ca.Function("slope", [nlp.w, nlp.p, given], [ca.gradient(nlp.f + ca.dot(given, nlp.g), nlp.w)])
-    left = -np.asarray(ca.densify(slope(w, p, weights)).full()).ravel()
+    left = -np.asarray(_lagrangian_slope(nlp)(w, p, weights).full()).ravel()
     reached = ((w > bounds["ubx"] - UNREACHED) & (left > 0.0)) | ((w < bounds["lbx"] + UNREACHED) & (left < 0.0))
     return np.where(reached & (np.abs(left) > UNREACHED), left, 0.0), weights
 
@@ -180,18 +192,29 @@ def _cost_scale(nlp: NLP, solution: Solution) -> float:
     """Size of the cost; where that is zero, or nothing but rounding, of its slope near the solution."""
     size = float(np.abs(list(solution.cost_terms.values())).sum())
     near = (1.0 + APART) * nlp.pack(solution.trajectory) + APART
-    gradient = ca.Function("gradient", [nlp.w, nlp.p], [ca.densify(ca.gradient(nlp.f, nlp.w))])
-    slope = float(np.abs(np.asarray(gradient(near, np.append(nlp.statement.values, 1.0)).full())).max(initial=0.0))
+    gradient = _lagrangian_slope(nlp)(near, np.append(nlp.statement.values, 1.0), 0.0)
+    slope = float(np.abs(np.asarray(gradient.full())).max(initial=0.0))
     if not np.isfinite(slope) or size > ROUNDING * slope:
         return size or 1.0
     return slope or 1.0
 
 
-def _hessians(nlp: NLP, method: str, own: Mapping[str, Any]) -> list[bool]:
-    """Whether the Hessian is exact, in the order in which that is tried."""
-    if "hessian_approximation" in own or method == "fatrop":
-        return [True]
-    return [False] if nlp.mesh.eliminated and nlp.statement.matrices else [True, False]
+def _lagrangian_slope(nlp: NLP) -> ca.Function:
+    """(variables, parameters, multipliers of the constraints) -> slopes of the Lagrangian without bounds."""
+    weights = ca.MX.sym("multipliers", nlp.g.shape[0])
+    if nlp.gradient is None:
+        slope = ca.gradient(nlp.f + ca.dot(weights, nlp.g), nlp.w)
+    else:
+        slope = nlp.gradient[1] + ca.mtimes(nlp.jacobian.T, weights)
+    return ca.Function("lagrangian_slope", [nlp.w, nlp.p, weights], [ca.densify(slope)])
+
+
+def _hessians(method: str, own: Mapping[str, Any], *, alone: bool) -> list[bool]:
+    """Whether the Hessian is exact, in the order in which that is tried; `alone`: matrices pass along the nominal."""
+    asked = own.get("hessian_approximation", dict(own.get(method) or {}).get("hessian_approximation"))
+    if asked is not None or method == "fatrop":
+        return [asked != "limited-memory"]
+    return [False] if alone else [True, False]
 
 
 def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
@@ -218,11 +241,39 @@ def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any
     return settings
 
 
-def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
-    """The law for these settings."""
-    nlp, entries = task.nlp, task.made.entries
+def _functions(nlp: NLP, method: str) -> dict[str, Any]:
+    """The slopes of the NLP as options of a plugin, where CasADi does not make them."""
+    if nlp.gradient is None:
+        return {}
+    given, names = [nlp.w, nlp.p], ["x", "p"]
+    (f, gradient), (g, jacobian) = nlp.gradient, (nlp.g, nlp.jacobian)
+    if method == "sqpmethod":
+        outputs = ["f", "grad_f_x", "g", "jac_g_x"]
+        own = ca.Function("nlp_jac_fg", given, [f, gradient, g, jacobian], names, outputs)
+        return {"jac_fg": own, "no_nlp_grad": True}
+    return {
+        "no_nlp_grad": True,
+        "grad_f": ca.Function("nlp_grad_f", given, [f, gradient], names, ["f", "grad_f_x"]),
+        "jac_g": ca.Function("nlp_jac_g", given, [g, jacobian], names, ["g", "jac_g_x"]),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Core:
+    """The function of the law; its inputs are those of `entries` and the guess."""
+
+    function: ca.Function
+    results: tuple[Port, ...]
+
+    __repr__ = short_repr
+
+
+def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core:
+    """The function for these settings, on one form of the transcription."""
+    entries = task.made.entries
     try:
-        solver = ca.nlpsol("nlp", method, {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, settings)
+        parts = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
+        solver = ca.nlpsol("nlp", method, parts, {**settings, **_functions(nlp, method)})
     except RuntimeError as error:
         raise ExportError(
             f"The plugin '{method}' refuses the problem or its settings.",
@@ -239,12 +290,25 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
     given |= {"p": ca.vertcat(p, task.scale), **(_narrowed(bounds) if method == "fatrop" else bounds)}
     result = solver(**given)
     evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
-    residuals = _residuals(task, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
+    residuals = _residuals(task, nlp, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
     outputs = _results(task, result["x"], evaluated, residuals)
     bad = ca.logic_not(ca.logic_and(residuals[0] <= INFEASIBLE, residuals[1] <= STATIONARY))
     values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"])]
-    inputs = [*symbols.values(), guess]
-    core = ca.Function("solve", inputs, [flat(v) for v in values])
+    function = ca.Function("solve", [*symbols.values(), guess], [flat(v) for v in values])
+    return _Core(function=function, results=(*(port for port, _ in outputs), Port(name="status")))
+
+
+def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
+    """The law for these settings."""
+    nlp, entries = task.nlp, task.made.entries
+    made = _core(task, nlp, method, settings)
+    core, code, plain = made.function, None, None
+    if task.written is not None:
+        code = _core(task, task.written[0], method, settings).function
+
+        def plain() -> ca.Function:
+            return _core(task, transcribe(nlp.statement, nlp.mesh, nlp.scales), method, settings).function
+
     ports = (*(entry.port for entry in entries), Port(name="guess", rows=int(nlp.w.shape[0]), about="where to start"))
     default = np.concatenate([*(entry.value for entry in entries), nlp.pack(task.solution.trajectory)])
     columns = core(*np.split(default, np.cumsum([port.size for port in ports])[:-1]))
@@ -255,13 +319,16 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         about=ABOUT if task.made.fixed.declarations.expected is None else (*ABOUT, NOMINAL),
         core=core,
         inputs=ports,
-        outputs=(*(port for port, _ in outputs), Port(name="status")),
+        outputs=made.results,
         statuses=STATUSES,
         safe=safe,
         defaults=default,
         points=lambda random, count: _points(task, default, random, count),
         most=MOST_POINTS,
         tolerance=TOLERANCE,
+        code=code,
+        passages=None if task.written is None else task.written[1].written(),
+        plain=plain,
     )
 
 
@@ -342,14 +409,10 @@ def _narrowed(bounds: dict[str, Any]) -> dict[str, Any]:
 
 
 def _residuals(
-    task: _Task, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
+    task: _Task, nlp: NLP, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
 ) -> tuple[Any, Any]:
     """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
-    nlp = task.nlp
-    multipliers = ca.MX.sym("multipliers", nlp.g.shape[0])
-    slope = ca.gradient(nlp.f + ca.dot(multipliers, nlp.g), nlp.w)
-    function = ca.Function("lagrangian_slope", [nlp.w, nlp.p, multipliers], [ca.densify(slope)])
-    left = function(result["x"], ca.vertcat(p, task.scale), result["lam_g"]) + result["lam_x"]
+    left = _lagrangian_slope(nlp)(result["x"], ca.vertcat(p, task.scale), result["lam_g"]) + result["lam_x"]
     both = ca.vertcat(result["x"], g)
     lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
     weights = ca.vertcat(result["lam_x"], result["lam_g"])

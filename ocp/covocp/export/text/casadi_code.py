@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,7 +108,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
     generator = ca.CodeGenerator(f"{package}_casadi.c", options)
     for law in laws:
         _check_functions(law, laws)
-        generator.add(_renamed(law.core, core_name(package, law)))
+        generator.add(_renamed(law.written, core_name(package, law)))
     try:
         written = generator.dump()
     except RuntimeError as error:
@@ -115,6 +116,9 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
     source = WHOLE.format(version=ca.CasadiMeta.version(), code=written)
     _check(source, laws)
     source = reentrant(source)
+    passages = [law.passages for law in laws if law.passages is not None]
+    for own in passages:
+        source = _filled(source, own.bodies)
     if precision == "single":  # so that sqrt, sin, ... of a float are computed as floats
         source = source.replace("#include <math.h>", "#include <tgmath.h>", 1)
     pragmas, gcc = (
@@ -123,6 +127,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
     )
     sizes = {law.name: _sizes(source, core_name(package, law)) for law in laws}
     introduction = INTRODUCTION.format(name=package, pragmas=pragmas, gcc=gcc)
+    introduction += "".join(f"{own.introduction}\n" for own in passages)
     return Generated(source=introduction + source, sizes=sizes, alone=shares_memory(source))
 
 
@@ -130,6 +135,16 @@ def _renamed(function: ca.Function, name: str) -> ca.Function:
     """The same function with another name."""
     arguments: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     return ca.Function(name, arguments, function.call(arguments, True, False))
+
+
+def _filled(source: str, bodies: Mapping[str, str]) -> str:
+    """The code with other bodies of some functions."""
+    for name, body in bodies.items():
+        place = re.compile(rf"(^/\* {name}:\(.*\*/\nstatic int .* \{{\n)(?:.*\n)*?(\}}\n)", re.MULTILINE)
+        found = place.search(source)
+        assert found is not None
+        source = source[: found.end(1)] + body + source[found.start(2) :]
+    return source
 
 
 def _sizes(source: str, core: str) -> Sizes:
@@ -141,7 +156,7 @@ def _sizes(source: str, core: str) -> Sizes:
 
 def _check_functions(law: Law, laws: tuple[Law, ...]) -> None:
     """Complain about the first function in a law that has no C code."""
-    for function in (law.core, *law.core.find_functions()):
+    for function in (law.written, *law.written.find_functions()):
         if function.class_name() in WITHOUT_CODE:
             raise _refused(laws, f"{function.class_name()}, which cannot be code generated", function.name())
 

@@ -1,0 +1,192 @@
+"""The passage as exported code has it: expressions of which one form is evaluated, the other written out as C.
+
+Both forms have the same arguments. The first calls the library, in which the same C code is compiled; the second is a
+function of CasADi's without a body, which `bodies` gives.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from covocp.base.expressions import Expr
+from covocp.base.matrices import half_length
+from covocp.base.nodes import Buffers, Node, address
+from covocp.base.short_repr import short_repr
+from covocp.passage.library import functions
+from covocp.passage.shape import Pattern, shape
+from covocp.passage.sweep import Told, entries
+
+# What the bodies call, in the order in which C must see it.
+SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "back.h", "written.h")
+WHAT = ("forward", "slopes")
+WIDTH = 24  # numbers of a line
+Form = Literal["evaluated", "written"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Call:
+    """One passage of a tape.
+
+    Attributes:
+        arguments: half-vector at the start, entries of h H at both points[, what is read]; expressions.
+        after: the half-vectors after each step, a symbol.
+        forward: of the arguments -> a column: the half-vectors, then what slopes need.
+        slopes: of the arguments but the first, of what `forward` returns and of slopes by the half-vectors -> a column:
+            slopes by the arguments one below the other, then what is of no use.
+    """
+
+    arguments: list[Any]
+    after: Any
+    forward: ca.Function
+    slopes: ca.Function
+
+    __repr__ = short_repr
+
+    def split(self, column: Expr) -> list[Any]:
+        """Slopes by each of the arguments."""
+        ends = np.cumsum([0, *(argument.numel() for argument in self.arguments), 1])
+        parts = ca.vertsplit(column, [*ends[:-1].tolist(), column.shape[0]])[:-1]
+        return [ca.reshape(part, *given.shape) for part, given in zip(parts, self.arguments, strict=True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """C code of passages: what stands before all functions, and the bodies of some of them by name."""
+
+    introduction: str
+    bodies: dict[str, str]
+
+    __repr__ = short_repr
+
+
+class Tape:
+    """Passages one after the other, each of what those before have given.
+
+    Args:
+        form: of their functions.
+
+    Attributes:
+        calls: the passages so far.
+    """
+
+    def __init__(self, form: Form) -> None:
+        """Begin without any."""
+        self.calls: list[Call] = []
+        self._form = form
+        self._unwritten: dict[str, tuple[Any, ...]] = {}
+
+    def passed_by(
+        self, first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None
+    ) -> Any:
+        """What `covocp.passage.sweep.passed_by` returns, as a symbol."""
+        assert kicks is None  # which costates are slopes by: nothing that is exported
+        pattern, given = entries(points, size)
+        steps, height = ((), 0) if told is None else (told.steps, told.rows)
+        count = given[0].shape[1] + len(steps)
+        if self._form == "evaluated":
+            forward, slopes = _evaluated(size, pattern, count, steps, height)
+        else:
+            own = shape(size, pattern, count, steps, height)
+            forward, slopes = self._unwritten.setdefault(_named(own), (own, *_unwritten(own)))[1:]
+        after = ca.MX.sym(f"after_{len(self.calls)}", half_length(size), count)
+        arguments = [first, *given, *([] if told is None else [told.columns])]
+        self.calls.append(Call(arguments=arguments, after=after, forward=forward, slopes=slopes))
+        return after
+
+    def written(self) -> Written:
+        """The C code of all of them, in the form that is written."""
+        folder = files("covocp.passage")
+        parts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SOURCES]
+        bodies: dict[str, str] = {}
+        for name, (own, *_) in self._unwritten.items():
+            lines = [", ".join(map(str, own[i : i + WIDTH])) for i in range(0, own.size, WIDTH)]
+            parts.append(f"static const int {name}[{own.size}] = {{\n    " + ",\n    ".join(lines) + "\n};\n")
+            bodies |= {f"{name}_{what}": _body(name, what, own) for what in WHAT}
+        return Written(introduction="\n".join(parts), bodies=bodies)
+
+
+def _reads(own: NDArray[np.intc]) -> int:
+    """Steps that read something."""
+    return int((own[5 : 5 + own[2]] < 0).sum())
+
+
+def _named(own: NDArray[np.intc]) -> str:
+    """A name for what has this shape."""
+    return f"passage_{zlib.crc32(own.tobytes()):08x}"
+
+
+@cache
+def _evaluated(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], height: int) -> list[ca.Function]:
+    """Forward and slopes; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
+    own = shape(size, pattern, count, reads, height)
+    return [_Evaluated(what, own, *_form(own, what)) for what in WHAT]
+
+
+def _unwritten(own: NDArray[np.intc]) -> list[ca.Function]:
+    """The same without bodies."""
+    made = []
+    for what in WHAT:
+        inputs, length = _form(own, what)
+        symbols = [ca.MX.sym(f"given_{i}", each) for i, each in enumerate(inputs)]
+        made.append(ca.Function(f"{_named(own)}_{what}", symbols, [ca.DM.zeros(length)], {"never_inline": True}))
+    return made
+
+
+def _form(own: NDArray[np.intc], what: str) -> tuple[list[ca.Sparsity], int]:
+    """Sparsities of the arguments of a function, length of its result."""
+    size, nonzeros, count, height, _ = own[:5].tolist()
+    reads = _reads(own)
+    half = half_length(size)
+    points = [(nonzeros, count - reads)] * 2 + ([(height * size + half_length(height), reads)] if reads else [])
+    lengths = [int(_library()["exported_length"](own.ctypes.data, of)) for of in range(len(WHAT))]
+    shapes = [(half, 1), *points] if what == WHAT[0] else [*points, (lengths[0], 1), (half, count)]
+    return [ca.Sparsity.dense(*each) for each in shapes], lengths[WHAT.index(what)]
+
+
+def _library() -> dict[str, Callable[..., Any]]:
+    """The library, which is there where something passes in compiled code."""
+    there = functions()
+    assert there is not None
+    return there
+
+
+class _Evaluated(Node):
+    """A function of the library that works in what it returns."""
+
+    def __init__(self, what: str, own: NDArray[np.intc], inputs: list[ca.Sparsity], length: int) -> None:
+        self._run, self._shape = _library()[f"exported_{what}"], own
+        self._told = None if _reads(own) else 2 + (what == WHAT[0])
+        super().__init__(f"passage_{what}", inputs, [ca.Sparsity.dense(length, 1)])
+
+    def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
+        """Of CasADi."""
+        pairs = zip(arguments, self._inputs, strict=True)  # what CasADi leaves out is zero
+        zeros = [np.zeros(sparsity.nnz()) if argument is None else None for argument, sparsity in pairs]
+        filled = zip(arguments, zeros, strict=True)
+        given = [address(argument) if zero is None else zero.ctypes.data for argument, zero in filled]
+        if self._told is not None:
+            given.insert(self._told, None)
+        chosen = np.empty(2 * int(self._shape[0]), dtype=np.intc)
+        result = address(results[0])
+        if result is not None:
+            self._run(self._shape.ctypes.data, chosen.ctypes.data, *given, result)
+        return 0
+
+
+def _body(name: str, what: str, own: NDArray[np.intc]) -> str:
+    """A call of written.h."""
+    reads = int(_reads(own) > 0)
+    before = 3 if what == WHAT[0] else 2
+    given = [f"arg[{i}]" for i in range(before + reads)] + ([] if reads else ["0"])
+    given += [f"arg[{before + reads + i}]" for i in range(0 if what == WHAT[0] else 2)]
+    call = f"written_{what}({name}, chosen, {', '.join(given)}, res[0]);"
+    return f"  int chosen[{2 * own[0]}];\n  if (res[0]) {call}\n  return 0;\n"
