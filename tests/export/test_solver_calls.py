@@ -95,12 +95,20 @@ def test_arguments_that_are_not_finite_return_the_plan_of_the_export():
                 np.testing.assert_array_equal(entry, usual[result])
 
 
-@pytest.mark.parametrize("arguments", [{"initial_x": 1e200}, {"weight": 1e300}, {"b": 1e10}, {"duration": 1e300}])
+@pytest.mark.parametrize("arguments", [{"initial_x": 1e200}, {"weight": 1e300}, {"b": 1e200}, {"duration": 1e300}])
 def test_arguments_that_overflow_return_the_plan_of_the_export(arguments):
     planner = package("planner").python()
     usual, plan = planner(), planner(**arguments)
     assert planner.status == "FAILED"
     np.testing.assert_array_equal(plan["u"], usual["u"])
+
+
+def test_a_plan_that_is_far_from_all_is_finite_and_not_called_solved():
+    """A mean of 1e10 with a deviation of one: the covariances pass, the iterations do not end."""
+    planner = package("planner").python()
+    plan = planner(b=1e10)
+    assert planner.status == "NOT_CONVERGED"
+    assert all(np.isfinite(entry).all() for name, entry in plan.items() if name != "status")
 
 
 def test_a_plan_backwards_in_time_is_none():

@@ -23,8 +23,8 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passage_reverse": (None, (_ADDRESS,) * 12),
     "passage_tangent": (_WHOLE, (_ADDRESS,) * 19),
     "exported_length": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
-    "exported_forward": (None, (_ADDRESS,) * 7),
-    "exported_slopes": (None, (_ADDRESS,) * 8),
+    "exported_forward": (None, (_ADDRESS,) * 6),
+    "exported_slopes": (None, (_ADDRESS,) * 7),
     "transitions": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 5),
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }

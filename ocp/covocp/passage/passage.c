@@ -109,17 +109,16 @@ EXPORT VERSIONS int passage_tangent(
 EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }
 
 EXPORT void exported_forward(
-    const int *shape, int *chosen, const double *first, const double *h1, const double *h2, const double *told,
-    double *result
+    const int *shape, int *chosen, const double *first, const double *h1, const double *h2, double *result
 ) {
-    written_forward(shape, chosen, first, h1, h2, told, result);
+    written_forward(shape, chosen, first, h1, h2, result);
 }
 
 EXPORT void exported_slopes(
-    const int *shape, int *chosen, const double *h1, const double *h2, const double *told, const double *passed,
-    const double *seed, double *result
+    const int *shape, int *chosen, const double *h1, const double *h2, const double *passed, const double *seed,
+    double *result
 ) {
-    written_slopes(shape, chosen, h1, h2, told, passed, seed, result);
+    written_slopes(shape, chosen, h1, h2, passed, seed, result);
 }
 
 static struct PyModuleDef definition = {

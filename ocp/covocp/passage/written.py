@@ -37,7 +37,7 @@ class Call:
     """One passage of a tape.
 
     Attributes:
-        arguments: half-vector at the start, entries of h H at both points[, what is read]; expressions.
+        arguments: half-vector at the start, entries of h H at both points; expressions.
         after: the half-vectors after each step, a symbol.
         forward: of the arguments -> a column: the half-vectors, then what slopes need.
         slopes: of the arguments but the first, of what `forward` returns and of slopes by the half-vectors -> a column:
@@ -88,18 +88,17 @@ class Tape:
         self, first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None
     ) -> Any:
         """What `covocp.passage.sweep.passed_by` returns, as a symbol."""
-        assert kicks is None  # which costates are slopes by: nothing that is exported
+        assert kicks is None  # nothing that is exported has them, nor readings
+        assert told is None
         pattern, given = entries(points, size)
-        steps, height = ((), 0) if told is None else (told.steps, told.rows)
-        count = given[0].shape[1] + len(steps)
+        count = given[0].shape[1]
         if self._form == "evaluated":
-            forward, slopes = _evaluated(size, pattern, count, steps, height)
+            forward, slopes = _evaluated(size, pattern, count)
         else:
-            own = shape(size, pattern, count, steps, height)
+            own = shape(size, pattern, count, (), 0)
             forward, slopes = self._unwritten.setdefault(_named(own), (own, *_unwritten(own)))[1:]
         after = ca.MX.sym(f"after_{len(self.calls)}", half_length(size), count)
-        arguments = [first, *given, *([] if told is None else [told.columns])]
-        self.calls.append(Call(arguments=arguments, after=after, forward=forward, slopes=slopes))
+        self.calls.append(Call(arguments=[first, *given], after=after, forward=forward, slopes=slopes))
         return after
 
     def written(self) -> Written:
@@ -114,20 +113,15 @@ class Tape:
         return Written(introduction="\n".join(parts), bodies=bodies)
 
 
-def _reads(own: NDArray[np.intc]) -> int:
-    """Steps that read something."""
-    return int((own[5 : 5 + own[2]] < 0).sum())
-
-
 def _named(own: NDArray[np.intc]) -> str:
     """A name for what has this shape."""
     return f"passage_{zlib.crc32(own.tobytes()):08x}"
 
 
 @cache
-def _evaluated(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], height: int) -> list[ca.Function]:
+def _evaluated(size: int, pattern: Pattern, count: int) -> list[ca.Function]:
     """Forward and slopes; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
-    own = shape(size, pattern, count, reads, height)
+    own = shape(size, pattern, count, (), 0)
     return [_Evaluated(what, own, *_form(own, what)) for what in WHAT]
 
 
@@ -143,12 +137,10 @@ def _unwritten(own: NDArray[np.intc]) -> list[ca.Function]:
 
 def _form(own: NDArray[np.intc], what: str) -> tuple[list[ca.Sparsity], int]:
     """Sparsities of the arguments of a function, length of its result."""
-    size, nonzeros, count, height, _ = own[:5].tolist()
-    reads = _reads(own)
-    half = half_length(size)
-    points = [(nonzeros, count - reads)] * 2 + ([(height * size + half_length(height), reads)] if reads else [])
+    size, nonzeros, count = own[:3].tolist()
+    half, point = half_length(size), (nonzeros, count)
     lengths = [int(_library()["exported_length"](own.ctypes.data, of)) for of in range(len(WHAT))]
-    shapes = [(half, 1), *points] if what == WHAT[0] else [*points, (lengths[0], 1), (half, count)]
+    shapes = [(half, 1), point, point] if what == WHAT[0] else [point, point, (lengths[0], 1), (half, count)]
     return [ca.Sparsity.dense(*each) for each in shapes], lengths[WHAT.index(what)]
 
 
@@ -164,7 +156,6 @@ class _Evaluated(Node):
 
     def __init__(self, what: str, own: NDArray[np.intc], inputs: list[ca.Sparsity], length: int) -> None:
         self._run, self._shape = _library()[f"exported_{what}"], own
-        self._told = None if _reads(own) else 2 + (what == WHAT[0])
         super().__init__(f"passage_{what}", inputs, [ca.Sparsity.dense(length, 1)])
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
@@ -173,8 +164,6 @@ class _Evaluated(Node):
         zeros = [np.zeros(sparsity.nnz()) if argument is None else None for argument, sparsity in pairs]
         filled = zip(arguments, zeros, strict=True)
         given = [address(argument) if zero is None else zero.ctypes.data for argument, zero in filled]
-        if self._told is not None:
-            given.insert(self._told, None)
         chosen = np.empty(2 * int(self._shape[0]), dtype=np.intc)
         result = address(results[0])
         if result is not None:
@@ -184,9 +173,6 @@ class _Evaluated(Node):
 
 def _body(name: str, what: str, own: NDArray[np.intc]) -> str:
     """A call of written.h."""
-    reads = int(_reads(own) > 0)
-    before = 3 if what == WHAT[0] else 2
-    given = [f"arg[{i}]" for i in range(before + reads)] + ([] if reads else ["0"])
-    given += [f"arg[{before + reads + i}]" for i in range(0 if what == WHAT[0] else 2)]
-    call = f"written_{what}({name}, chosen, {', '.join(given)}, res[0]);"
+    given = ", ".join(f"arg[{i}]" for i in range(3 if what == WHAT[0] else 4))
+    call = f"written_{what}({name}, chosen, {given}, res[0]);"
     return f"  int chosen[{2 * own[0]}];\n  if (res[0]) {call}\n  return 0;\n"
