@@ -12,6 +12,28 @@ INLINE void divide(const double *RESTRICT factor, const double *RESTRICT swaps, 
     for (int k = n - 1; k >= 0; --k) exchange(M, r, k, (int)swaps[k]);
 }
 
+/* The same for M' (r x n), whose rows move by those of the factors. */
+INLINE void divide_few(const double *RESTRICT factor, const double *RESTRICT swaps, int n, int r, double *RESTRICT M) {
+    for (int c = 0; c < r; ++c) {
+        double *RESTRICT own = M + c * n;
+        for (int i = 0; i < n; ++i) {
+            const double *RESTRICT row = factor + i * n;
+            const double share = own[i] /= row[i];
+            for (int j = i + 1; j < n; ++j) own[j] -= share * row[j];
+        }
+        for (int i = n - 1; i > 0; --i) {
+            const double *RESTRICT row = factor + i * n;
+            const double share = own[i];
+            for (int j = 0; j < i; ++j) own[j] -= share * row[j];
+        }
+        for (int k = n - 1; k >= 0; --k) {
+            const int other = (int)swaps[k];
+            const double kept = own[k];
+            own[k] = own[other], own[other] = kept;
+        }
+    }
+}
+
 /* -1/2 (J left) right' at the nonzeros, both (2n x r). */
 INLINE void at_nonzeros(
     const Passage *p, int n, int r, const double *RESTRICT left, const double *RESTRICT right, double *RESTRICT slopes
@@ -44,7 +66,7 @@ INLINE void congruent(const Passage *p, int n, int k, double *RESTRICT P, double
         for (int j = 0; j < n; ++j) P[i * n + j] = 0.5 * (spare[i * n + j] + spare[j * n + i]);
 }
 
-/* What follows has the slopes P as a matrix (few = 0) or as M C M' with few columns. */
+/* What follows has the slopes P as a matrix (few = 0) or as M C M' with few columns; M' (few x n) is kept. */
 typedef struct {
     int few, any;
     double *P, *M, *C;
@@ -56,7 +78,7 @@ INLINE void write_out(Slopes *s, int n, double *RESTRICT P) {
         for (int j = 0; j <= i; ++j) {
             double sum = 0.0;
             for (int a = 0; a < r; ++a)
-                for (int b = 0; b < r; ++b) sum += s->M[i * r + a] * s->C[a * r + b] * s->M[j * r + b];
+                for (int b = 0; b < r; ++b) sum += s->M[a * n + i] * s->C[a * r + b] * s->M[b * n + j];
             P[i * n + j] = P[j * n + i] = sum;
         }
 }
@@ -81,7 +103,7 @@ INLINE void join(Slopes *s, int n, const double *RESTRICT seed) {
         s->any = 1;
         s->few = 3 * r > n ? 0 : r;
         if (!s->few) return;
-        for (int a = 0; a < r; ++a) s->M[rows[a] * r + a] = 1.0;
+        for (int a = 0; a < r; ++a) s->M[a * n + rows[a]] = 1.0;
         double *core = s->C + n; /* past the rows */
         for (int a = 0; a < r; ++a)
             for (int b = 0; b < r; ++b) core[a * r + b] = s->P[rows[a] * n + rows[b]];
@@ -106,11 +128,11 @@ INLINE void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRI
 /* Slopes before a step and by its H: few columns. */
 INLINE void back_few(const Passage *p, int n, int r, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
     double *RESTRICT y = spare, *RESTRICT weighted = spare + 2 * n * r;
-    divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, r, s->M);
+    divide_few(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, r, s->M);
     for (int stage = 0; stage < 2; ++stage) {
         double *out = stage ? s2 : s1;
         if (!out) continue;
-        product((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, 2 * n, n, r, y);
+        product_turned((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, 2 * n, n, r, y);
         for (int i = 0; i < 2 * n; ++i)
             for (int c = 0; c < r; ++c) {
                 double sum = 0.0;
@@ -154,7 +176,7 @@ INLINE void back_reading(const Passage *p, int n, int j, Slopes *s, double *REST
         pack_noise(seen, r, by_told + tall);
     }
     if (few) {
-        turned_product(A, s->M, n, n, few, spare);
+        product(s->M, A, few, n, n, spare);
         memcpy(s->M, spare, sizeof(double) * n * few);
         return;
     }

@@ -72,15 +72,17 @@ INLINE void applied(const double *RESTRICT D, const double *RESTRICT E, int n, d
     }
 }
 
-/* Whether a step measures so much that the covariance loses most of its size: then rounding of E itself would count. */
+/* Whether a step measures so much that the covariance loses most of its size where it is measured: then rounding of E
+ * itself would count. The trace of h W E, in any units. */
 static int measures_much(const Passage *p, int k, const double *E) {
     const double *h1 = p->h1 + (size_t)k * p->nnz, *h2 = p->h2 + (size_t)k * p->nnz;
-    double information = 0.0, largest = 0.0;
+    double first = 0.0, second = 0.0;
     for (int q = 0; q < p->nnz; ++q)
-        if (p->row[q] < p->n && p->col[q] >= p->n)
-            information = fmax(information, fmax(fabs(h1[q]), fabs(h2[q])));
-    for (int i = 0; i < p->n; ++i) largest = fmax(largest, E[i * p->n + i]);
-    return information * largest > MUCH;
+        if (p->row[q] < p->n && p->col[q] >= p->n) {
+            const double own = E[p->row[q] * p->n + p->col[q] - p->n];
+            first += h1[q] * own, second += h2[q] * own;
+        }
+    return !(fmax(first, second) <= MUCH); /* NaN too */
 }
 
 /* One step: E (n x n) becomes the one after it; what slopes need is kept.

@@ -20,6 +20,29 @@ INLINE void add_rows(
     }
 }
 
+/* The same for two rows, own and next, of which each row of B is read once. */
+INLINE void add_to_two(
+    double *RESTRICT own, double *RESTRICT next, double sign, const double *share, const double *further, int step,
+    const double *B, int wide, int rows, int columns
+) {
+    int j = 0;
+    for (; j + 4 <= rows; j += 4) {
+        const double a = sign * share[j * step], b = sign * share[(j + 1) * step], c = sign * share[(j + 2) * step],
+                     d = sign * share[(j + 3) * step];
+        const double e = sign * further[j * step], f = sign * further[(j + 1) * step],
+                     g = sign * further[(j + 2) * step], h = sign * further[(j + 3) * step];
+        if (a == 0.0 && b == 0.0 && c == 0.0 && d == 0.0 && e == 0.0 && f == 0.0 && g == 0.0 && h == 0.0) continue;
+        const double *RESTRICT one = B + j * wide, *RESTRICT two = one + wide, *RESTRICT three = two + wide,
+                     *RESTRICT four = three + wide;
+        for (int i = 0; i < columns; ++i) {
+            own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
+            next[i] += (e * one[i] + f * two[i]) + (g * three[i] + h * four[i]);
+        }
+    }
+    add_rows(own, sign, share + j * step, step, B + j * wide, wide, rows - j, columns);
+    add_rows(next, sign, further + j * step, step, B + j * wide, wide, rows - j, columns);
+}
+
 /* Two rows of w entries change places. */
 INLINE void exchange(double *RESTRICT a, int w, int one, int other) {
     for (int j = 0; one != other && j < w; ++j) {
@@ -49,24 +72,46 @@ INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, double *
     }
 }
 
-/* The columns past the first m solved, which are triangular. */
+/* Rows `begin` to m, by as many rows from k on as their shares lie before column `end`. */
+INLINE void update(double *RESTRICT a, int m, int w, int k, int begin, int end) {
+    int i = begin;
+    for (; i + 2 <= m; i += 2) {
+        double *own = a + i * w, *next = own + w;
+        add_to_two(own + end, next + end, -1.0, own + k, next + k, 1, a + k * w + end, w, end - k, w - end);
+    }
+    if (i < m) add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, end - k, w - end);
+}
+
+/* The columns past the first m solved, which are triangular, two rows at a time from the last on. */
 INLINE void solve_upper(double *RESTRICT a, int m, int w) {
-    for (int k = m - 1; k >= 0; --k) {
-        double *own = a + k * w;
-        add_rows(own + m, -1.0, own + k + 1, 1, own + w + m, w, m - 1 - k, w - m);
+    for (int k = m - 1; k >= 0; k -= 2) {
+        double *own = a + k * w, *next = own - w;
+        const int below = m - 1 - k, columns = w - m;
+        if (k == 0) {
+            add_rows(own + m, -1.0, own + 1, 1, own + w + m, w, below, columns);
+        } else {
+            add_to_two(own + m, next + m, -1.0, own + k + 1, next + k + 1, 1, own + w + m, w, below, columns);
+        }
         const double inverse = 1.0 / own[k];
         for (int j = m; j < w; ++j) own[j] *= inverse;
+        if (k == 0) return;
+        const double share = next[k], other = 1.0 / next[k - 1];
+        for (int j = m; j < w; ++j) next[j] = (next[j] - share * own[j]) * other;
     }
 }
+
+/* Columns that are made triangular at a time. */
+enum { PANEL = 8 };
 
 /* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL), the
  * others solved. */
 INLINE void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) {
-    for (int k = 0; k < m; k += 4) {
-        const int end = k + 4 < m ? k + 4 : m;
+    for (int k = 0; k < m; k += PANEL) {
+        const int end = k + PANEL < m ? k + PANEL : m;
         panel(a, m, w, k, end, swaps);
-        for (int i = k + 1; i < m; ++i)
-            add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, (i < end ? i : end) - k, w - end);
+        for (int i = k + 1; i < end; ++i)
+            add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
+        update(a, m, w, k, end, end);
     }
     solve_upper(a, m, w);
 }
@@ -80,8 +125,8 @@ static const double STEADY = 0.03;
  * identity and what moves entries of one unit to those of another.
  */
 INLINE int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT sizes) {
-    for (int k = 0; k < m; k += 4) {
-        const int end = k + 4 < m ? k + 4 : m;
+    for (int k = 0; k < m; k += PANEL) {
+        const int end = k + PANEL < m ? k + PANEL : m;
         for (int c = k; c < end; ++c) {
             const double *RESTRICT first = a + c * w;
             if (!(fabs(first[c]) >= STEADY * sizes[c])) return 0; /* NaN neither */
@@ -94,11 +139,11 @@ INLINE int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT s
                 if (i < end) sizes[i] += fabs(own[c] * first[i]);
             }
         }
-        for (int i = k + 1; i < m; ++i) {
-            double *own = a + i * w;
-            for (int c = k; i >= end && c < end; ++c) sizes[i] += fabs(own[c] * a[c * w + i]);
-            add_rows(own + end, -1.0, own + k, 1, a + k * w + end, w, (i < end ? i : end) - k, w - end);
-        }
+        for (int i = k + 1; i < end; ++i)
+            add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
+        for (int i = end; i < m; ++i)
+            for (int c = k; c < end; ++c) sizes[i] += fabs(a[i * w + c] * a[c * w + i]);
+        update(a, m, w, k, end, end);
     }
     solve_upper(a, m, w);
     return 1;
@@ -115,7 +160,13 @@ INLINE void product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
-    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i * inner, 1, B, columns, inner, columns);
+    int i = 0;
+    for (; i + 2 <= rows; i += 2) {
+        double *own = result + i * columns;
+        const double *share = A + i * inner;
+        add_to_two(own, own + columns, 1.0, share, share + inner, 1, B, columns, inner, columns);
+    }
+    if (i < rows) add_rows(result + i * columns, 1.0, A + i * inner, 1, B, columns, inner, columns);
 }
 
 /* a . b, in four sums that do not wait for one another. */
