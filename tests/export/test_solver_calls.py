@@ -104,10 +104,10 @@ def test_arguments_that_overflow_return_the_plan_of_the_export(arguments):
 
 
 def test_a_plan_that_is_far_from_all_is_finite_and_not_called_solved():
-    """A mean of 1e10 with a deviation of one: the covariances pass, the iterations do not end."""
+    """A mean of 1e10 with a deviation of one: the iterations do not end, or overflow."""
     planner = package("planner").python()
     plan = planner(b=1e10)
-    assert planner.status == "NOT_CONVERGED"
+    assert planner.status in ("NOT_CONVERGED", "FAILED")
     assert all(np.isfinite(entry).all() for name, entry in plan.items() if name != "status")
 
 

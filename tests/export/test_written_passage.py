@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import casadi as ca
@@ -113,3 +114,26 @@ def test_the_same_package_is_written_again(tmp_path: Path, monkeypatch: pytest.M
     first = code(export_c(unknown_lag.problem(), tmp_path / "one", **MESH, name="lag"))
     export_c(mass_chain.problem(masses=1), tmp_path / "between", **MESH)
     assert code(export_c(unknown_lag.problem(), tmp_path / "two", **MESH, name="lag")) == first
+
+
+def test_few_segments_are_exported_unless_changes_grow_or_they_are_asked_for(tmp_path: Path) -> None:
+    """Constraints: the continuity of a state where segments meet, beside those of the problem itself."""
+
+    def segments(problem: co.Problem, name: str, **options: int) -> int:
+        counts = []
+        for own, given in ((name, options), (f"{name}_one", {"segments": 1})):
+            made = export_c(problem, tmp_path / own, intervals=40, substeps=2, **given)
+            found = re.search(r"/\* nlp:\(.*\)->\(x\[\d+\],f,g(\[\d+\]|),", code(made))
+            assert found is not None
+            counts.append(int(found[1].strip("[]") or 1))
+        return counts[0] - counts[1] + 1
+
+    ocp = co.Problem(duration=30.0)
+    x, u = ocp.state("x", initial=0.1, final=0.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, 0.45 * x + u, noise=0.1)  # grows by e^13.5
+    ocp.measurement("y", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[x, x])
+    assert segments(unknown_lag.problem(), "lag") == 2
+    assert segments(unknown_lag.problem(), "asked", segments=5) == 5
+    assert segments(ocp, "unstable") == 3

@@ -328,18 +328,22 @@ def choose_mesh(statement: Statement, options: Options, step: StepKind, stiffnes
     if paired and substeps % 2:
         substeps += 1  # Simpson's rule for the running cost takes them in pairs
     substeps, points = _choose_points(statement, options, substeps, 2 if paired else 1)
-    short, longer = divmod(intervals, count)
-    lengths = (short + 1,) * longer + (short,) * (count - longer)
     return Mesh(
         nodes=nodes,
         control=options.control,
         substeps=substeps,
-        segments=lengths,
+        segments=segment_lengths(intervals, count),
         eliminated=eliminated,
         step=step,
         points=points,
         readings=readings_at(statement, nodes),
     )
+
+
+def segment_lengths(intervals: int, count: int) -> tuple[int, ...]:
+    """So many segments of as many intervals as possible, the longer ones first."""
+    short, longer = divmod(intervals, count)
+    return (short + 1,) * longer + (short,) * (count - longer)
 
 
 def with_substeps(options: Options, mesh: Mesh, substeps: int) -> Options:
