@@ -11,6 +11,7 @@ import pytest
 import covocp as co
 from covocp.models import mass_chain
 from covocp.passage import library
+from covocp.passage.sweep import passed_by
 from covocp.solving.warm_start import make_guess
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import NLP
@@ -61,8 +62,9 @@ def transcribed(problem: co.Problem, options: dict[str, object]) -> tuple[NLP, N
     mesh = resolve_mesh(statement, Options(**options), statement.values)  # type: ignore[arg-type]
     guess = make_guess(statement, mesh, statement.values, None).trajectory
     scales = choose_scales(statement, mesh, guess, statement.values)
-    compiled, plain = (transcribe(statement, mesh, scales, kind) for kind in ("compiled", "plain"))
+    compiled, plain = (transcribe(statement, mesh, scales, kind) for kind in (passed_by, None))
     assert is_staged(statement, mesh)
+    assert plain.gradient is None
     rng = np.random.default_rng(0)
     w = compiled.pack(guess)
     return compiled, plain, w + 0.1 * rng.normal(size=w.size), np.append(statement.values, 1.7)

@@ -40,6 +40,11 @@ class Node(ca.Callback):
         """Of CasADi."""
         return self._outputs[i]
 
+    def filled(self, arguments: Buffers) -> list[memoryview]:
+        """The arguments of a call, with zeros for what CasADi leaves out."""
+        pairs = zip(arguments, self._inputs, strict=True)
+        return [np.zeros(shape.nnz()).data if own is None else own for own, shape in pairs]
+
     def has_eval_buffer(self) -> bool:
         """Of CasADi."""
         return True

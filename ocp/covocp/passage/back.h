@@ -83,14 +83,14 @@ INLINE void write_out(Slopes *s, int n, double *RESTRICT P) {
         }
 }
 
-/* The slopes of one step's result join those of what comes after. */
-INLINE void join(Slopes *s, int n, const double *RESTRICT seed) {
+/* The slopes of one step's result join those of what comes after; `rows`: n to work in. */
+INLINE void join(Slopes *s, int n, int *RESTRICT rows, const double *RESTRICT seed) {
     const int half = n * (n + 1) / 2;
     int asked = 0;
     for (int t = 0; t < half && !asked; ++t) asked = seed[t] != 0.0;
     if (!asked) return;
     if (!s->any) {
-        int r = 0, *rows = (int *)s->C;
+        int r = 0;
         memset(s->P, 0, sizeof(double) * n * n);
         for (int j = 0, t = 0; j < n; ++j)
             for (int i = j; i < n; ++i, ++t) s->P[i * n + j] = s->P[j * n + i] = i == j ? seed[t] : 0.5 * seed[t];
@@ -104,10 +104,8 @@ INLINE void join(Slopes *s, int n, const double *RESTRICT seed) {
         s->few = 3 * r > n ? 0 : r;
         if (!s->few) return;
         for (int a = 0; a < r; ++a) s->M[a * n + rows[a]] = 1.0;
-        double *core = s->C + n; /* past the rows */
         for (int a = 0; a < r; ++a)
-            for (int b = 0; b < r; ++b) core[a * r + b] = s->P[rows[a] * n + rows[b]];
-        memmove(s->C, core, sizeof(double) * r * r);
+            for (int b = 0; b < r; ++b) s->C[a * r + b] = s->P[rows[a] * n + rows[b]];
         return;
     }
     if (s->few) write_out(s, n, s->P), s->few = 0;
@@ -193,7 +191,7 @@ INLINE void back(
     Slopes s = {0, 0, p->work, p->work + n * n, p->work + 2 * n * n};
     for (int at = p->count - 1; at >= 0; --at) {
         const int k = p->place[at];
-        join(&s, n, seed + at * half);
+        join(&s, n, p->chosen, seed + at * half);
         if (by_kicks) pack_slopes(&s, n, spare, by_kicks + at * half);
         if (k < 0) {
             double *own = by_told ? by_told + (-1 - k) * tells : NULL;

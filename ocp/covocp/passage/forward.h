@@ -82,7 +82,7 @@ static int measures_much(const Passage *p, int k, const double *E) {
             const double own = E[p->row[q] * p->n + p->col[q] - p->n];
             first += h1[q] * own, second += h2[q] * own;
         }
-    return !(fmax(first, second) <= MUCH); /* NaN too */
+    return !(first <= MUCH && second <= MUCH); /* NaN too */
 }
 
 /* One step: E (n x n) becomes the one after it; what slopes need is kept.
@@ -122,7 +122,7 @@ INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
 }
 
 /* Where readings compute: past what steps use. */
-static double *aside(const Passage *p) { return p->work + 17 * (size_t)p->n * p->n + p->nnz; }
+static double *aside(const Passage *p) { return p->work + 17 * (size_t)p->n * p->n; }
 
 /* What reading j does: E (n x n) becomes the one after it; what slopes need is kept. */
 INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {

@@ -55,12 +55,14 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean) {
     return k;
 }
 
-/* Bytes of such a passage. */
+/* Bytes of such a passage, with its tangents unless it is for values alone. */
 EXPORT size_t passage_bytes(const int *shape, int lean) {
     Passage p;
     described(&p, shape);
     p.lean = lean;
-    return sizeof(double) * (keeps(&p, NULL) + works(&p, NULL) + numbers(&p));
+    const size_t n = p.n, square = n * n, own = keeps(&p, NULL) + works(&p, NULL) + numbers(&p);
+    const size_t moved = 5 * square * p.moves + (p.r * n + 2 * square) * p.reads;
+    return sizeof(double) * (own + (lean ? 0 : moved + numbers(&p) + n * (n + 1) / 2 * p.count));
 }
 
 /* Whether the passage at this point is known. */

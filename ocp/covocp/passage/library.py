@@ -60,6 +60,13 @@ def functions() -> dict[str, Callable[..., Any]] | None:
     return _loaded()[0]
 
 
+def needed() -> dict[str, Callable[..., Any]]:
+    """The same, where it is known that they are there."""
+    there = functions()
+    assert there is not None
+    return there
+
+
 def build_info() -> dict[str, str | bool]:
     """Tell whether the compiled passage of covariances is used here, and why not.
 

@@ -1,3 +1,33 @@
+/* The passage of a covariance through Gauss steps of its Riccati equation, and the exact slopes of what depends on it.
+ *
+ * E' = F E + E F' + Q - E W E is linear in Z = [X; Y], E = Y X^-1: Z' = H Z, H = [-F' W; Q F]. A step of the two-stage
+ * Gauss method takes Z from [I; E] to [X; Y]. With H1, H2 = h H at its two points, g = sqrt(3)/6 and a = 1/2 - 2 g its
+ * stages are
+ *
+ *     [(I - g H2)(I - g H1) - a/2 (H1 + H2)] Y1 = (I - g H2) Z0,   Z+ = Z0 + ((I - g H1) Y1 - Z0)/a,
+ *     Y2 = Y1 + 2 g (Z+ - Z0).
+ *
+ * The method is symplectic and its own adjoint, so that no adjoint system has to be solved: with J = [0 I; -I 0]
+ *
+ *     dE+ = X^-T dE X^-1,   P = X^-1 P+ X^-T,   slope of tr(P+ E+) by H_i = -1/2 (J Y_i) P Y_i'.
+ *
+ * A cost on few entries of the last E has P = M C M' with few columns and a constant core C: M = X^-1 M+.
+ *
+ * How these slopes change along a direction (products with second derivatives) needs one more system a step, that of the
+ * tangent of Y1. It holds, as the slopes do, where H and its direction have this form: Q and W symmetric.
+ *
+ * Some of the steps have no length: there something is read, r values M x with noise of variance R,
+ *
+ *     K = E M' (M E M' + R)^-1,   A = I - K M,   E+ = A E A' + K R K',   P = A' P+ A,
+ *     slope by M = -2 K' P+ E+,   slope by R = K' P+ K,
+ *
+ * which needs no inverse of R and stays semidefinite however small it is. What is read at once is read one after the
+ * other, a step each, r rows at most; rows without entries, of variance 1, read nothing.
+ *
+ * Half-vectors hold the lower triangle column by column. Slopes by a half-vector are those of its entries: both places
+ * of a symmetric matrix move with one entry. The nonzeros of H come column by column, step after step; what is read
+ * comes as the rows of M, then the half-vector of R, reading after reading.
+ */
 /* What a passage works on, in memory that its caller provides. */
 #include <math.h>
 #include <stddef.h>
@@ -84,7 +114,7 @@ static size_t keeps(Passage *p, double *memory) {
 static size_t works(Passage *p, double *memory) {
     const size_t n = p->n, r = p->r, filled = p->order ? (size_t)p->right[2 * n] : 0;
     size_t used = 0;
-    p->work = placed(memory, &used, 17 * n * n + p->nnz + 4 * (r * r + r * n));
+    p->work = placed(memory, &used, 17 * n * n + 4 * (r * r + r * n));
     p->sizes = placed(memory, &used, 2 * n);
     p->values = placed(memory, &used, p->order ? 6 * n + filled : 0);
     return used;

@@ -1,35 +1,7 @@
-/* The passage of a covariance through Gauss steps of its Riccati equation, and the exact slopes of what depends on it.
+/* The library of the passage: what Python calls. The derivations are in memory.h.
  *
- * E' = F E + E F' + Q - E W E is linear in Z = [X; Y], E = Y X^-1: Z' = H Z, H = [-F' W; Q F]. A step of the two-stage
- * Gauss method takes Z from [I; E] to [X; Y]. With H1, H2 = h H at its two points, g = sqrt(3)/6 and a = 1/2 - 2 g its
- * stages are
- *
- *     [(I - g H2)(I - g H1) - a/2 (H1 + H2)] Y1 = (I - g H2) Z0,   Z+ = Z0 + ((I - g H1) Y1 - Z0)/a,
- *     Y2 = Y1 + 2 g (Z+ - Z0).
- *
- * The method is symplectic and its own adjoint, so that no adjoint system has to be solved: with J = [0 I; -I 0]
- *
- *     dE+ = X^-T dE X^-1,   P = X^-1 P+ X^-T,   slope of tr(P+ E+) by H_i = -1/2 (J Y_i) P Y_i'.
- *
- * A cost on few entries of the last E has P = M C M' with few columns and a constant core C: M = X^-1 M+.
- *
- * How these slopes change along a direction (products with second derivatives) needs one more system a step, that of the
- * tangent of Y1. It holds, as the slopes do, where H and its direction have this form: Q and W symmetric.
- *
- * Some of the steps have no length: there something is read, r values M x with noise of variance R,
- *
- *     K = E M' (M E M' + R)^-1,   A = I - K M,   E+ = A E A' + K R K',   P = A' P+ A,
- *     slope by M = -2 K' P+ E+,   slope by R = K' P+ K,
- *
- * which needs no inverse of R and stays semidefinite however small it is. What is read at once is read one after the
- * other, a step each, r rows at most; rows without entries, of variance 1, read nothing.
- *
- * Half-vectors hold the lower triangle column by column. Slopes by a half-vector are those of its entries: both places
- * of a symmetric matrix move with one entry. The nonzeros of H come column by column, step after step; what is read
- * comes as the rows of M, then the half-vector of R, reading after reading.
- *
- * Nothing here is shared: each `Passage` is used by one thread at a time. It keeps the last point, so that slopes there
- * do not run the passage again.
+ * Nothing here is shared: each `Kept` is used by one thread at a time. It keeps the last point, so that slopes there do
+ * not run the passage again.
  */
 #define Py_LIMITED_API 0x030b0000
 #include <Python.h>
@@ -105,7 +77,7 @@ EXPORT VERSIONS int passage_tangent(
     return 0;
 }
 
-/* What exported code computes, compiled as it is there: the same numbers to the last digit. */
+/* What exported code computes, by the same operations: without the version for newer processors. */
 EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }
 
 EXPORT void exported_forward(

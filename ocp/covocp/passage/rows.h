@@ -72,9 +72,9 @@ INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, double *
     }
 }
 
-/* Rows `begin` to m, by as many rows from k on as their shares lie before column `end`. */
-INLINE void update(double *RESTRICT a, int m, int w, int k, int begin, int end) {
-    int i = begin;
+/* Rows `end` to m past column `end`, by rows k to `end`, whose shares lie before it. */
+INLINE void update(double *RESTRICT a, int m, int w, int k, int end) {
+    int i = end;
     for (; i + 2 <= m; i += 2) {
         double *own = a + i * w, *next = own + w;
         add_to_two(own + end, next + end, -1.0, own + k, next + k, 1, a + k * w + end, w, end - k, w - end);
@@ -85,16 +85,16 @@ INLINE void update(double *RESTRICT a, int m, int w, int k, int begin, int end) 
 /* The columns past the first m solved, which are triangular, two rows at a time from the last on. */
 INLINE void solve_upper(double *RESTRICT a, int m, int w) {
     for (int k = m - 1; k >= 0; k -= 2) {
-        double *own = a + k * w, *next = own - w;
         const int below = m - 1 - k, columns = w - m;
-        if (k == 0) {
-            add_rows(own + m, -1.0, own + 1, 1, own + w + m, w, below, columns);
-        } else {
-            add_to_two(own + m, next + m, -1.0, own + k + 1, next + k + 1, 1, own + w + m, w, below, columns);
-        }
+        double *own = a + k * w, *next = k ? own - w : own;
+        const double *done = below ? own + w + m : own;
+        if (k)
+            add_to_two(own + m, next + m, -1.0, own + k + 1, next + k + 1, 1, done, w, below, columns);
+        else
+            add_rows(own + m, -1.0, own + 1, 1, done, w, below, columns);
         const double inverse = 1.0 / own[k];
         for (int j = m; j < w; ++j) own[j] *= inverse;
-        if (k == 0) return;
+        if (!k) return;
         const double share = next[k], other = 1.0 / next[k - 1];
         for (int j = m; j < w; ++j) next[j] = (next[j] - share * own[j]) * other;
     }
@@ -111,7 +111,7 @@ INLINE void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) 
         panel(a, m, w, k, end, swaps);
         for (int i = k + 1; i < end; ++i)
             add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
-        update(a, m, w, k, end, end);
+        update(a, m, w, k, end);
     }
     solve_upper(a, m, w);
 }
@@ -143,7 +143,7 @@ INLINE int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT s
             add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
         for (int i = end; i < m; ++i)
             for (int c = k; c < end; ++c) sizes[i] += fabs(a[i * w + c] * a[c * w + i]);
-        update(a, m, w, k, end, end);
+        update(a, m, w, k, end);
     }
     solve_upper(a, m, w);
     return 1;

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.nodes import Buffers, Node, address
-from covocp.passage.library import functions
+from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
@@ -119,17 +119,10 @@ class _Workspaces:
     def _free(self, more: int, least: int) -> None:
         """Free the oldest, down to so many, until there is room for more bytes."""
         while len(self._kept) > least and more + sum(owner.bytes for owner, _ in self._kept) > KEPT_BYTES:
-            _library()["passage_free"](self._kept.pop(0)[1])
+            needed()["passage_free"](self._kept.pop(0)[1])
 
 
 _WORKSPACES = _Workspaces()
-
-
-def _library() -> dict[str, Callable[..., Any]]:
-    """The library, which is there where a sweep is."""
-    there = functions()
-    assert there is not None
-    return there
 
 
 @cache
@@ -151,7 +144,7 @@ class _Sweep(Node):
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
         self._shape = shape(size, pattern, count, reads, height)
-        self.bytes = int(_library()["passage_bytes"](self._shape.ctypes.data, int(lean)))
+        self.bytes = int(needed()["passage_bytes"](self._shape.ctypes.data, int(lean)))
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
         sizes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
@@ -163,7 +156,7 @@ class _Sweep(Node):
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
-        memory = _library()["passage_new"](self._shape.ctypes.data, self._shape.size, int(self._lean))
+        memory = needed()["passage_new"](self._shape.ctypes.data, self._shape.size, int(self._lean))
         if not memory:
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
@@ -195,7 +188,7 @@ class _Sweep(Node):
         zero = np.zeros(longest)  # what CasADi leaves out is zero
         whole = [zero.ctypes.data if at is None and i < 4 else at for i, at in enumerate(self.padded(moved))]
         memory = _WORKSPACES.take(self)
-        failed = _library()["passage_tangent"](memory, *given, seed, *whole, moved_seed, after, *slopes)
+        failed = needed()["passage_tangent"](memory, *given, seed, *whole, moved_seed, after, *slopes)
         _WORKSPACES.give(self, memory)
         if failed:
             raise MemoryError(f"no memory for the tangents of {self.count} steps")
@@ -204,7 +197,7 @@ class _Sweep(Node):
         """Of CasADi."""
         given = self.padded([address(argument) for argument in arguments])
         memory = _WORKSPACES.take(self)
-        _library()["passage_forward"](memory, *given, address(results[0]))
+        needed()["passage_forward"](memory, *given, address(results[0]))
         _WORKSPACES.give(self, memory)
         return 0
 
@@ -251,7 +244,7 @@ class _Slopes(Node):
         memory = _WORKSPACES.take(sweep)
         for k in range(self._directions):
             own = sweep.padded(sweep.direction(slopes, k))
-            _library()["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
+            needed()["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
         _WORKSPACES.give(sweep, memory)
         return 0
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.nodes import Buffers, Node, address
-from covocp.passage.library import functions
+from covocp.passage.library import needed
 
 STAGES = 4
 
@@ -70,9 +70,7 @@ class _Passed(Node):
     """One of the functions of the library on some steps."""
 
     def __init__(self, steps: Steps, name: str) -> None:
-        there = functions()
-        assert there is not None
-        self._run = there[name]
+        self._run = needed()[name]
         entries, intervals = len(steps.pattern[0]), sum(steps.lengths)
         slopes = ca.Sparsity.dense(entries, STAGES * steps.steps * intervals)
         if name == "transitions":
@@ -93,8 +91,5 @@ class _Passed(Node):
         out = address(results[0])
         if out is None:
             return 0
-        missing = [argument is None for argument in arguments]  # what CasADi leaves out is zero
-        zeros = [np.zeros(shape.nnz() if left else 0) for shape, left in zip(self._inputs, missing, strict=True)]
-        pairs = zip(arguments, zeros, strict=True)
-        given = [zero.ctypes.data if argument is None else address(argument) for argument, zero in pairs]
-        return int(self._run(*self._arguments, *given, out))
+        given = self.filled(arguments)
+        return int(self._run(*self._arguments, *map(address, given), out))

@@ -7,7 +7,7 @@ function of CasADi's without a body, which `bodies` gives.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -21,7 +21,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.nodes import Buffers, Node, address
 from covocp.base.short_repr import short_repr
-from covocp.passage.library import functions
+from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 from covocp.passage.sweep import Told, entries
 
@@ -53,8 +53,8 @@ class Call:
 
     def split(self, column: Expr) -> list[Any]:
         """Slopes by each of the arguments."""
-        ends = np.cumsum([0, *(argument.numel() for argument in self.arguments), 1])
-        parts = ca.vertsplit(column, [*ends[:-1].tolist(), column.shape[0]])[:-1]
+        ends = np.cumsum([0, *(argument.numel() for argument in self.arguments)]).tolist()
+        parts = ca.vertsplit(column, [*ends, column.shape[0]])[:-1]
         return [ca.reshape(part, *given.shape) for part, given in zip(parts, self.arguments, strict=True)]
 
 
@@ -96,7 +96,8 @@ class Tape:
             forward, slopes = _evaluated(size, pattern, count)
         else:
             own = shape(size, pattern, count, (), 0)
-            forward, slopes = self._unwritten.setdefault(_named(own), (own, *_unwritten(own)))[1:]
+            known, forward, slopes = self._unwritten.setdefault(_named(own), (own, *_unwritten(own)))
+            assert np.array_equal(known, own)  # the names of different shapes differ
         after = ca.MX.sym(f"after_{len(self.calls)}", half_length(size), count)
         self.calls.append(Call(arguments=[first, *given], after=after, forward=forward, slopes=slopes))
         return after
@@ -104,7 +105,7 @@ class Tape:
     def written(self) -> Written:
         """The C code of all of them, in the form that is written."""
         folder = files("covocp.passage")
-        parts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SOURCES]
+        parts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SOURCES if self._unwritten]
         bodies: dict[str, str] = {}
         for name, (own, *_) in self._unwritten.items():
             lines = [", ".join(map(str, own[i : i + WIDTH])) for i in range(0, own.size, WIDTH)]
@@ -139,35 +140,24 @@ def _form(own: NDArray[np.intc], what: str) -> tuple[list[ca.Sparsity], int]:
     """Sparsities of the arguments of a function, length of its result."""
     size, nonzeros, count = own[:3].tolist()
     half, point = half_length(size), (nonzeros, count)
-    lengths = [int(_library()["exported_length"](own.ctypes.data, of)) for of in range(len(WHAT))]
+    lengths = [int(needed()["exported_length"](own.ctypes.data, of)) for of in range(len(WHAT))]
     shapes = [(half, 1), point, point] if what == WHAT[0] else [point, point, (lengths[0], 1), (half, count)]
     return [ca.Sparsity.dense(*each) for each in shapes], lengths[WHAT.index(what)]
-
-
-def _library() -> dict[str, Callable[..., Any]]:
-    """The library, which is there where something passes in compiled code."""
-    there = functions()
-    assert there is not None
-    return there
 
 
 class _Evaluated(Node):
     """A function of the library that works in what it returns."""
 
     def __init__(self, what: str, own: NDArray[np.intc], inputs: list[ca.Sparsity], length: int) -> None:
-        self._run, self._shape = _library()[f"exported_{what}"], own
+        self._run, self._shape = needed()[f"exported_{what}"], own
         super().__init__(f"passage_{what}", inputs, [ca.Sparsity.dense(length, 1)])
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        pairs = zip(arguments, self._inputs, strict=True)  # what CasADi leaves out is zero
-        zeros = [np.zeros(sparsity.nnz()) if argument is None else None for argument, sparsity in pairs]
-        filled = zip(arguments, zeros, strict=True)
-        given = [address(argument) if zero is None else zero.ctypes.data for argument, zero in filled]
+        given, result = self.filled(arguments), address(results[0])
         chosen = np.empty(2 * int(self._shape[0]), dtype=np.intc)
-        result = address(results[0])
         if result is not None:
-            self._run(self._shape.ctypes.data, chosen.ctypes.data, *given, result)
+            self._run(self._shape.ctypes.data, chosen.ctypes.data, *map(address, given), result)
         return 0
 
 

@@ -329,7 +329,7 @@ def _backward(
 
 
 def compiled_steps(mesh: Mesh) -> bool:
-    """Whether the compiled passage has the steps of a mesh: those of Gauss, where nothing is written out as C."""
+    """Whether the compiled passage has the steps of a mesh: those of Gauss, where CasADi writes nothing out as C."""
     return mesh.step in ("gauss", "rodas") and mesh.linear_solver == LINEAR_SOLVER and functions() is not None
 
 

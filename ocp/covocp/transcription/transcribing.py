@@ -51,7 +51,7 @@ def transcribe(
     """
     variables = _Variables(statement, mesh, scales)
     passage = passage if compiled_steps(mesh) else None
-    along = _AlongRun(variables) if passage is not None and is_staged(statement, mesh) else None
+    along = _AlongRun(variables) if passage is passed_by and is_staged(statement, mesh) else None
     nodes = shoot(statement, mesh, variables, passage=passage) if along is None else along.nodes
     running, terminal = _costs(variables, nodes)
     rows = _constraints(statement, mesh, scales, variables, nodes)

@@ -181,7 +181,7 @@ def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool) -
     if alone:
         scales = evened(scales, mesh)
     written = None
-    if limited and alone and not statement.coupled and compiled_steps(solution.mesh):
+    if limited and alone and not statement.coupled and compiled_steps(solution.mesh):  # what `mesh` writes out is not
         nlp = written_out(statement, mesh, scales, Tape("evaluated"))
         tape = Tape("written")
         written = written_out(statement, mesh, scales, tape), tape
@@ -229,7 +229,9 @@ def _lagrangian_slope(nlp: NLP) -> ca.Function:
 
 def _hessians(method: str, own: Mapping[str, Any], *, alone: bool) -> list[bool]:
     """Whether the Hessian is exact, in the order in which that is tried; `alone`: matrices pass along the nominal."""
-    asked = own.get("hessian_approximation", dict(own.get(method) or {}).get("hessian_approximation"))
+    inner = own.get(method)
+    inner = inner if isinstance(inner, Mapping) else {}
+    asked = own.get("hessian_approximation", inner.get("hessian_approximation"))
     if asked is not None or method == "fatrop":
         return [asked != "limited-memory"]
     return [False] if alone else [True, False]

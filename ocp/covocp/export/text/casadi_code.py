@@ -25,6 +25,9 @@ INTRODUCTION = """\
 #endif
 
 """
+PASSAGE = """\
+/* The passage of covariances, from the sources of covocp (MIT). What CasADi has generated comes behind it. */
+"""
 # What CasADi puts around its code in a file. The code is taken from it as text: of a file that it cannot write, in a
 # full folder, it says nothing.
 WHOLE = """\
@@ -127,7 +130,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
     )
     sizes = {law.name: _sizes(source, core_name(package, law)) for law in laws}
     introduction = INTRODUCTION.format(name=package, pragmas=pragmas, gcc=gcc)
-    introduction += "".join(f"{own.introduction}\n" for own in passages)
+    introduction += "".join(f"{PASSAGE}{own.introduction}\n" for own in passages if own.introduction)
     return Generated(source=introduction + source, sizes=sizes, alone=shares_memory(source))
 
 
