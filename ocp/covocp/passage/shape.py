@@ -26,8 +26,9 @@ def shape(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], heigh
     """
     rows, columns = (np.array(part, dtype=np.intc) for part in pattern)
     place = np.empty(count, dtype=np.intc)
-    place[list(reads)] = -1 - np.arange(len(reads))
-    place[np.setdiff1d(np.arange(count), reads)] = np.arange(count - len(reads))
+    reading = np.isin(np.arange(count), reads)
+    place[reading] = -1 - np.arange(len(reads))
+    place[~reading] = np.arange(count - len(reads))
     by_rows = np.lexsort((columns, rows))
     begin = np.searchsorted(rows[by_rows], np.arange(2 * size + 1))
     own = ordering(size, *(list(part) for part in pattern))
