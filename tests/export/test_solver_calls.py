@@ -4,6 +4,7 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
+import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, package
@@ -181,3 +182,68 @@ def test_names_of_the_plan_are_not_those_of_its_status(tmp_path):
 def test_options_that_a_solver_has_not_are_refused(tmp_path, option, remedy):
     with pytest.raises(co.ExportError, match=rf"(?s)no option '{next(iter(option))}' for a problem.*{remedy}"):
         export_c(unknown_lag.problem(), tmp_path / "pk", **option)
+
+
+def pulled(matrix) -> co.Problem:
+    """Two states with a matrix parameter that is not symmetric."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", 2, initial=[1.0, 0.0], variance=0.1), ocp.control("u")
+    b = ocp.unknown("b", mean=1.0, variance=0.2)
+    ocp.dynamics(x, ocp.parameter("M", matrix) @ x + ca.vertcat(0, b * u))
+    ocp.measurement("y", x[0], noise=0.05)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=ca.dot(x, x) + E[b, b])
+    return ocp
+
+
+def test_a_matrix_parameter_is_given_as_it_is():
+    """Not its transpose, by default or by name, in Python and in C; of another shape it is refused."""
+    matrix = np.array([[0.0, 1.0], [-2.0, -0.3]])
+    made = export_c(pulled(matrix), FOLDER / "pulled", intervals=8, substeps=2)
+    made.build(flags=["-Werror"])
+    assert made.check().ok
+    changed = np.array([[0.1, 0.7], [-1.5, -0.2]])
+    for planner in (made.reference(), made.python()):
+        for given, meant in (
+            ({}, matrix),
+            ({"M": matrix}, matrix),
+            ({"M": changed}, changed),
+            ({"M": changed.ravel()}, changed),
+        ):
+            known = co.solve(pulled(meant), intervals=8, substeps=2, progress=False)
+            assert planner(**given)["cost"] == pytest.approx(known.cost, rel=1e-7)
+        with pytest.raises(co.ExportError, match="give 'M' in its shape"):
+            planner(M=np.zeros((1, 4)))
+    assert "2 by 2, row by row" in (made.directory / "pulled.h").read_text()
+
+
+def test_threads_that_share_a_compiled_planner_get_their_own_plans():
+    planner = package("planner").python()
+    starts = np.linspace(0.2, 0.9, 4)
+    known = [planner(initial_x=start)["cost"] for start in starts]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: (k, planner(initial_x=starts[k % 4])), range(40)))
+    for k, plan in found:
+        assert plan["status"] == "OK"
+        assert plan["cost"] == known[k % 4]
+
+
+def test_one_segment_compiles_without_a_warning():
+    """Code in which newer compilers see an address of a local array that outlives it."""
+    made = export_c(unknown_lag.problem(), FOLDER / "single", intervals=12, substeps=2, segments=1)
+    made.build(flags=["-Werror"])
+    assert made.check().ok
+
+
+def test_residuals_that_are_rounding_are_no_deviation():
+    """Of a stiff plant CasADi's C code of Ipopt leaves another slope, of 1e-9, at the same plan."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", 2, initial=[0.3, 0.0], variance=0.1), ocp.control("u", guess=-0.2)
+    b = ocp.unknown("b", mean=1.0, variance=0.3)
+    ocp.dynamics(x, ca.vertcat(2.0 * x[0] + b * x[1], -200.0 * (x[1] - u)), noise=[0.01, 0.1])
+    ocp.measurement("y", x[0], noise=0.01)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=x[0] ** 2 + 0.1 * u**2 + 0.2 * E[x[0], x[0]], terminal=x[0] ** 2 + E[b, b])
+    made = export_c(ocp, FOLDER / "stiff", intervals=12, substeps=4, method="ipopt")
+    made.build(flags=["-O0"])
+    assert made.check().ok

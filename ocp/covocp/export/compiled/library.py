@@ -6,6 +6,7 @@ import copy
 import ctypes
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -58,6 +59,7 @@ class Library:
     def __init__(self, path: Path, package: str, precision: str) -> None:
         """Load it."""
         self._made_from = (path, package, precision)
+        self._lock = threading.Lock()
         self._package = package
         self._real: Any = ctypes.c_double if precision == "double" else ctypes.c_float
         try:
@@ -78,9 +80,17 @@ class Library:
         return Library, self._made_from
 
     def backend(self, law: Law) -> Backend:
-        """The C function of a law; buffers are its own, so it must not run in two threads at a time."""
-        if law.kind in ("sample", "controller"):
-            return self._with_struct(law)
+        """The C function of a law, which works in buffers of its own; threads take turns."""
+        call, lock = self._with_struct(law) if law.kind in ("sample", "controller") else self._plain(law), self._lock
+
+        def alone(row: Array) -> tuple[Array, int]:
+            with lock:
+                return call(row)
+
+        return alone
+
+    def _plain(self, law: Law) -> Backend:
+        """A C function of arguments and results, with a workspace of its own where it needs one."""
         inputs, outputs = self._buffer(stacked_size(law.inputs)), self._buffer(stacked_size(law.results))
         function = getattr(self._library, f"{self._package}_{law.name}")
         function.restype = ctypes.c_int
@@ -218,10 +228,10 @@ class Call:
         """
         row = self._row(values, named)
         results, status = self._backend(row)
-        self.status = NAMES[status]
+        self.status = name = NAMES[status]
         parts = {p.name: _shaped(results[span(self.law.results, p.name)], p) for p in self.law.results}
         if self.law.kind != "function":
-            return {**parts, "status": self.status}
+            return {**parts, "status": name}
         return next(iter(parts.values())) if len(parts) == 1 else tuple(parts.values())
 
     def _row(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> Array:
@@ -237,7 +247,8 @@ class Call:
                 array = real_numbers(value)
             except (TypeError, ValueError, OverflowError) as error:
                 raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
-            if array.size != port.size:
+            matrices = port.columns > 1 and array.ndim > 1
+            if array.size != port.size or (matrices and array.shape != port.shape):
                 raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
             parts.append(array.ravel())
         return np.concatenate([np.zeros(0), *parts])

@@ -54,6 +54,7 @@ class Port:
         about: what it is, a line.
         entries: names of the rows of a vector.
         whole: whether a number is an int in a struct.
+        least: where it is compared, what is smaller counts as of this size.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Port:
     about: str = ""
     entries: tuple[str, ...] = ()
     whole: bool = False
+    least: float = 0.0
 
     @property
     def size(self) -> int:

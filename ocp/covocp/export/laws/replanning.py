@@ -31,14 +31,16 @@ class Argument:
     Attributes:
         port: as the caller sees it; a covariance is a whole matrix.
         parameter: name of the parameter; "" for the duration.
-        value: default, in the shape of the port, flat.
+        value: default, in the shape of the port, flat row by row.
         deviation: how far it may be moved to try the solver, of the same shape.
+        symmetric: whether the parameter is the half-vector of the matrix, not its columns one below the other.
     """
 
     port: Port
     parameter: str
     value: Array
     deviation: Array
+    symmetric: bool = False
 
     __repr__ = short_repr
 
@@ -79,11 +81,12 @@ def replannable(problem: Problem) -> Replannable:
     found = restartable(own, statement)
     own, entries = found.declarations, [_argument(start, taken) for start in found.starts]
     for block in (*statement.of_kind("parameter"), *statement.of_kind("unknown")):
-        value = statement.values[block.span]
+        rows, columns = statement.matrix_parameters.get(block.name, (block.size, 1))
+        value = statement.values[block.span].reshape(rows, columns, order="F").ravel()
         about = "parameter" if block.kind == "parameter" else "mean of the unknown"
-        port = Port(
-            name=identifier(block.name, taken), rows=block.size, unit=block.unit, about=f"{about} '{block.name}'"
-        )
+        about = f"{about} '{block.name}'" + (f", {rows} by {columns}, row by row" if columns > 1 else "")
+        name = identifier(block.name, taken)
+        port = Port(name=name, rows=rows, columns=columns, unit=block.unit, about=about)
         entries.append(Argument(port=port, parameter=block.name, value=value, deviation=0.02 * np.abs(value)))
     moving = own
     if own.free_duration is None and statement.autonomous and not _timed(own):
@@ -110,7 +113,8 @@ def _argument(start: Start, taken: set[str]) -> Argument:
         value = unpack(start.value, entry.size)
         about = f"initial value of the matrix '{entry.name}', rows {', '.join(entry.labels)}"
         port = Port(name=name, rows=entry.size, columns=entry.size, unit=entry.unit, about=about)
-        return Argument(port=port, parameter=start.parameter, value=value.ravel(), deviation=np.zeros(value.size))
+        none = np.zeros(value.size)
+        return Argument(port=port, parameter=start.parameter, value=value.ravel(), deviation=none, symmetric=True)
     about = f"initial value of '{entry.name}'"
     about += "" if len(known) == entry.size else f", its entries {', '.join(map(str, known))}"
     deviation = np.zeros(len(known))
@@ -122,14 +126,18 @@ def _argument(start: Start, taken: set[str]) -> Argument:
 
 
 def stacked(entries: tuple[Argument, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
-    """The parameters of a statement from the arguments, in the order of their names; matrices as half-vectors."""
+    """The parameters of a statement from the arguments, in the order of their names, as it has matrices."""
     by_parameter = {entry.parameter: entry for entry in entries}
     result = []
     for name in names:
         entry = by_parameter[name]
         value = values[entry.port.name]
-        if entry.port.columns > 1:
-            value = _half(value, entry.port.rows)
+        rows, columns = entry.port.rows, entry.port.columns
+        if entry.symmetric:
+            value = _half(value, rows)
+        elif columns > 1:
+            turned = np.arange(rows * columns).reshape(rows, columns).ravel(order="F")
+            value = value[turned.tolist()]
         result.append(value)
     return result
 

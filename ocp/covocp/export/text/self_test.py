@@ -140,7 +140,8 @@ def reference(law: Law, count: int, seed: int, precision: str) -> Reference:
     else:
         status, values = values[:, -1], values[:, :-1]
     finite = np.where(np.isfinite(values), np.abs(values), 0.0)
-    smallest = FLOORS[precision] * np.median(finite, axis=0)
+    least = np.repeat([port.least for port in law.results], [port.size for port in law.results])
+    smallest = np.maximum(FLOORS[precision] * np.median(finite, axis=0), least)
     return Reference(rows=rows, values=values, status=status.astype(int), smallest=smallest)
 
 
