@@ -247,3 +247,16 @@ def test_residuals_that_are_rounding_are_no_deviation():
     made = export_c(ocp, FOLDER / "stiff", intervals=12, substeps=4, method="ipopt")
     made.build(flags=["-O0"])
     assert made.check().ok
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (5, "a dict of options of the plugin by name"),
+        ({"hessian_approximation": "nonsense"}, "'exact' or 'limited-memory'"),
+        ({"ipopt": 5}, "ipopt"),
+    ],
+)
+def test_wrong_options_of_the_plugin_are_refused_by_name(given, words, tmp_path):
+    with pytest.raises(co.ExportError, match=words):
+        export_c(unknown_lag.problem(), tmp_path / "lag", **FEW, plugin_options=given)

@@ -60,7 +60,7 @@ typedef struct {
     const int *place; /* of each step among those that move, or -1 - that among those that read; of shape */
     const int *row, *col; /* nonzeros of H, column by column; of shape */
     const int *begin, *across, *which; /* the same row by row: places, columns, positions among them; of shape */
-    /* An order of elimination and the pattern it leads to, see sparse.h, of shape; NULL: rows are exchanged. Row i of
+    /* An order of elimination and the pattern it leads to, see `solve_sparse`, of shape; NULL: rows are exchanged. Row i of
      * the factors has columns `before` it and `behind` it, from `left[i]` and `right[i]` on; `facing`: of each of the
      * former, the place of i behind it. */
     const int *order, *rank, *left, *right, *before, *facing, *behind;

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import product
 from typing import Any
 
 import casadi as ca
@@ -52,6 +51,7 @@ TOLERANCE = 1e-8
 TRIALS, FAILURES = 6, 3
 MOST_POINTS = 12
 SEED = 1971
+HESSIANS = ("exact", "limited-memory")  # that sqpmethod takes; of another word it says nothing
 # Shooting segments where covariances are eliminated, unless changes grow much: with the states at the starts of ten of
 # them a QP takes three to eight times longer (lag, oscillator, chains of 4 to 12 rows). With one segment fewer plans of
 # Mars entry from starts 20 % away were found: 9 of 11.
@@ -128,13 +128,16 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     made = replannable(problem)
     chosen = {name: value for name, value in options.items() if name != "plugin_options"}
     solution = Solver(made.fixed, **chosen).solve(progress=False)
-    own = dict(options.get("plugin_options") or {})
+    own = _plugin_options(options)
     alone = solution.mesh.eliminated and len(made.statement.matrices) > 0
     failed = ""
-    meshes = [solution.mesh]
-    if alone and chosen.get("segments", "auto") == "auto":
-        meshes.insert(0, _condensed(solution))
-    for exact, mesh in product(_hessians(method, own, alone=alone), dict.fromkeys(meshes)):
+    condensed = alone and chosen.get("segments", "auto") == "auto"
+    tries = [
+        (exact, mesh)
+        for exact in _hessians(method, own, alone=alone)
+        for mesh in ([_condensed(solution)] if condensed and not exact else []) + [solution.mesh]
+    ]
+    for exact, mesh in tries:
         task = _task(made, solution, mesh, limited=not exact)
         law = _law(task, method, _settings(method, exact, own))
         failure = _failure(law)
@@ -148,6 +151,32 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
         remedy=("another method" if method == "ipopt" else "method='ipopt' (linked)")
         + ", fewer intervals, or plugin_options such as {'max_iter': 1000}",
     )
+
+
+def _plugin_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the plugin.
+
+    Raises:
+        ExportError: they are no mapping, or ask for a Hessian that there is not.
+    """
+    given = options.get("plugin_options")
+    if given is not None and not isinstance(given, Mapping):
+        raise ExportError(
+            "The option 'plugin_options' is no mapping.",
+            expected="a dict of options of the plugin by name, such as {'max_iter': 1000}",
+            received=repr(given)[:100],
+            remedy="correct plugin_options=",
+        )
+    own = dict(given or {})
+    asked = own.get("hessian_approximation", HESSIANS[0])
+    if asked not in HESSIANS:
+        raise ExportError(
+            "The option 'hessian_approximation' of the plugin has an unknown value.",
+            expected=" or ".join(map(repr, HESSIANS)),
+            received=repr(asked)[:100],
+            remedy="correct plugin_options=",
+        )
+    return own
 
 
 def _failure(law: Law) -> str:
