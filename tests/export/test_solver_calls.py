@@ -254,7 +254,7 @@ def test_residuals_that_are_rounding_are_no_deviation():
     [
         (5, "a dict of options of the plugin by name"),
         ({"hessian_approximation": "nonsense"}, "'exact' or 'limited-memory'"),
-        ({"ipopt": 5}, "ipopt"),
+        ({"ipopt": 5}, "Unknown option: ipopt"),
     ],
 )
 def test_wrong_options_of_the_plugin_are_refused_by_name(given, words, tmp_path):

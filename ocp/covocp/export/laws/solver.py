@@ -307,6 +307,13 @@ def _functions(nlp: NLP, method: str) -> dict[str, Any]:
     }
 
 
+def _named(message: str) -> str:
+    """The line of CasADi's message that names the option; behind an unknown one it lists some that it has."""
+    lines = message.strip().splitlines()
+    unknown = [line.rpartition(": Unknown")[2] for line in lines if ": Unknown" in line]
+    return f"Unknown{unknown[0]}" if unknown else lines[-1]
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Core:
     """The function of the law; its inputs are those of `entries` and the guess."""
@@ -327,7 +334,7 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
         raise ExportError(
             f"The plugin '{method}' refuses the problem or its settings.",
             expected="a plugin of this CasADi, and options that it has",
-            received=str(error).strip().splitlines()[-1],
+            received=_named(str(error)),
             remedy="correct plugin_options, or take another method",
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
