@@ -18,6 +18,19 @@ Outputs = tuple[Array, ...]
 KEPT = 3
 
 
+class Weighed:
+    """The slope of the sum of rows with some weights, from the entries of their Jacobian."""
+
+    def __init__(self, pattern: ca.Sparsity) -> None:
+        """Take the sparsity of the Jacobian."""
+        self._rows, self._columns = np.array(pattern.row(), np.intp), np.array(pattern.get_col(), np.intp)
+        self._width = pattern.shape[1]
+
+    def __call__(self, entries: Array, weights: Array) -> Array:
+        """The slope."""
+        return np.asarray(np.bincount(self._columns, entries * weights[self._rows], self._width), dtype=float)
+
+
 class AtPoint:
     """The functions of a program with slopes of first order; the last points are kept, in any unit of the cost."""
 
@@ -31,7 +44,7 @@ class AtPoint:
         cost, gradient = program.gradient or (program.f, ca.gradient(program.f, w))
         rows = ca.jacobian(program.g, w) if program.jacobian is None else program.jacobian
         self.pattern = rows.sparsity()
-        self._rows, self._columns = np.array(self.pattern.row(), np.intp), np.array(self.pattern.get_col(), np.intp)
+        self.weighed = Weighed(self.pattern)
         outputs = [ca.densify(program.g), ca.densify(gradient), rows]
         self._full = Buffered(ca.Function("full", [w, p], [cost, *outputs]))
         self._value = Buffered(ca.Function("value", [w, p], [program.f, *outputs[:1]]))
@@ -56,11 +69,6 @@ class AtPoint:
         if self._trial[0] != key:
             self._trial = key, _kept(self._value(w, np.append(p[:-1], 1.0)))
         return _scaled(self._trial[1], p)
-
-    def weighed(self, entries: Array, weights: Array) -> Array:
-        """The slope of the sum of the rows with these weights, from the entries of their Jacobian."""
-        products = entries * weights[self._rows]
-        return np.asarray(np.bincount(self._columns, products, self.pattern.shape[1]), dtype=float)
 
     @staticmethod
     def _key(w: Array, p: Array) -> bytes:

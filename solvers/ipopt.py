@@ -245,8 +245,8 @@ class ShootingSolver:
     ) -> None:
         """Keep the settings; see `prepare`. `limit`: of the residuals of a converged point."""
         self._statement, self._mesh = statement, mesh
-        stages = plugin == "ipopt"  # others differentiate the Jacobian themselves
-        self._runs = Runs(_builder(None, (statement,), (mesh,), limited, stages), plugin, settings, limited, limit)
+        taken = plugin == "ipopt"  # others differentiate the slopes themselves
+        self._runs = Runs(_builder(None, (statement,), (mesh,), limited, taken), plugin, settings, limited, limit)
 
     @property
     def mesh(self) -> Mesh:
@@ -300,7 +300,7 @@ def _builder(
     statements: tuple[Statement, ...],
     meshes: tuple[Mesh, ...],
     limited: bool,
-    stages: bool = False,
+    taken: bool = False,
 ) -> Callable[[Magnitudes | None, Trajectories, Arrays], Program]:
     """What makes the program in some magnitudes, or in those of trajectories where there are none."""
 
@@ -314,7 +314,7 @@ def _builder(
         if limited:
             scales = tuple(evened(own, mesh) for own, mesh in zip(scales, meshes, strict=True))
         made = zip(pairs, scales, strict=True)
-        parts = tuple(transcribe(*pair, own, passage, stages=stages) for pair, own in made)
+        parts = tuple(transcribe(*pair, own, passage, taken=taken) for pair, own in made)
         return alone(parts[0]) if chain is None else joined(chain, parts)
 
     return build

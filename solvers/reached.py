@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
 from covocp.base.residuals import LIMIT, VANISHING, Residuals, complementary
 from covocp.base.short_repr import short_repr
-from covocp.solvers.at_point import AtPoint
+from covocp.solvers.at_point import AtPoint, Weighed
 from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.program import Arrays, Program, Trajectories
 from covocp.transcription.scales import choose_scales, magnitudes
@@ -87,23 +89,37 @@ class FirstOrder:
 
     def __init__(self, nlp: Program, solver: Any, together: AtPoint | None = None) -> None:
         """Take the functions that are had together, those of a solver that tells them, or, without both, make some."""
-        self.nlp, self._together = nlp, together
-        self._gradient: Any = None
-        self._jacobian: Any = None
-        if together is None and solver is not None:
-            self._gradient, self._jacobian = solver.get_function("nlp_grad_f"), solver.get_function("nlp_jac_g")
+        self.nlp, self._together, self._solver = nlp, together, solver
+
+    @cached_property
+    def _gradient(self) -> Matrices:
+        """(w, p) -> cost, its slopes."""
+        if self._solver is not None:
+            return Matrices(self._solver.get_function("nlp_grad_f"))
+        w, p = self.nlp.w, self.nlp.p
+        return Matrices(ca.Function("gradient", [w, p], [self.nlp.f, ca.gradient(self.nlp.f, w)]))
+
+    @cached_property
+    def _rows(self) -> tuple[Buffered, Weighed]:
+        """(w, p) -> constraints, entries of their Jacobian, by the function of the solver; and what weighs these."""
+        function = self._solver.get_function("nlp_jac_g")
+        return Buffered(function), Weighed(function.sparsity_out(1))
+
+    @cached_property
+    def _sum(self) -> Matrices:
+        """(w, p, weights) -> constraints, slopes of their sum with these weights."""
+        w, p, g = self.nlp.w, self.nlp.p, self.nlp.g
+        weights = ca.MX.sym("weights", g.shape[0])
+        return Matrices(ca.Function("weighed", [w, p, weights], [g, ca.jtimes(g, w, weights, True)]))
 
     def cost(self, w: Array, parameters: Arrays) -> tuple[float, Array]:
         """The cost and its gradient by the variables; NaN where the model fails."""
         p = self.nlp.p_of(parameters, 1.0)
-        if self._together is not None:
-            outputs = self._together.full(w, p)
-            return (np.nan, np.full(w.size, np.nan)) if outputs is None else (float(outputs[0][0]), outputs[2])
-        if self._gradient is None:
-            slopes = [self.nlp.f, ca.gradient(self.nlp.f, self.nlp.w)]
-            self._gradient = ca.Function("gradient", [self.nlp.w, self.nlp.p], slopes)
-        value, slope = self._gradient(w, p)
-        return float(value), np.asarray(slope.full()).ravel()
+        if self._together is None:
+            value, slope = self._gradient.evaluated(w, p)
+            return float(value.item()), slope.ravel()
+        outputs = self._together.full(w, p)
+        return (np.nan, np.full(w.size, np.nan)) if outputs is None else (float(outputs[0][0]), outputs[2])
 
     def constraints(self, w: Array, parameters: Arrays, weights: Array) -> tuple[Array, Array]:
         """The constraints, and the slope by the variables of their sum with these weights."""
@@ -113,15 +129,14 @@ class FirstOrder:
             if outputs is None:
                 return np.full(weights.size, np.nan), np.full(w.size, np.nan)
             return outputs[1], self._together.weighed(outputs[3], weights)
-        if self._jacobian is not None:
-            values, jacobian = self._jacobian(w, p)
-            slope = ca.mtimes(jacobian.T, ca.DM(weights)).full()  # not by scipy: importing it takes longer than a solve
-        else:
-            lam = ca.MX.sym("lam", weights.size)
-            both = [self.nlp.g, ca.jtimes(self.nlp.g, self.nlp.w, lam, True)]
-            values, slope = ca.Function("weighted", [self.nlp.w, self.nlp.p, lam], both)(w, p, weights)
-            slope = slope.full()
-        return np.asarray(values.full()).ravel(), np.asarray(slope).ravel()
+        if self._solver is None:
+            values, slope = self._sum.evaluated(w, p, weights)
+            return values.ravel(), slope.ravel()
+        rows, weighed = self._rows
+        outputs = rows(w, p)
+        if outputs is None:
+            raise RuntimeError("the constraints have no slopes there")
+        return outputs[0], weighed(outputs[1], weights)
 
 
 def reached_scales(nlp: Program, trajectories: Trajectories, parameters: Arrays, *, again: bool) -> Magnitudes:

@@ -33,6 +33,7 @@ from covocp.solvers.reached import (
 )
 from covocp.solvers.statuses import Status, status_of
 from covocp.transcription.program import Arrays, Program, Trajectories
+from covocp.transcription.separable import slopes
 
 MAX_ITERATIONS = 1000
 # Runs from one start, each in the scales of the point that the last one reached.
@@ -45,6 +46,9 @@ UNMOVED = 1.0 + 1e-9
 # Relative length of the step along the gradient by which the curvature of the cost is probed.
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
+
+# Options of functions of CasADi that are compiled.
+COMPILED = ("jit", "compiler", "jit_options")
 
 NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
 
@@ -83,6 +87,7 @@ class Runs:
         self._solvers: dict[bool, Any] = {}  # of the program, by whether they start from multipliers
         self._functions: Any = None  # the solver of it that was made first and has the functions of all
         self._nodes: Nodes | None = None  # its functions, where they are had together
+        self._slopes: FirstOrder | None = None
 
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> tuple[Round, dict[str, Any]]:
         """Run from these guesses, one for each part; the last iterate is returned whatever happens.
@@ -167,7 +172,7 @@ class Runs:
         status = self._ending(point.status)
         if not (point.success or (status is not None and status.judged)):
             return Round(nlp=nlp, point=point, where=where, residuals=None, converged=False)
-        first = FirstOrder(nlp, self._functions if self._open else None, self._together())
+        first = self._first_order()
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
@@ -194,7 +199,7 @@ class Runs:
         """One run of the NLP solver; a tentative one may be given up."""
         bounds = nlp.bounds(parameters)
         w0 = np.clip(start.w, bounds["lbx"], bounds["ubx"])
-        scale = self._cost_scale(solver, w0, parameters)
+        scale = self._cost_scale(w0, parameters)
         arguments: dict[str, Any] = {"x0": w0, "p": nlp.p_of(parameters, scale), **bounds}
         if start.lam_x is not None and start.lam_g is not None:
             arguments |= {"lam_x0": start.lam_x / scale, "lam_g0": start.lam_g / scale}
@@ -285,7 +290,7 @@ class Runs:
         self._nlp = self._build_program(scales, trajectories, parameters)
         if self._open:
             self._monitor = Monitor(self._nlp)
-        self._solvers, self._functions, self._nodes = {}, None, None
+        self._solvers, self._functions, self._nodes, self._slopes = {}, None, None, None
 
     def _solver(self, warm: bool) -> Any:
         """The solver for starts with multipliers, or without; other plugins than Ipopt have one for all."""
@@ -309,6 +314,10 @@ class Runs:
         if nlp.gradient is not None and self._open and settings.get("no_nlp_grad"):
             self._nodes = self._nodes or Nodes(nlp)
             problem, settings = self._nodes.problem, {**settings, **self._nodes.slopes}
+        elif nlp.pieces and "jac_g" not in settings:
+            compiled: dict[str, Any] = {name: settings[name] for name in COMPILED if name in settings}
+            own = (nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0])
+            settings = slopes(*own, second=not self._limited, options=compiled) | settings
         elif nlp.jacobian is not None and "jac_g" not in settings:
             outputs, names = [nlp.g, nlp.jacobian], (["x", "p"], ["g", "jac_g_x"])
             settings["jac_g"] = ca.Function("nlp_jac_g", [nlp.w, nlp.p], outputs, *names)
@@ -334,7 +343,7 @@ class Runs:
                 remedy="correct plugin_options=, or leave compile= out",
             ) from error
 
-    def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
+    def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
         """Curvature of the cost along its gradient at the start: in units of it the Hessian is of the order of one.
 
         Never above the size of the cost and of its slope by the controls, so that the tolerance keeps its meaning.
@@ -342,9 +351,14 @@ class Runs:
         if not self._open:  # each plugin has functions of its own, and a scaling of its own
             return 1.0
         with np.errstate(all="ignore"):  # where numbers are too large to be squared there is no curvature to be seen
+            return self._share * self._curvature_along(self._first_order(), w0, parameters)
+
+    def _first_order(self) -> FirstOrder:
+        """The slopes of the present program, by the functions of its solver where that tells them."""
+        if self._slopes is None:
             assert self._nlp is not None
-            first = FirstOrder(self._nlp, solver, self._together())
-            return self._share * self._curvature_along(first, w0, parameters)
+            self._slopes = FirstOrder(self._nlp, self._functions if self._open else None, self._together())
+        return self._slopes
 
     def _together(self) -> AtPoint | None:
         """The functions of the present program, where they are had together."""

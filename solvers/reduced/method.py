@@ -137,7 +137,7 @@ class ReducedRuns(Runs):
         """All by the tolerance: nothing here is compared with one."""
         self._strictness *= share_for(found.worst / LIMIT)
 
-    def _cost_scale(self, solver: Any, w0: Array, parameters: Arrays) -> float:
+    def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
         """The Hessian has a magnitude of its own."""
         return 1.0
 

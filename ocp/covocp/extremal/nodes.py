@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, stacked, unpack
@@ -24,8 +24,8 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
     function = _mapped(extremal.statement, "rates", extremal.mesh.intervals + 1)
 
     def stacked(u: Expr, time: Array) -> Array:
-        state, matrices, _ = function(x, u, e, time[None, :], *rest)
-        return np.vstack([np.asarray(state.full()), np.asarray(matrices.full())]).T
+        state, matrices, _ = function.evaluated(x, u, e, time[None, :], *rest)
+        return np.vstack([state, matrices]).T
 
     x, u, e, _, *rest = extremal.columns()
     t = extremal.time
@@ -45,7 +45,7 @@ def filter_gains(extremal: Extremal) -> Array | None:
     block = st.estimation
     x, u, _, t, duration, p = extremal.columns()
     count = extremal.mesh.intervals + 1
-    _, M, U = (stacked(v, count) for v in _mapped(st, "measurement", count)(x, u, t, duration, p))
+    _, M, U = (stacked(v, count) for v in _mapped(st, "measurement", count).evaluated(x, u, t, duration, p))
     E = unpack(extremal.trajectory.e[:, block.span], block.size)
     try:
         return np.asarray(kalman_gain(E, M, U))
@@ -54,7 +54,6 @@ def filter_gains(extremal: Extremal) -> Array | None:
 
 
 @lru_cache(maxsize=2 * KEPT)
-def _mapped(statement: Statement, function: str, count: int) -> ca.Function:
+def _mapped(statement: Statement, function: str, count: int) -> Matrices:
     """A function of the statement for so many points."""
-    made: ca.Function = getattr(statement, function).map(count)
-    return made
+    return Matrices(getattr(statement, function).map(count))

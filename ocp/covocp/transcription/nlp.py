@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.errors import OutsideDomainError
 from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
@@ -16,6 +17,7 @@ from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 from covocp.transcription.before_reading import hold, unfed
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.separable import Piece
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Scaled residual above which a constraint of a failed run is reported as violated.
@@ -61,7 +63,8 @@ class NLP:
     `p` stacks the parameters of the statement and the scale of the cost. `evaluate` maps (w, p) to x, e, u at the
     nodes (columns), the terminal time, running cost, terminal cost and g. `backward` maps them to the half-vectors at
     the start of the matrices that run backward; None where none does. `gradient`, f and its slopes by w, and
-    `jacobian`, the slopes of g, are there where CasADi's own take longer, else None.
+    `jacobian`, the slopes of g, are there where CasADi's own take longer, else None. `pieces`, where there are some,
+    add up to f and g.
     """
 
     statement: Statement
@@ -76,6 +79,7 @@ class NLP:
     jacobian: Any
     evaluate: ca.Function
     backward: ca.Function | None = None
+    pieces: tuple[Piece, ...] = ()
 
     __repr__ = short_repr
 
@@ -93,11 +97,14 @@ class NLP:
 
     def unpack(self, w: Array, parameters: Array) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory at all nodes, and the cost terms and constraint values, of some variables."""
-        x, e, u, duration, running, terminal, g = (
-            np.asarray(v.full()) for v in self.evaluate(w, np.append(parameters, 1.0))
-        )
+        x, e, u, duration, running, terminal, g = self._evaluated.evaluated(w, np.append(parameters, 1.0))
         trajectory = Trajectory(x=x.T, u=u.T, e=e.T, duration=float(duration.item()))
         return trajectory, {"running": float(running.item()), "terminal": float(terminal.item()), "g": g.ravel()}
+
+    @cached_property
+    def _evaluated(self) -> Matrices:
+        """`evaluate`, for numbers."""
+        return Matrices(self.evaluate)
 
     def bounds(self, parameters: Array) -> dict[str, Array]:
         """Bounds of w and g (nlpsol's names) for these parameters."""
@@ -302,12 +309,12 @@ def terminal_slopes(
 ) -> tuple[Array, Array]:
     """Slopes by x(T) and by the half-vectors at T of terminal cost and of the inequalities that act there."""
     t, function = trajectory, _terminal_slopes(statement)
-    by_x, by_e = function(t.x[-1], t.e[-1], t.u[-1], t.duration, parameters, end, path)
-    return np.asarray(by_x.full()).ravel(), np.asarray(by_e.full()).ravel()
+    by_x, by_e = function.evaluated(t.x[-1], t.e[-1], t.u[-1], t.duration, parameters, end, path)
+    return by_x.ravel(), by_e.ravel()
 
 
 @lru_cache(maxsize=4)
-def _terminal_slopes(statement: Statement) -> ca.Function:
+def _terminal_slopes(statement: Statement) -> Matrices:
     """(x, e, u at T, T, parameters, multipliers of conditions at the end, of those along the path) -> slopes."""
     x, e, u = (ca.MX.sym(name, size) for name, size in (("x", statement.nx), ("e", statement.ne), ("u", statement.nu)))
     t, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
@@ -316,7 +323,7 @@ def _terminal_slopes(statement: Statement) -> ca.Function:
     for conditions, weights in ((statement.end, end), (statement.path, path)):
         if conditions.size:
             value += ca.dot(weights, conditions.function(x, u, e, t, t, p))
-    return ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes_by(value, (x, e)))
+    return Matrices(ca.Function("terminal_slopes", [x, e, u, t, p, end, path], slopes_by(value, (x, e))))
 
 
 def _fix(lower: Array, upper: Array, values: Array) -> None:

@@ -16,6 +16,7 @@ from covocp.base.short_repr import short_repr
 from covocp.statement.chain import Chain, Link
 from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.nlp import NLP, VIOLATION, Rows, Scales, check_costs
+from covocp.transcription.separable import Piece
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # What each part of a program has, one after the other.
@@ -232,6 +233,11 @@ class Program:
             value, wanted = starts[kind]
             result.append((value[entries] - wanted) / _scale(part.scales, kind, entries))
         return result
+
+    @property
+    def pieces(self) -> tuple[Piece, ...]:
+        """What a program of one part consists of, where that is known."""
+        return () if self.links else self.parts[0].pieces
 
     @cached_property
     def _spans(self) -> list[slice]:

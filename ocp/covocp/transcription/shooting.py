@@ -86,11 +86,9 @@ def shoot(
             cost of the intervals, a column each.
     """
     intervals = interval_columns(mesh, variables.u, variables.duration, variables.parameters)
-    if not mesh.eliminated or statement.coupled:
-        start = ca.vertcat(variables.x, variables.e) if statement.matrices else variables.x
-        advance = full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
-    else:
-        start, advance = variables.x, nominal_interval(statement, mesh.substeps, mesh.step)
+    together = statement.matrices and (not mesh.eliminated or statement.coupled)
+    start = ca.vertcat(variables.x, variables.e) if together else variables.x
+    advance = advancing(statement, mesh)
     ends, fine, cost = _segments(mesh, advance, start, intervals) if run is None else run
     nodes = _node_values(mesh, start, ends)
     last = [i - 1 for i in mesh.starts[1:]]
@@ -111,6 +109,13 @@ def shoot(
     if inside:
         result["e_inside"] = halves[:, inside]
     return result | {"e": at_nodes, "cost": cost + matrix_cost}
+
+
+def advancing(statement: Statement, mesh: Mesh) -> ca.Function:
+    """What moves along an interval of a mesh: the nominal alone where the matrices are eliminated, else both."""
+    if mesh.eliminated and not statement.coupled:
+        return nominal_interval(statement, mesh.substeps, mesh.step)
+    return full_interval(statement, mesh.substeps, mesh.step, mesh.linear_solver)
 
 
 def nominal_run(statement: Statement, mesh: Mesh, variables: Expr) -> tuple[Any, Any, Any]:

@@ -18,6 +18,7 @@ from covocp.statement.statement import Columns, Conditions, Statement
 from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
+from covocp.transcription.pieces import is_separable, pieces
 from covocp.transcription.scales import limit_units
 from covocp.transcription.shooting import (
     Passage,
@@ -35,7 +36,7 @@ LARGEST_DIRECTIONS = 64
 
 
 def transcribe(
-    statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = None, *, stages: bool = False
+    statement: Statement, mesh: Mesh, scales: Scales, passage: Passage = None, *, taken: bool = False
 ) -> NLP:
     """Build the NLP of a statement on a mesh.
 
@@ -44,7 +45,7 @@ def transcribe(
         mesh: nodes, segments, formulation.
         scales: magnitudes in which the NLP works.
         passage: of eliminated matrices; compiled, the NLP has slopes of first order only.
-        stages: whether slopes of segments may be taken in compiled code, which has no further slopes.
+        taken: whether the solver takes functions of slopes as they are, and so needs no further slopes of them.
 
     Returns:
         The NLP; its functions are not yet differentiated.
@@ -61,7 +62,8 @@ def transcribe(
     if passage is not None and any(entry.dense for entry in rows):
         depending = _depending(variables, scales)
     outputs = [nodes["x"], nodes["e"], variables.u, variables.duration, running, terminal, g]
-    stages = stages and statement.nx >= SMALLEST_ALONE and is_staged(statement, mesh)
+    separable = taken and is_separable(statement, mesh)
+    stages = taken and not separable and statement.nx >= SMALLEST_ALONE and is_staged(statement, mesh)
     by_stages = _staged(variables, nodes) if stages or along is not None else None
     return NLP(
         statement=statement,
@@ -76,6 +78,7 @@ def transcribe(
         jacobian=_jacobian(variables, nodes, rows, depending, by_stages),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
         backward=_backward(statement, mesh, variables, p),
+        pieces=pieces(statement, mesh, scales, rows, variables.parameters) if separable else (),
     )
 
 
