@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.expressions import Expr
 from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, distinct, half_indices, read_only, unpack
 from covocp.base.quadrature import hermite
@@ -305,8 +306,7 @@ def mapped(function: ca.Function, *columns: Array) -> list[Array]:
     while begin < count:
         chunk = next((size for size in CHUNKS if size >= count - begin), CHUNKS[-1])
         taken = np.minimum(np.arange(begin, begin + chunk), count - 1)
-        given = [ca.DM(column[:, taken]) if column.shape[0] else ca.DM(0, chunk) for column in columns]
-        parts.append([np.asarray(value.full()) for value in function.map(chunk).call(given)])
+        parts.append(Matrices(function.map(chunk)).evaluated(*(column[:, taken] for column in columns)))
         begin += chunk
     return [np.hstack(values)[:, :count] for values in zip(*parts, strict=True)]
 

@@ -18,6 +18,7 @@ from covocp.passage.sweep import passed_by
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
+from covocp.transcription.steering import nominal_states
 from covocp.transcription.steps import moving_interval, nominal_interval
 
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
@@ -237,10 +238,12 @@ def simulate_states(
     statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
 ) -> Array:
     """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
-    first = np.concatenate([start, e0]) if statement.coupled else start
-    advance = moving_interval(statement, mesh.substeps, mesh.step)
-    ends = swept(advance, first, *interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters)))[0]
-    values = np.vstack([start, ends[:, : statement.nx]])
+    if statement.coupled:
+        advance = moving_interval(statement, mesh.substeps, mesh.step)
+        columns = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
+        values = np.vstack([start, swept(advance, np.concatenate([start, e0]), *columns)[0][:, : statement.nx]])
+    else:
+        values = nominal_states(statement, mesh, start, u, duration, parameters)
     if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:
         lower, upper = statement.state_bounds
         return np.asarray(np.clip(values, lower, upper))

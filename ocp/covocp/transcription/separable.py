@@ -70,10 +70,26 @@ def slopes(
     Returns:
         "grad_f" and "jac_g", and "hess_lag" where it is wanted.
     """
-    made = {"grad_f": _gradient(found, w, p), "jac_g": _jacobian(found, w, p, height)}
+    placed = [_Placed(piece, w) for piece in found]
+    made = {"grad_f": _gradient(placed, w, p), "jac_g": _jacobian(placed, w, p, height)}
     if second:
-        made["hess_lag"] = _second(found, w, p, height)
+        made["hess_lag"] = _second(placed, w, p, height)
     return {name: ca.Function(*own, dict(options)) for name, own in made.items()}
+
+
+class _Placed:
+    """A piece, with the variables of a program at its places."""
+
+    def __init__(self, piece: Piece, w: Any) -> None:
+        own = w[piece.variables.ravel(order="F").tolist()] * ca.DM(piece.units.ravel(order="F"))
+        self.piece, self._at = piece, ca.reshape(own, *piece.units.shape)
+
+    def evaluated(self, outputs: list[Any], *more: tuple[Any, Any]) -> list[Any]:
+        """Expressions of the piece at all places, a column for each; `more`: further symbols with their columns."""
+        piece = self.piece
+        function = ca.Function("piece", [piece.by, *piece.others, *(symbol for symbol, _ in more)], outputs)
+        function = function.map(piece.count) if piece.count > 1 else function
+        return list(function.call([self._at, *piece.constants, *(columns for _, columns in more)], True, False))
 
 
 class _Function(NamedTuple):
@@ -86,14 +102,15 @@ class _Function(NamedTuple):
     output_names: list[str]
 
 
-def _gradient(found: tuple[Piece, ...], w: Any, p: Any) -> _Function:
+def _gradient(placed: list[_Placed], w: Any, p: Any) -> _Function:
     """(w, p) -> cost, its slopes."""
     cost: Any = 0
     sums = _Sums(w.shape[0], 1)
-    for piece in found:
+    for each in placed:
+        piece = each.piece
         if piece.rows[-1, 0] == COST:
             slope = ca.jacobian(piece.values[-1], piece.by)
-            value, numbers = _at_places(piece, [piece.values[-1], _nonzeros(slope)], w)
+            value, numbers = each.evaluated([piece.values[-1], _nonzeros(slope)])
             columns = slope.sparsity().get_col()
             cost += ca.sum2(value)
             sums.add(numbers, piece.variables[columns], np.zeros((1, 1), np.intp), piece.units[columns])
@@ -101,16 +118,17 @@ def _gradient(found: tuple[Piece, ...], w: Any, p: Any) -> _Function:
     return _Function("nlp_grad_f", [w, p], outputs, ["x", "p"], ["f", "grad_f_x"])
 
 
-def _jacobian(found: tuple[Piece, ...], w: Any, p: Any, height: int) -> _Function:
+def _jacobian(placed: list[_Placed], w: Any, p: Any, height: int) -> _Function:
     """(w, p) -> rows, their slopes."""
     values: list[Any] = [ca.MX(0, 1)]
     order = [np.zeros(0, np.intp)]
     sums = _Sums(height, w.shape[0])
-    for piece in found:
+    for each in placed:
+        piece = each.piece
         count = int(np.sum(piece.rows[:, 0] != COST))
         if count:
             slope = ca.jacobian(piece.values[:count], piece.by)
-            value, numbers = _at_places(piece, [piece.values[:count], _nonzeros(slope)], w)
+            value, numbers = each.evaluated([piece.values[:count], _nonzeros(slope)])
             values.append(ca.vec(value / ca.DM(piece.scales[:count])))
             order.append(piece.rows[:count].ravel(order="F"))
             row, column = slope.sparsity().get_triplet()
@@ -120,19 +138,20 @@ def _jacobian(found: tuple[Piece, ...], w: Any, p: Any, height: int) -> _Functio
     return _Function("nlp_jac_g", [w, p], [g, sums.matrix()], ["x", "p"], ["g", "jac_g_x"])
 
 
-def _second(found: tuple[Piece, ...], w: Any, p: Any, height: int) -> _Function:
+def _second(placed: list[_Placed], w: Any, p: Any, height: int) -> _Function:
     """(w, p, weight of the cost, weights of the rows) -> upper triangle of the second slopes of their sum."""
     of_cost, of_rows = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", height)
     weights = ca.vertcat(of_rows, of_cost / p[-1])
     sums = _Sums(w.shape[0], w.shape[0])
-    for piece in found:
+    for each in placed:
+        piece = each.piece
         symbol = type(piece.by).sym("weights", piece.values.shape[0])
         slope, _ = ca.hessian(ca.dot(symbol, piece.values), piece.by)
         row, column = slope.sparsity().get_triplet()
         if row:
             places = np.where(piece.rows == COST, height, piece.rows)
             own = ca.reshape(weights[places.ravel(order="F").tolist()], *places.shape) / ca.DM(piece.scales)
-            (numbers,) = _at_places(piece, [_nonzeros(slope)], w, (symbol, own))
+            (numbers,) = each.evaluated([_nonzeros(slope)], (symbol, own))
             i, j = piece.variables[row], piece.variables[column]
             sums.add(numbers, i, j, piece.units[row] * piece.units[column], i <= j)
     inputs, names = [w, p, of_cost, of_rows], ["x", "p", "lam_f", "lam_g"]
@@ -163,15 +182,6 @@ class _Sums:
         counts = np.concatenate([[0], np.cumsum(taken)]).tolist()
         summed = ca.DM(ca.Sparsity(entries.size, taken.size, counts, where.tolist()), ca.DM(factors[taken]))
         return ca.sparsity_cast(ca.mtimes(summed, ca.vertcat(*self._numbers)), pattern)
-
-
-def _at_places(piece: Piece, outputs: list[Any], w: Any, *more: tuple[Any, Any]) -> list[Any]:
-    """Expressions of a piece at all its places, a column for each; `more`: further symbols with their columns."""
-    own = w[piece.variables.ravel(order="F").tolist()] * ca.DM(piece.units.ravel(order="F"))
-    at = ca.reshape(own, *piece.units.shape)
-    function = ca.Function("piece", [piece.by, *piece.others, *(symbol for symbol, _ in more)], outputs)
-    function = function.map(piece.count) if piece.count > 1 else function
-    return list(function.call([at, *piece.constants, *(columns for _, columns in more)], True, False))
 
 
 def _nonzeros(matrix: Any) -> Any:

@@ -152,10 +152,9 @@ def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
     """Values at all nodes: variables where segments start and at the end, computed ones between."""
     if len(mesh.segments) == mesh.intervals:
         return start  # each node starts a segment
-    columns = []
-    for j, (i, k) in enumerate(zip(mesh.starts[:-1], mesh.starts[1:], strict=True)):
-        columns += [start[:, j], ends[:, i : k - 1]]
-    return ca.horzcat(*columns, start[:, -1])
+    places = np.arange(mesh.intervals + 1) + len(mesh.segments)  # of the ends of the intervals, behind the starts
+    places[list(mesh.starts)] = np.arange(len(mesh.starts))
+    return ca.horzcat(start, ends)[:, places.tolist()]
 
 
 def matrices_along(

@@ -8,6 +8,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
@@ -65,12 +66,12 @@ class Run:
 
     def states(self, u: Array) -> Array:
         """States at the nodes (N + 1, nx) of controls (nodes, nu); NaN or inf where the run diverges."""
-        ends = _along(self.statement, self.mesh)(self.start, u.T, self.duration, self.parameters)[0]
-        return np.vstack([self.start, np.asarray(ends.full()).T])
+        return nominal_states(self.statement, self.mesh, self.start, u, self.duration, self.parameters)
 
     def running(self, u: Array) -> float:
         """Integral of the running cost; zero where that depends on the matrices."""
-        return float(_along(self.statement, self.mesh)(self.start, u.T, self.duration, self.parameters)[1])
+        outputs = _numbers_along(self.statement, self.mesh).evaluated(self.start, u.T, self.duration, self.parameters)
+        return float(outputs[1].item())
 
     @property
     def weights(self) -> Array:
@@ -100,6 +101,20 @@ def _along(statement: Statement, mesh: Mesh) -> ca.Function:
     run = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("simulate", mesh.intervals)
     ends, _, cost = run(x0, *interval_columns(mesh, u, duration, p))
     return ca.Function("along", [x0, u, duration, p], [ends, ca.sum2(cost)])
+
+
+@lru_cache(maxsize=KEPT)
+def _numbers_along(statement: Statement, mesh: Mesh) -> Matrices:
+    """The same, for numbers."""
+    return Matrices(_along(statement, mesh))
+
+
+def nominal_states(
+    statement: Statement, mesh: Mesh, start: Array, u: Array, duration: float, parameters: Array
+) -> Array:
+    """States at the nodes (N + 1, nx) of a run of the nominal; NaN or inf where it diverges."""
+    ends = _numbers_along(statement, mesh).evaluated(start, u.T, duration, parameters)[0]
+    return np.vstack([start, ends.T])
 
 
 @lru_cache(maxsize=KEPT)
