@@ -154,7 +154,8 @@ def _node_values(mesh: Mesh, start: Expr, ends: Expr) -> Any:
         return start  # each node starts a segment
     places = np.arange(mesh.intervals + 1) + len(mesh.segments)  # of the ends of the intervals, behind the starts
     places[list(mesh.starts)] = np.arange(len(mesh.starts))
-    return ca.horzcat(start, ends)[:, places.tolist()]
+    either: Expr = ca.horzcat(start, ends)
+    return either[:, places.tolist()]
 
 
 def matrices_along(
