@@ -29,6 +29,7 @@ from covocp.transcription.domain import WIDENED, needs_exact_bounds
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import QUIET
+from covocp.transcription.pieces import is_separable
 from covocp.transcription.program import Arrays, Program, Trajectories, alone, joined
 from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.shooting import Passage
@@ -272,7 +273,9 @@ class ChainSolver:
     ) -> None:
         """Keep the settings; see `prepare_chain`."""
         self._chain, self._meshes = chain, meshes
-        self._runs = Runs(_builder(chain, chain.statements, meshes, limited), plugin, settings, limited, limit)
+        separable = all(is_separable(st, mesh) for st, mesh in zip(chain.statements, meshes, strict=True))
+        build = _builder(chain, chain.statements, meshes, limited, plugin == "ipopt" and separable)
+        self._runs = Runs(build, plugin, settings, limited, limit)
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:

@@ -316,8 +316,8 @@ class Runs:
             problem, settings = self._nodes.problem, {**settings, **self._nodes.slopes}
         elif nlp.pieces and "jac_g" not in settings:
             compiled: dict[str, Any] = {name: settings[name] for name in COMPILED if name in settings}
-            own = (nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0])
-            settings = slopes(*own, second=not self._limited, options=compiled) | settings
+            own, sizes = (nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0]), [part.statement.np for part in nlp.parts]
+            settings = slopes(*own, second=not self._limited, sizes=sizes, options=compiled) | settings
         elif nlp.jacobian is not None and "jac_g" not in settings:
             outputs, names = [nlp.g, nlp.jacobian], (["x", "p"], ["g", "jac_g_x"])
             settings["jac_g"] = ca.Function("nlp_jac_g", [nlp.w, nlp.p], outputs, *names)

@@ -14,12 +14,14 @@ from covocp.models import bryson_denham, formation_flight, free_time_integrator
 from covocp.solving.warm_start import make_guess
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import NLP
+from covocp.transcription.program import Program, joined
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.separable import COST, slopes
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 from tests.attitudes import tracked
 from tests.decided import everywhere
+from tests.phased import bounce
 
 
 def plain() -> co.Problem:
@@ -93,12 +95,10 @@ def transcribed(problem: co.Problem, options: dict[str, Any]) -> tuple[NLP, np.n
     return nlp, w + 0.02 * np.random.default_rng(0).normal(size=w.size), np.append(statement.values, 1.7)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_all_slopes_are_those_of_casadi(case: str) -> None:
-    make, options = CASES[case]
-    nlp, w, p = transcribed(make(), options)
+def check_slopes(nlp: NLP | Program, w: np.ndarray, p: np.ndarray, sizes: list[int] | None = None) -> None:
+    """Compare all slopes at a point with CasADi's own."""
     assert nlp.pieces
-    found = slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=True)
+    found = slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=True, sizes=sizes)
     of_cost, of_rows = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.g.shape[0])
     second, _ = ca.hessian(of_cost * nlp.f + ca.dot(of_rows, nlp.g), nlp.w)
     first = [nlp.f, ca.gradient(nlp.f, nlp.w), nlp.g, ca.jacobian(nlp.g, nlp.w)]
@@ -111,6 +111,46 @@ def test_all_slopes_are_those_of_casadi(case: str) -> None:
         assert np.isfinite(b).all()
         assert np.abs(a - b).max() <= 1e-11 * max(1.0, np.abs(b).max())
     assert found["hess_lag"].sparsity_out(0).is_triu()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_slopes_are_those_of_casadi(case: str) -> None:
+    make, options = CASES[case]
+    check_slopes(*transcribed(make(), options))
+
+
+def thrown() -> co.Phases:
+    """A ball that is steered to a wall, bounces off it, and is caught: free durations, a jump, conditions."""
+    problems = []
+    for k in range(2):
+        ocp = co.Problem(co.Free(guess=1.5, lower=0.2, upper=5.0), name=f"part {k}")
+        x = ocp.state("x", initial=None if k else 0.0, final=0.3 if k else 1.0)
+        v, u = ocp.state("v", initial=None if k else 0.5), ocp.control("u", guess=0.2 + 0.1 * k)
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, u - 0.1 * v * ca.sqrt(v**2 + 0.01))
+        ocp.subject_to(u * v, upper=3.0, name="power")
+        ocp.minimize(running=u**2 * (1 + x**2), terminal=(1 + k) * ocp.duration**2)
+        problems.append((ocp, v))
+    phases = co.Phases([ocp for ocp, _ in problems], name="thrown")
+    phases.jump(problems[1][1], -0.7 * problems[0][1] * (1 + 0.1 * problems[0][0].duration))
+    return phases
+
+
+@pytest.mark.parametrize(("phases", "form"), [(thrown, "auto"), (bounce, "states")])
+def test_all_slopes_of_several_parts_are_those_of_casadi(phases: Callable[[], co.Phases], form: str) -> None:
+    chain = phases().chain()
+    parts, w = [], []
+    for statement in chain.statements:
+        mesh = resolve_mesh(statement, Options(intervals=6, covariances=form), statement.values)  # type: ignore[arg-type]
+        guess = make_guess(statement, mesh, statement.values, None).trajectory
+        scales = choose_scales(statement, mesh, guess, statement.values)
+        parts.append(transcribe(statement, mesh, scales, taken=True))
+        w.append(parts[-1].pack(guess))
+    point = np.concatenate(w)
+    point += 0.02 * np.random.default_rng(0).normal(size=point.size)
+    p = np.concatenate([*(statement.values for statement in chain.statements), [1.7]])
+    sizes = [statement.np for statement in chain.statements]
+    check_slopes(joined(chain, tuple(parts)), point, p + 1e-3 * np.arange(p.size), sizes)
 
 
 def test_rows_and_cost_are_there_once() -> None:

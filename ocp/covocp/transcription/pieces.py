@@ -9,10 +9,11 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
+from covocp.statement.chain import Link
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.nlp import Rows, Scales, inside_kind
+from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.separable import COST, Piece, Whole
 from covocp.transcription.shooting import advancing
 
@@ -26,10 +27,8 @@ def is_separable(statement: Statement, mesh: Mesh) -> bool:
 class _Places:
     """Where the variables of a program lie, and what rows it has."""
 
-    def __init__(
-        self, statement: Statement, mesh: Mesh, scales: Scales, rows: tuple[Rows, ...], parameters: Expr
-    ) -> None:
-        self.statement, self.mesh, self._parameters = statement, mesh, parameters
+    def __init__(self, statement: Statement, mesh: Mesh, scales: Scales, rows: tuple[Rows, ...]) -> None:
+        self.statement, self.mesh = statement, mesh
         sizes = (statement.nx, statement.ne, statement.nu)
         counts = (mesh.intervals + 1, mesh.intervals + 1, mesh.control_nodes)
         ends = np.cumsum([0, *(size * count for size, count in zip(sizes, counts, strict=True))])
@@ -51,10 +50,6 @@ class _Places:
         found = self.rows.get(kind, np.zeros(0, dtype=np.intp))
         return np.asarray(found.reshape(count, -1).T if count else found.reshape(0, 0))
 
-    def parameters(self, count: int) -> Any:
-        """Those of the statement, a column for each of some places."""
-        return ca.repmat(self._parameters, 1, count)
-
     def piece(
         self,
         kind: Any,
@@ -68,19 +63,21 @@ class _Places:
         Args:
             kind: of its symbols.
             parts: positions of its variables, a group for each of the first arguments of `values`.
-            others: size and columns of each of its other arguments; the parameters come after them.
+            others: size and columns of each of its other arguments.
             rows: of the program, or `COST`.
-            values: (*parts, *others) -> what it gives.
+            values: (*parts, *others, parameters) -> what it gives.
         """
         count = rows.shape[1]
         places = np.vstack([np.broadcast_to(part, (part.shape[0], count)) for part in parts])
         by = kind.sym("v", places.shape[0])
         own = ca.vertsplit(by, np.cumsum([0, *(part.shape[0] for part in parts)]).tolist())
         symbols = [kind.sym(f"c{i}", size) for i, (size, _) in enumerate(others)]
+        parameters = kind.sym("p", self.statement.np)
         return Piece(
             by=by,
             others=tuple(symbols),
-            values=ca.densify(values(*own, *symbols)),
+            parameters={0: parameters},
+            values=ca.densify(values(*own, *symbols, parameters)),
             variables=places,
             units=self.units[places],
             constants=tuple(columns for _, columns in others),
@@ -89,9 +86,7 @@ class _Places:
         )
 
 
-def pieces(
-    statement: Statement, mesh: Mesh, scales: Scales, rows: tuple[Rows, ...], parameters: Expr
-) -> tuple[Piece, ...]:
+def pieces(statement: Statement, mesh: Mesh, scales: Scales, rows: tuple[Rows, ...]) -> tuple[Piece, ...]:
     """The pieces of a program that `is_separable`: together they are all its rows and its cost.
 
     Args:
@@ -99,9 +94,8 @@ def pieces(
         mesh: of it.
         scales: magnitudes in which the program works.
         rows: of the program.
-        parameters: of the statement, symbols of the program.
     """
-    places = _Places(statement, mesh, scales, rows, parameters)
+    places = _Places(statement, mesh, scales, rows)
     found = [_intervals(places), _terminal(places)]
     n = mesh.intervals
     given = [("path", statement.path, range(n + 1)), ("start", statement.start, [0]), ("end", statement.end, [n])]
@@ -124,10 +118,10 @@ def _intervals(places: _Places) -> Piece:
     parts += [*([places.u[:, 1:]] if linear else []), places.time]
     reading = ca.DM(mesh.readings) if mesh.readings.size else ca.DM(0, n)
     others = [(1, ca.DM(mesh.nodes[:-1]).T), (1, ca.DM(np.diff(mesh.nodes)).T)]
-    others += [(statement.np, places.parameters(n)), (statement.readings, reading)]
+    others.append((statement.readings, reading))
 
     def values(x: Expr, e: Expr, next_x: Expr, next_e: Expr, *rest: Expr) -> Any:
-        a, b, T, s, ds, p, read = rest if linear else (rest[0], *rest)
+        a, b, T, s, ds, read, p = rest if linear else (rest[0], *rest)
         interval = Interval(a, b, s, ds, T if free else statement.duration.guess, p, read)
         end, fine, cost = advance.call([ca.vertcat(x, e), *interval], True, False)
         return ca.vertcat(end - ca.vertcat(next_x, next_e), *_inside(statement, mesh, fine, interval), cost)
@@ -157,8 +151,8 @@ def _terminal(places: _Places) -> Piece:
     def values(x: Expr, e: Expr, T: Expr, p: Expr) -> Any:
         return statement.terminal(x, e, T if free else statement.duration.guess, p)
 
-    parts, others = (places.x[:, n:], places.e[:, n:], places.time), [(statement.np, places.parameters(1))]
-    return places.piece(_kind(statement.terminal), parts, others, np.full((1, 1), COST), values)
+    parts = (places.x[:, n:], places.e[:, n:], places.time)
+    return places.piece(_kind(statement.terminal), parts, (), np.full((1, 1), COST), values)
 
 
 def _conditions(places: _Places, kind: str, conditions: Conditions, nodes: list[int]) -> Piece:
@@ -170,7 +164,7 @@ def _conditions(places: _Places, kind: str, conditions: Conditions, nodes: list[
         return conditions.function(x, u, e, duration * s, duration, p)
 
     parts = (places.x[:, nodes], places.u[:, nodes], places.e[:, nodes], places.time)
-    others = [(1, ca.DM(places.mesh.nodes[nodes]).T), (statement.np, places.parameters(len(nodes)))]
+    others = [(1, ca.DM(places.mesh.nodes[nodes]).T)]
     rows = places.rows_of(kind, len(nodes))
     return places.piece(_kind(conditions.function), parts, others, rows, values)
 
@@ -184,8 +178,56 @@ def _backward_ends(places: _Places) -> Piece:
     def values(x: Expr, e: Expr, T: Expr, p: Expr) -> Any:
         return e - function(x, T if free else statement.duration.guess, p)
 
-    parts, others = (places.x[:, n:], places.e[entries, n:], places.time), [(statement.np, places.parameters(1))]
-    return places.piece(_kind(function), parts, others, places.rows_of("backward_ends", 1), values)
+    parts = (places.x[:, n:], places.e[entries, n:], places.time)
+    return places.piece(_kind(function), parts, (), places.rows_of("backward_ends", 1), values)
+
+
+def joined_pieces(links: Sequence[Link], parts: Sequence[NLP]) -> tuple[Piece, ...]:
+    """The pieces of a program of several parts: theirs, then those of the links; none where one has none.
+
+    What runs backward in a part is in the terminal cost of that before it: then it is no sum of pieces.
+    """
+    if not all(part.pieces for part in parts) or any(link.weights for link in links):
+        return ()
+    variables = np.cumsum([0, *(part.w.shape[0] for part in parts)])
+    rows = np.cumsum([0, *(part.g.shape[0] for part in parts)])
+    found = []
+    for i, part in enumerate(parts):
+        found += [piece.shifted(i, variables[i], rows[i]) for piece in part.pieces]
+    row = rows[-1]
+    for i, (link, before, after) in enumerate(zip(links, parts[:-1], parts[1:], strict=True)):
+        found.append(_link(link, i, (before, after), variables[i : i + 2], row))
+        row += found[-1].rows.shape[0]
+    return tuple(found)
+
+
+def _link(link: Link, number: int, parts: tuple[NLP, NLP], offsets: Whole, row: int) -> Piece:
+    """The rows of a link: initial values that are variables less what the part before gives."""
+    before, after = (_Places(part.statement, part.mesh, part.scales, part.rows) for part in parts)
+    n, kind = before.mesh.intervals, _kind(link.function)
+    matrices = list(link.matrices) if after.e.size else []
+    ends = [before.x[:, n], before.e[:, n], before.time[:, 0]]
+    starts = [after.x[list(link.states), 0], after.e[matrices, 0]]
+    own = np.concatenate([*(each + offsets[0] for each in ends), *(each + offsets[1] for each in starts)])
+    units = np.concatenate([*(before.units[each] for each in ends), *(after.units[each] for each in starts)])
+    by = kind.sym("v", own.size)
+    x, e, T, *start = ca.vertsplit(by, np.cumsum([0, *(each.size for each in (*ends, *starts))]).tolist())
+    symbols = {number + i: kind.sym("p", part.statement.np) for i, part in enumerate(parts)}
+    duration = before.statement.duration
+    given = link.function(x, e, T if duration.free else duration.guess, *symbols.values())
+    sizes = (len(link.states), len(matrices))
+    values = ca.vertcat(*(a - b[:size] for a, b, size in zip(start, given, sizes, strict=True)))
+    return Piece(
+        by=by,
+        others=(),
+        parameters=symbols,
+        values=ca.densify(values),
+        variables=own[:, None],
+        units=units[:, None],
+        constants=(),
+        rows=row + np.arange(sum(sizes))[:, None],
+        scales=np.concatenate([after.units[each] for each in starts])[:, None],
+    )
 
 
 def _kind(*functions: ca.Function) -> Any:

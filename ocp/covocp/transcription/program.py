@@ -16,6 +16,7 @@ from covocp.base.short_repr import short_repr
 from covocp.statement.chain import Chain, Link
 from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.nlp import NLP, VIOLATION, Rows, Scales, check_costs
+from covocp.transcription.pieces import joined_pieces
 from covocp.transcription.separable import Piece
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -32,7 +33,8 @@ class Program:
     the scale of the cost; `g` stacks those of the parts, then the links. Where matrices are eliminated the half-vectors
     at the start of a part are no variables: expressions of the part before stand for them among its parameters. What
     runs backward in a part stands, at its start, among the parameters of the part before. `gradient`, f and
-    its slopes by w, and `jacobian`, those of g, are there where CasADi's own take longer, else None.
+    its slopes by w, and `jacobian`, those of g, are there where CasADi's own take longer, else None. `pieces`,
+    where there are some, add up to f and g.
     """
 
     parts: tuple[NLP, ...]
@@ -44,6 +46,7 @@ class Program:
     link_rows: tuple[Rows, ...]
     gradient: tuple[Any, Any] | None
     jacobian: Any
+    pieces: tuple[Piece, ...] = ()
 
     __repr__ = short_repr
 
@@ -234,11 +237,6 @@ class Program:
             result.append((value[entries] - wanted) / _scale(part.scales, kind, entries))
         return result
 
-    @property
-    def pieces(self) -> tuple[Piece, ...]:
-        """What a program of one part consists of, where that is known."""
-        return () if self.links else self.parts[0].pieces
-
     @cached_property
     def _spans(self) -> list[slice]:
         """The variables of each part."""
@@ -261,7 +259,7 @@ def _bounds(program: Program, *parameters: bytes) -> dict[str, Array]:
 
 def alone(nlp: NLP) -> Program:
     """The program of one statement."""
-    common = {name: getattr(nlp, name) for name in ("w", "p", "f", "g", "gradient", "jacobian")}
+    common = {name: getattr(nlp, name) for name in ("w", "p", "f", "g", "gradient", "jacobian", "pieces")}
     return Program(parts=(nlp,), links=(), link_rows=(), **common)
 
 
@@ -313,6 +311,7 @@ def joined(chain: Chain, parts: tuple[NLP, ...]) -> Program:
         link_rows=tuple(link_rows),
         gradient=None,
         jacobian=jacobian,
+        pieces=joined_pieces(chain.links, parts),
     )
 
 

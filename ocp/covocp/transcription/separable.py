@@ -8,8 +8,8 @@ second slopes once, by its own variables, and constant sparse matrices add up th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -31,14 +31,15 @@ NONE: Mapping[str, Any] = MappingProxyType({})
 class Piece:
     """A kind of piece: a function of a few variables, and the places where it stands.
 
-    by: symbol of the variables. others: symbols of what else it takes. values: expression of them. variables: position
-    of each variable among those of the program, a column for each place. units: by which they are multiplied there.
-    constants: columns of the others. rows: of the program, to which each value belongs, or `COST`. scales: by which the
-    values are divided there.
+    by: symbol of the variables. others: symbols of what else it takes. parameters: symbols of those of some parts of
+    the program, by the number of the part. values: expression of them. variables: position of each variable among those
+    of the program, a column for each place. units: by which they are multiplied there. constants: columns of the
+    others. rows: of the program, to which each value belongs, or `COST`. scales: by which the values are divided there.
     """
 
     by: Any
     others: tuple[Any, ...]
+    parameters: Mapping[int, Any]
     values: Any
     variables: Whole
     units: Array
@@ -53,9 +54,26 @@ class Piece:
         """Places where it stands."""
         return int(self.variables.shape[1])
 
+    def shifted(self, part: int, variables: int, rows: int) -> Piece:
+        """The same in a program of several parts, as one of that number, behind so many variables and rows."""
+        (parameters,) = self.parameters.values()
+        return replace(
+            self,
+            parameters={part: parameters},
+            variables=self.variables + variables,
+            rows=np.where(self.rows == COST, COST, self.rows + rows),
+        )
+
 
 def slopes(
-    found: tuple[Piece, ...], w: Any, p: Any, height: int, *, second: bool, options: Mapping[str, Any] = NONE
+    found: tuple[Piece, ...],
+    w: Any,
+    p: Any,
+    height: int,
+    *,
+    second: bool,
+    sizes: Sequence[int] | None = None,
+    options: Mapping[str, Any] = NONE,
 ) -> dict[str, ca.Function]:
     """Slopes of a program, as CasADi's NLP solvers take them.
 
@@ -65,12 +83,15 @@ def slopes(
         p: its parameters, the scale of the cost last.
         height: rows of it.
         second: whether second slopes are wanted.
+        sizes: how many parameters each part has; None: there is one part.
         options: of CasADi's functions.
 
     Returns:
         "grad_f" and "jac_g", and "hess_lag" where it is wanted.
     """
-    placed = [_Placed(piece, w) for piece in found]
+    sizes = [p.shape[0] - 1] if sizes is None else sizes
+    parameters = ca.vertsplit(p, np.cumsum([0, *sizes, 1]).tolist())
+    placed = [_Placed(piece, w, parameters) for piece in found]
     made = {"grad_f": _gradient(placed, w, p), "jac_g": _jacobian(placed, w, p, height)}
     if second:
         made["hess_lag"] = _second(placed, w, p, height)
@@ -80,16 +101,19 @@ def slopes(
 class _Placed:
     """A piece, with the variables of a program at its places."""
 
-    def __init__(self, piece: Piece, w: Any) -> None:
+    def __init__(self, piece: Piece, w: Any, parameters: Sequence[Any]) -> None:
+        self._parameters = [ca.repmat(parameters[i], 1, piece.count) for i in piece.parameters]
         own = w[piece.variables.ravel(order="F").tolist()] * ca.DM(piece.units.ravel(order="F"))
         self.piece, self._at = piece, ca.reshape(own, *piece.units.shape)
 
     def evaluated(self, outputs: list[Any], *more: tuple[Any, Any]) -> list[Any]:
         """Expressions of the piece at all places, a column for each; `more`: further symbols with their columns."""
         piece = self.piece
-        function = ca.Function("piece", [piece.by, *piece.others, *(symbol for symbol, _ in more)], outputs)
+        known = [*piece.others, *piece.parameters.values()]
+        function = ca.Function("piece", [piece.by, *known, *(symbol for symbol, _ in more)], outputs)
         function = function.map(piece.count) if piece.count > 1 else function
-        return list(function.call([self._at, *piece.constants, *(columns for _, columns in more)], True, False))
+        columns = [self._at, *piece.constants, *self._parameters, *(columns for _, columns in more)]
+        return list(function.call(columns, True, False))
 
 
 class _Function(NamedTuple):

@@ -78,7 +78,7 @@ def transcribe(
         jacobian=_jacobian(variables, nodes, rows, depending, by_stages),
         evaluate=ca.Function("evaluate", [variables.w, p], outputs),
         backward=_backward(statement, mesh, variables, p),
-        pieces=pieces(statement, mesh, scales, rows, variables.parameters) if separable else (),
+        pieces=pieces(statement, mesh, scales, rows) if separable else (),
     )
 
 
