@@ -123,7 +123,7 @@ def _intervals(places: _Places) -> Piece:
     def values(x: Expr, e: Expr, next_x: Expr, next_e: Expr, *rest: Expr) -> Any:
         a, b, T, s, ds, read, p = rest if linear else (rest[0], *rest)
         interval = Interval(a, b, s, ds, T if free else statement.duration.guess, p, read)
-        end, fine, cost = advance.call([ca.vertcat(x, e), *interval], True, False)
+        end, fine, cost = advance(ca.vertcat(x, e), *interval)
         return ca.vertcat(end - ca.vertcat(next_x, next_e), *_inside(statement, mesh, fine, interval), cost)
 
     return places.piece(_kind(advance, statement.path.function), parts, others, rows, values)

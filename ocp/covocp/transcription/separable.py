@@ -113,7 +113,7 @@ class _Placed:
         function = ca.Function("piece", [piece.by, *known, *(symbol for symbol, _ in more)], outputs)
         function = function.map(piece.count) if piece.count > 1 else function
         columns = [self._at, *piece.constants, *self._parameters, *(columns for _, columns in more)]
-        return list(function.call(columns, True, False))
+        return list(function.call(columns))
 
 
 class _Function(NamedTuple):

@@ -20,6 +20,7 @@ from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
 from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
+from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
 from covocp.export.laws.replanning import Replannable, replannable, stacked
 from covocp.export.text.names import identifier
 from covocp.passage.written import Tape
@@ -27,25 +28,21 @@ from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.solver import Solver
 from covocp.transcription.mesh import GROWTH, Mesh, Options, segment_lengths
-from covocp.transcription.nlp import NLP, QUIET
+from covocp.transcription.nlp import NLP
+from covocp.transcription.pieces import is_separable
 from covocp.transcription.scales import choose_scales, evened
 from covocp.transcription.shooting import compiled_steps
 from covocp.transcription.stiffness import nominal_along
 from covocp.transcription.transcribing import transcribe, written_out
 
-# In the NLP's own units: what counts as solved, and what the solvers are asked for. Interior-point methods end with a
-# barrier of a tenth of what they are asked for, which the cost has in it for each bound that is reached.
+# In the NLP's own units: what counts as solved.
 INFEASIBLE, STATIONARY = 1e-6, 1e-5
-ASKED, ASKED_INTERIOR = 1e-8, 1e-10
 # Fatrop widens bounds by this, relative to their size or to 1 where they are smaller, and offers no option for it.
 WIDENED = 1e-8
-MAX_ITERATIONS = 200
 # Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
 ROUNDING, APART = 1e-6, 1e-2
 # Distance and multiplier of a bound that is not reached at the solution of the export.
 UNREACHED = 1e-5
-# Multipliers below this are rounding: taken for reached, their bounds make the first active set of the QP dependent.
-INACTIVE = 1e-9
 TOLERANCE = 1e-8
 # Problems near that of the export by which a solver is tried, and how many of them it may fail to solve.
 TRIALS, FAILURES = 6, 3
@@ -134,12 +131,12 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     condensed = alone and chosen.get("segments", "auto") == "auto"
     tries = [
         (exact, mesh)
-        for exact in _hessians(method, own, alone=alone)
+        for exact in hessians(method, own, alone=alone)
         for mesh in ([_condensed(solution)] if condensed and not exact else []) + [solution.mesh]
     ]
     for exact, mesh in tries:
         task = _task(made, solution, mesh, limited=not exact)
-        law = _law(task, method, _settings(method, exact, own))
+        law = _law(task, method, plugin_settings(method, exact, own))
         failure = _failure(law)
         if not failure:
             return law, PLUGINS[method]
@@ -215,14 +212,17 @@ def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool) -
         tape = Tape("written")
         written = written_out(statement, mesh, scales, tape), tape
     else:
-        nlp = transcribe(statement, mesh, scales)
+        nlp = transcribe(statement, mesh, scales, taken=is_separable(statement, mesh))
     scale = _cost_scale(nlp, solution)
-    multipliers = _multipliers(nlp, solution, scale)
+    timed = any(entry.port.name == "duration" for entry in made.entries)
+    multipliers = _multipliers(nlp, solution, scale, timed=timed)
     return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers, written=written)
 
 
-def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Array]:
+def _multipliers(nlp: NLP, solution: Solution, scale: float, *, timed: bool) -> tuple[Array, Array]:
     """Multipliers of the solution: those of constraints, then those of bounds that are reached, by stationarity.
+
+    `timed`: whether the duration is a variable that an argument fixes.
 
     Small ones, as an interior-point method leaves them at all bounds, would each cost the QP solver an iteration.
     """
@@ -232,6 +232,7 @@ def _multipliers(nlp: NLP, solution: Solution, scale: float) -> tuple[Array, Arr
     weights[np.abs(weights) < UNREACHED] = 0.0
     left = -np.asarray(_lagrangian_slope(nlp)(w, p, weights).full()).ravel()
     reached = ((w > bounds["ubx"] - UNREACHED) & (left > 0.0)) | ((w < bounds["lbx"] + UNREACHED) & (left < 0.0))
+    reached[-1] |= timed
     return np.where(reached & (np.abs(left) > UNREACHED), left, 0.0), weights
 
 
@@ -256,64 +257,6 @@ def _lagrangian_slope(nlp: NLP) -> ca.Function:
     return ca.Function("lagrangian_slope", [nlp.w, nlp.p, weights], [ca.densify(slope)])
 
 
-def _hessians(method: str, own: Mapping[str, Any], *, alone: bool) -> list[bool]:
-    """Whether the Hessian is exact, in the order in which that is tried; `alone`: matrices pass along the nominal."""
-    inner = own.get(method)
-    inner = inner if isinstance(inner, Mapping) else {}
-    asked = own.get("hessian_approximation", inner.get("hessian_approximation"))
-    if asked is not None or method == "fatrop":
-        return [asked != "limited-memory"]
-    return [False] if alone else [True, False]
-
-
-def _settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of the plugin."""
-    settings: dict[str, Any] = dict(QUIET)
-    if method == "sqpmethod":
-        settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": ASKED, "tol_pr": ASKED}
-        settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}
-        settings["qpsol_options"] = {
-            "print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False,
-            "min_lam": INACTIVE,
-        }  # fmt: skip
-        settings["hessian_approximation"] = "exact" if exact else "limited-memory"
-    elif method == "ipopt":
-        # Bounds are those of the problem: widened by Ipopt's 1e-8 they lower the cost of Bryson-Denham by 9e-8.
-        settings["ipopt"] = {"print_level": 0, "sb": "yes", "max_iter": MAX_ITERATIONS}
-        settings["ipopt"] |= {"tol": ASKED_INTERIOR, "bound_relax_factor": 0.0}
-        if not exact:
-            settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": 20}
-    elif method == "fatrop":
-        settings["fatrop"] = {"print_level": 0, "tolerance": ASKED_INTERIOR, "max_iter": MAX_ITERATIONS}
-    for key, value in own.items():
-        settings[key] = {**settings.get(key, {}), **value} if isinstance(value, Mapping) else value
-    return settings
-
-
-def _functions(nlp: NLP, method: str) -> dict[str, Any]:
-    """The slopes of the NLP as options of a plugin, where CasADi does not make them."""
-    if nlp.gradient is None:
-        return {}
-    given, names = [nlp.w, nlp.p], ["x", "p"]
-    (f, gradient), (g, jacobian) = nlp.gradient, (nlp.g, nlp.jacobian)
-    if method == "sqpmethod":
-        outputs = ["f", "grad_f_x", "g", "jac_g_x"]
-        own = ca.Function("nlp_jac_fg", given, [f, gradient, g, jacobian], names, outputs)
-        return {"jac_fg": own, "no_nlp_grad": True}
-    return {
-        "no_nlp_grad": True,
-        "grad_f": ca.Function("nlp_grad_f", given, [f, gradient], names, ["f", "grad_f_x"]),
-        "jac_g": ca.Function("nlp_jac_g", given, [g, jacobian], names, ["g", "jac_g_x"]),
-    }
-
-
-def _named(message: str) -> str:
-    """The line of CasADi's message that names the option; behind an unknown one it lists some that it has."""
-    lines = message.strip().splitlines()
-    unknown = [line.rpartition(": Unknown")[2] for line in lines if ": Unknown" in line]
-    return f"Unknown{unknown[0]}" if unknown else lines[-1]
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Core:
     """The function of the law; its inputs are those of `entries` and the guess."""
@@ -329,12 +272,12 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
     entries = task.made.entries
     try:
         parts = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
-        solver = ca.nlpsol("nlp", method, parts, {**settings, **_functions(nlp, method)})
+        solver = ca.nlpsol("nlp", method, parts, {**settings, **plugin_functions(nlp, method)})
     except RuntimeError as error:
         raise ExportError(
             f"The plugin '{method}' refuses the problem or its settings.",
             expected="a plugin of this CasADi, and options that it has",
-            received=_named(str(error)),
+            received=refused_option(str(error)),
             remedy="correct plugin_options, or take another method",
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
