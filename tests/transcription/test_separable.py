@@ -8,6 +8,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from attitudes import tracked
+from decided import everywhere
+from phased import bounce
+from spreads import ellipse
 
 import covocp as co
 from covocp.models import bryson_denham, formation_flight, free_time_integrator
@@ -19,9 +23,6 @@ from covocp.transcription.scales import choose_scales
 from covocp.transcription.separable import COST, slopes
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
-from tests.attitudes import tracked
-from tests.decided import everywhere
-from tests.phased import bounce
 
 
 def plain() -> co.Problem:
@@ -79,6 +80,7 @@ CASES: dict[str, tuple[Callable[[], co.Problem], dict[str, Any]]] = {
     "estimation by rk4": (estimated, STATES | {"intervals": 7, "covariance_step": "rk4"}),
     "readings": (lambda: estimated(sampled=True), STATES | {"intervals": 8}),
     "closed loop": (closed, STATES | {"intervals": 6}),
+    "terminal weights of matrices": (lambda: ellipse((0.3, 0.2)), STATES | {"intervals": 6, "control": "constant"}),
     "attitude": (lambda: tracked()[0], STATES | {"intervals": 4}),
     "free time": (free_time_integrator.problem, {"intervals": 10}),
     "formation": (formation_flight.problem, {"intervals": 5}),

@@ -192,7 +192,7 @@ class _Sums:
 
     def add(self, numbers: Any, rows: Whole, columns: Whole, factors: Array, taken: Any = True) -> None:
         """Numbers, a column for each place, with the entries to which they count, times factors, where taken."""
-        self._numbers.append(ca.vec(numbers))
+        self._numbers.append(ca.densify(ca.vec(numbers)))  # CasADi may know that they are all zero
         keys = columns * self._height + rows
         for kept, own in ((self._places, keys), (self._factors, factors), (self._taken, taken)):
             kept.append(np.broadcast_to(own, numbers.shape).ravel(order="F"))
