@@ -25,6 +25,9 @@ Whole = NDArray[np.intp]
 # Row of what counts in the cost.
 COST = -1
 NONE: Mapping[str, Any] = MappingProxyType({})
+# Variables of a piece, and scalar operations of its values times these, up to which it is written out in scalars: its
+# slopes are then had in a quarter to a sixteenth of the time (formation flight, a seeker on a line).
+FEW, SHORT = 100, 200_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +56,11 @@ class Piece:
     def count(self) -> int:
         """Places where it stands."""
         return int(self.variables.shape[1])
+
+    @property
+    def symbols(self) -> list[Any]:
+        """What its values depend on."""
+        return [self.by, *self.others, *self.parameters.values()]
 
     def shifted(self, part: int, variables: int, rows: int) -> Piece:
         """The same in a program of several parts, as one of that number, behind so many variables and rows."""
@@ -105,15 +113,27 @@ class _Placed:
         self._parameters = [ca.repmat(parameters[i], 1, piece.count) for i in piece.parameters]
         own = w[piece.variables.ravel(order="F").tolist()] * ca.DM(piece.units.ravel(order="F"))
         self.piece, self._at = piece, ca.reshape(own, *piece.units.shape)
+        self._scalar = piece.count > 1 and _is_short(piece)
 
     def evaluated(self, outputs: list[Any], *more: tuple[Any, Any]) -> list[Any]:
         """Expressions of the piece at all places, a column for each; `more`: further symbols with their columns."""
         piece = self.piece
-        known = [*piece.others, *piece.parameters.values()]
-        function = ca.Function("piece", [piece.by, *known, *(symbol for symbol, _ in more)], outputs)
+        function = ca.Function("piece", [*piece.symbols, *(symbol for symbol, _ in more)], outputs)
+        function = function.expand() if self._scalar else function
         function = function.map(piece.count) if piece.count > 1 else function
         columns = [self._at, *piece.constants, *self._parameters, *(columns for _, columns in more)]
         return list(function.call(columns))
+
+
+def _is_short(piece: Piece) -> bool:
+    """Whether a piece of matrices can be written out in scalars, and is short then."""
+    if isinstance(piece.by, ca.SX) or piece.by.numel() > FEW:
+        return False
+    try:
+        scalar = ca.Function("values", piece.symbols, [piece.values]).expand()
+    except RuntimeError:  # of a linear system or a table inside it
+        return False
+    return bool(scalar.n_instructions() * piece.by.numel() <= SHORT)
 
 
 class _Function(NamedTuple):
