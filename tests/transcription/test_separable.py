@@ -138,7 +138,19 @@ def thrown() -> co.Phases:
     return phases
 
 
-@pytest.mark.parametrize(("phases", "form"), [(thrown, "auto"), (bounce, "states")])
+def apart() -> co.Phases:
+    """Two parts that have nothing in common: the first gives the second no value."""
+    problems = []
+    for k in range(2):
+        ocp = co.Problem(1.0 + k, name=f"part {k}")
+        x, u = ocp.state("xy"[k], initial=1.0), ocp.control("u")
+        ocp.dynamics(x, -(x**3) + u)
+        ocp.minimize(running=u**2 + x**2)
+        problems.append(ocp)
+    return co.Phases(problems, name="apart")
+
+
+@pytest.mark.parametrize(("phases", "form"), [(thrown, "auto"), (bounce, "states"), (apart, "auto")])
 def test_all_slopes_of_several_parts_are_those_of_casadi(phases: Callable[[], co.Phases], form: str) -> None:
     chain = phases().chain()
     parts, w = [], []

@@ -196,8 +196,9 @@ def joined_pieces(links: Sequence[Link], parts: Sequence[NLP]) -> tuple[Piece, .
         found += [piece.shifted(i, variables[i], rows[i]) for piece in part.pieces]
     row = rows[-1]
     for i, (link, before, after) in enumerate(zip(links, parts[:-1], parts[1:], strict=True)):
-        found.append(_link(link, i, (before, after), variables[i : i + 2], row))
-        row += found[-1].rows.shape[0]
+        piece = _link(link, i, (before, after), variables[i : i + 2], row)
+        row += piece.rows.shape[0]
+        found += [piece] if piece.rows.size else []
     return tuple(found)
 
 
