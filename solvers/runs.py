@@ -47,8 +47,9 @@ UNMOVED = 1.0 + 1e-9
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
 
-# Options of functions of CasADi that are compiled.
-COMPILED = ("jit", "compiler", "jit_options")
+# Options of functions of CasADi that are compiled, and those that are meant for functions that CasADi makes itself.
+COMPILED = ("jit", "compiler", "jit_options", "jit_cleanup", "jit_serialize")
+FOR_OWN = ("common_options", "specific_options")
 
 NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
 
@@ -314,7 +315,7 @@ class Runs:
         if nlp.gradient is not None and self._open and settings.get("no_nlp_grad"):
             self._nodes = self._nodes or Nodes(nlp)
             problem, settings = self._nodes.problem, {**settings, **self._nodes.slopes}
-        elif nlp.pieces and "jac_g" not in settings:
+        elif nlp.pieces and not settings.keys() & {"jac_g", *FOR_OWN}:
             compiled: dict[str, Any] = {name: settings[name] for name in COMPILED if name in settings}
             own, sizes = (nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0]), [part.statement.np for part in nlp.parts]
             settings = slopes(*own, second=not self._limited, sizes=sizes, options=compiled) | settings

@@ -1,5 +1,6 @@
 """The exported solver: the costs of `solve`, from other starts, for other parameters and durations."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from exports import FOLDER, PLANNER, STRICT, package
@@ -139,3 +140,35 @@ def test_what_means_nothing_to_a_solver_is_refused(options, words):
     with pytest.raises(co.CovocpError, match=words):
         export_c(unknown_lag.problem(), FOLDER / "no_solver", **({"intervals": 6} | options))
     assert not (FOLDER / "no_solver").exists()
+
+
+def moved():
+    """A double integrator that is moved with least energy."""
+    ocp = co.Problem(duration=2.0)
+    x, v, u = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0), ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=u**2)
+    return ocp
+
+
+@pytest.mark.parametrize("asked", ["calc_f", "calc_lam_p"])
+def test_what_casadi_is_asked_for_beside_the_plan_is_taken(asked):
+    made = export_c(moved(), FOLDER / asked, intervals=5, plugin_options={asked: True})
+    assert made.reference()()["cost"] == pytest.approx(co.solve(moved(), intervals=5, progress=False).cost)
+
+
+def test_a_function_of_the_user_is_not_replaced(monkeypatch):
+    given = ca.Function("given", [ca.MX.sym("x")], [ca.MX(1)])
+    taken, nlpsol = [], ca.nlpsol
+
+    def refused(name, plugin, problem, settings):
+        if plugin == "ipopt":  # of the plan from which the export starts
+            return nlpsol(name, plugin, problem, settings)
+        taken.append(settings["hess_lag"])
+        raise RuntimeError("seen")
+
+    monkeypatch.setattr(ca, "nlpsol", refused)
+    with pytest.raises(co.ExportError, match="seen"):
+        export_c(moved(), FOLDER / "given", intervals=5, plugin_options={"hess_lag": given})
+    assert taken == [given]

@@ -222,3 +222,9 @@ def test_functions_of_the_user_are_taken() -> None:
     found = co.solve(ocp, intervals=10, progress=False, plugin_options={"hess_lag": unit})
     assert found.stats["iterations"] > known.stats["iterations"]
     assert found.cost == pytest.approx(known.cost, rel=1e-6)
+
+
+def test_options_for_functions_of_casadi_reach_them() -> None:
+    """They are meant for functions that CasADi makes: an option that none of them has is refused, not left out."""
+    with pytest.raises(co.ProblemError, match="refuses its settings"):
+        co.solve(plain(), intervals=8, progress=False, plugin_options={"specific_options": {"nlp_hess_l": {"no": 1}}})

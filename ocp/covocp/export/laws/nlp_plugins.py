@@ -54,10 +54,10 @@ def plugin_settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[st
     return settings
 
 
-def plugin_functions(nlp: NLP, method: str) -> dict[str, Any]:
+def plugin_functions(nlp: NLP, method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The slopes of the NLP as options of a plugin, where CasADi does not make them."""
     if nlp.gradient is None:
-        return _by_pieces(nlp, method) if nlp.pieces and method in TAKING else {}
+        return _by_pieces(nlp, method, settings) if nlp.pieces and method in TAKING else {}
     given, names = [nlp.w, nlp.p], ["x", "p"]
     (f, gradient), (g, jacobian) = nlp.gradient, (nlp.g, nlp.jacobian)
     if method == "sqpmethod":
@@ -71,7 +71,7 @@ def plugin_functions(nlp: NLP, method: str) -> dict[str, Any]:
     }
 
 
-def _by_pieces(nlp: NLP, method: str) -> dict[str, Any]:
+def _by_pieces(nlp: NLP, method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The same, piece by piece."""
     found: dict[str, Any] = slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=True)
     if method == "sqpmethod":
@@ -81,7 +81,11 @@ def _by_pieces(nlp: NLP, method: str) -> dict[str, Any]:
         given = found["hess_lag"].mx_in()
         whole = ca.triu2symm(found["hess_lag"](*given))
         found["hess_lag"] = ca.Function("nlp_hess_l", given, [whole], ["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"])
-    return found | {"no_nlp_grad": True}
+    return (
+        found
+        if any(name.startswith("calc_") and settings[name] for name in settings)
+        else found | {"no_nlp_grad": True}
+    )
 
 
 def refused_option(message: str) -> str:

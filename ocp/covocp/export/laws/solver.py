@@ -272,7 +272,7 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
     entries = task.made.entries
     try:
         parts = {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}
-        solver = ca.nlpsol("nlp", method, parts, {**settings, **plugin_functions(nlp, method)})
+        solver = ca.nlpsol("nlp", method, parts, {**plugin_functions(nlp, method, settings), **settings})
     except RuntimeError as error:
         raise ExportError(
             f"The plugin '{method}' refuses the problem or its settings.",
