@@ -1,10 +1,12 @@
 """Functions called through their buffers: the numbers of CasADi's own calls."""
 
+import threading
+
 import casadi as ca
 import numpy as np
 import pytest
 
-from covocp.base.buffered import Buffered, swept
+from covocp.base.buffered import Buffered, Matrices, swept
 
 
 def test_a_sweep_has_the_numbers_of_casadis_own():
@@ -39,3 +41,40 @@ def test_a_call_that_fails_is_told():
     assert Buffered(function)(np.array([2.0]), np.array([0.0])) is None
     with pytest.raises(RuntimeError, match="outer failed at column 1"):
         swept(function, np.array([1.0]), np.zeros((1, 3)))
+
+
+def test_matrices_are_those_of_the_function():
+    x, a = ca.MX.sym("x", 2, 3), ca.MX.sym("a")
+    function = ca.Function("f", [x, a], [a * x.T, ca.diag(x[0, :].T), ca.sum1(x)])
+    value = np.arange(6.0).reshape(2, 3)
+    found = Matrices(function).evaluated(value, 3.0)
+    for own, expected in zip(found, function(value, 3.0), strict=True):
+        np.testing.assert_array_equal(own, expected.full())
+
+
+def test_matrices_that_cannot_be_had_are_an_error():
+    failing = Failing()
+    assert Matrices(failing).evaluated(1.0)[0] == 2.0
+    with pytest.raises(RuntimeError, match="failing failed"):
+        Matrices(failing).evaluated(3.0)
+
+
+def test_threads_share_matrices():
+    """Each gets its own numbers, though the memory is one."""
+    x = y = ca.MX.sym("x", 50)
+    for _ in range(100):
+        y = ca.sin(y) + x
+    shared, wrong = Matrices(ca.Function("f", [x], [y])), []
+
+    def run(number):
+        (expected,) = shared.evaluated(np.full(50, number))
+        wrong.extend(1 for _ in range(100) if not np.array_equal(shared.evaluated(np.full(50, number))[0], expected))
+        if np.ptp(expected):
+            wrong.append(number)
+
+    threads = [threading.Thread(target=run, args=(float(k),)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong

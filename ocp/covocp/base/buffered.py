@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.threads import one_at_a_time
 
 
 class Buffered:
@@ -44,7 +45,7 @@ class Buffered:
 
 
 class Matrices(Buffered):
-    """The same of matrices, to dense ones: as a function of CasADi, in a fraction of its time."""
+    """The same of matrices, to dense ones: as a function of CasADi, in a fraction of its time. Threads take turns."""
 
     def __init__(self, function: ca.Function) -> None:
         """Make the memory.
@@ -58,6 +59,7 @@ class Matrices(Buffered):
         self._shapes = [function.size_out(i) for i in range(function.n_out())]
         super().__init__(function)
 
+    @one_at_a_time
     def evaluated(self, *arguments: Array | float) -> list[Array]:
         """The outputs.
 
