@@ -33,7 +33,7 @@ from covocp.solvers.reached import (
 )
 from covocp.solvers.statuses import Status, status_of
 from covocp.transcription.program import Arrays, Program, Trajectories
-from covocp.transcription.separable import slopes
+from covocp.transcription.separable import FOR_OWN, slopes
 
 MAX_ITERATIONS = 1000
 # Runs from one start, each in the scales of the point that the last one reached.
@@ -47,9 +47,8 @@ UNMOVED = 1.0 + 1e-9
 PROBE = 1e-4
 SMALLEST_CURVATURE = 1e-6
 
-# Options of functions of CasADi that are compiled, and those that are meant for functions that CasADi makes itself.
+# Options of functions of CasADi that are compiled.
 COMPILED = ("jit", "compiler", "jit_options", "jit_cleanup", "jit_serialize")
-FOR_OWN = ("common_options", "specific_options")
 
 NOT_EVALUABLE = "the model has no values where the solver ended (this is its start): bound what leaves its domain; {}"
 

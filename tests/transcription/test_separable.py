@@ -168,7 +168,7 @@ def test_all_slopes_of_several_parts_are_those_of_casadi(phases: Callable[[], co
 
 
 def test_rows_and_cost_are_there_once() -> None:
-    nlp, *_ = transcribed(*(make() if callable(make) else make for make in CASES["plain"]))
+    nlp, *_ = transcribed(plain(), {"intervals": 8})
     rows = np.concatenate([piece.rows.ravel() for piece in nlp.pieces])
     assert np.array_equal(np.sort(rows[rows != COST]), np.arange(nlp.g.shape[0]))
     assert (rows == COST).sum() == nlp.mesh.intervals + 1

@@ -25,6 +25,8 @@ Whole = NDArray[np.intp]
 # Row of what counts in the cost.
 COST = -1
 NONE: Mapping[str, Any] = MappingProxyType({})
+# Options of CasADi's solvers for functions that they make themselves.
+FOR_OWN = ("common_options", "specific_options")
 # Variables of a piece, and scalar operations of its values times these, up to which it is written out in scalars: its
 # slopes are then had in a quarter to a sixteenth of the time (formation flight, a seeker on a line).
 FEW, SHORT = 100, 200_000

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 
 from covocp.transcription.nlp import NLP, QUIET
-from covocp.transcription.separable import slopes
+from covocp.transcription.separable import FOR_OWN, slopes
 
 # What the solvers are asked for, in the units of the NLP. Interior-point methods end with a barrier of a tenth of what
 # they are asked for, which the cost has in it for each bound that is reached.
@@ -57,7 +57,8 @@ def plugin_settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[st
 def plugin_functions(nlp: NLP, method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The slopes of the NLP as options of a plugin, where CasADi does not make them."""
     if nlp.gradient is None:
-        return _by_pieces(nlp, method, settings) if nlp.pieces and method in TAKING else {}
+        taken = nlp.pieces and method in TAKING and not settings.keys() & set(FOR_OWN)
+        return _by_pieces(nlp, method, settings) if taken else {}
     given, names = [nlp.w, nlp.p], ["x", "p"]
     (f, gradient), (g, jacobian) = nlp.gradient, (nlp.g, nlp.jacobian)
     if method == "sqpmethod":
@@ -72,20 +73,20 @@ def plugin_functions(nlp: NLP, method: str, settings: Mapping[str, Any]) -> dict
 
 
 def _by_pieces(nlp: NLP, method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The same, piece by piece."""
-    found: dict[str, Any] = slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=True)
+    """The same, piece by piece; second slopes where the Hessian is exact."""
+    asked = [settings, *(value for value in settings.values() if isinstance(value, Mapping))]
+    exact = all(own.get("hessian_approximation") != "limited-memory" for own in asked)
+    found: dict[str, Any] = slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=exact)
     if method == "sqpmethod":
         first = [found.pop(name).call([nlp.w, nlp.p]) for name in ("grad_f", "jac_g")]
         outputs = ["f", "grad_f_x", "g", "jac_g_x"]
         found["jac_fg"] = ca.Function("nlp_jac_fg", [nlp.w, nlp.p], [*first[0], *first[1]], ["x", "p"], outputs)
+    if method == "sqpmethod" and exact:
         given = found["hess_lag"].mx_in()
         whole = ca.triu2symm(found["hess_lag"](*given))
         found["hess_lag"] = ca.Function("nlp_hess_l", given, [whole], ["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"])
-    return (
-        found
-        if any(name.startswith("calc_") and settings[name] for name in settings)
-        else found | {"no_nlp_grad": True}
-    )
+    by_parameters = any(name.startswith("calc_") and settings[name] for name in settings)
+    return found if by_parameters else found | {"no_nlp_grad": True}
 
 
 def refused_option(message: str) -> str:
