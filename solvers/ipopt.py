@@ -75,6 +75,7 @@ KINDS = {
 def prepare(
     statement: Statement,
     options: Options,
+    parameters: Array | None = None,
     *,
     tolerance: float | None = None,
     max_iterations: int | None = None,
@@ -88,6 +89,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh and formulation.
+        parameters: values that the mesh is made for; None: the declared ones.
         tolerance: of Ipopt, on the scaled optimality conditions; None: 1e-7.
         max_iterations: of Ipopt; None: 1000.
         hessian: of Ipopt: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or
@@ -104,7 +106,8 @@ def prepare(
         ProblemError: an option is wrong, or the model is not finite where the solver starts.
     """
     own = (tolerance, max_iterations, hessian, plugin, plugin_options, compile)
-    (mesh,), settings, limited, limit = _made_ready((statement,), (options,), *own)
+    values = (statement.values if parameters is None else parameters,)
+    (mesh,), settings, limited, limit = _made_ready((statement,), (options,), values, *own)
     return ShootingSolver(statement, mesh, plugin, settings, limited, limit)
 
 
@@ -133,13 +136,15 @@ def prepare_chain(
         compile: whether the functions of the NLP are compiled.
     """
     own = (tolerance, max_iterations, hessian, plugin, plugin_options, compile)
-    meshes, settings, limited, limit = _made_ready(chain.statements, options, *own)
+    values = tuple(statement.values for statement in chain.statements)
+    meshes, settings, limited, limit = _made_ready(chain.statements, options, values, *own)
     return ChainSolver(chain, meshes, plugin, settings, limited, limit)
 
 
 def _made_ready(
     statements: tuple[Statement, ...],
     options: tuple[Options, ...],
+    parameters: Arrays,
     tolerance: float | None,
     max_iterations: int | None,
     hessian: str,
@@ -149,7 +154,7 @@ def _made_ready(
 ) -> tuple[tuple[Mesh, ...], dict[str, Any], bool, float]:
     """Meshes, settings of the plugin, whether its Hessian is of limited memory, and what residuals may be left."""
     _check_options(tolerance, max_iterations, hessian, plugin)
-    meshes = tuple(resolve_mesh(st, own, st.values) for st, own in zip(statements, options, strict=True))
+    meshes = tuple(map(resolve_mesh, statements, options, parameters))
     pairs = list(zip(statements, meshes, strict=True))
     eliminated = any(mesh.eliminated and st.matrices for st, mesh in pairs)
     limited = hessian == "limited-memory" or (hessian == "auto" and eliminated)

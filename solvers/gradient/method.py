@@ -79,6 +79,7 @@ KINDS = {
 def prepare(
     statement: Statement,
     options: Options,
+    parameters: Array | None = None,
     *,
     variant: Variant = "gradient",
     weight: Given = "adaptive",
@@ -103,6 +104,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh; `segments` and `covariances` mean nothing here, and inequalities are met at the nodes only.
+        parameters: values that the mesh is made for; None: the declared ones.
         variant: "gradient", or "chord": solve H_u(x, E, p, P, u_c) = 0 along the present x, E, p, P and step towards
             u_c [4.2-10].
         weight: W: "adaptive" (w H_uu, w from predicted and actual changes), "curvature" (H_uu, fixed factor), or a
@@ -119,7 +121,7 @@ def prepare(
     Raises:
         ProblemError: an option is wrong.
     """
-    mesh, pairs = _meshed(statement, options)
+    mesh, pairs = _meshed(statement, options, statement.values if parameters is None else parameters)
     _check_weight(weight, statement.nu, mesh.nodes.size)
     settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
     return GradientSolver(statement, mesh, pairs, settings)
@@ -154,11 +156,11 @@ def prepare_chain(
     settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
     check_phases(chain, settings)
     _check_weight(weight, 1, 0)
-    pairs = [_meshed(st, own) for st, own in zip(chain.statements, options, strict=True)]
+    pairs = [_meshed(st, own, st.values) for st, own in zip(chain.statements, options, strict=True)]
     return GradientChainSolver(chain, tuple(mesh for mesh, _ in pairs), tuple(count for _, count in pairs), settings)
 
 
-def _meshed(statement: Statement, options: Options) -> tuple[Mesh, int]:
+def _meshed(statement: Statement, options: Options, parameters: Array) -> tuple[Mesh, int]:
     """The mesh in one segment with propagated matrices, and the steps of an interval backward.
 
     Raises:
@@ -169,9 +171,9 @@ def _meshed(statement: Statement, options: Options) -> tuple[Mesh, int]:
             raise _option_error(name, "nothing: it belongs to shooting", getattr(options, name))
     if options.points not in ("auto", 1):
         raise _option_error("points", "'auto' or 1: its penalties act at the nodes; 'ipopt' has more", options.points)
-    mesh = resolve_mesh(statement, options, statement.values)
+    mesh = resolve_mesh(statement, options, parameters)
     mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
-    found = stiffness(statement, options, statement.values)
+    found = stiffness(statement, options, parameters)
     stiff = max(found.nominal, found.matrices)
     pairs = int(np.clip(np.ceil(stiff / STIFFNESS_PER_PAIR), mesh.substeps, max(LARGEST_PAIRS, mesh.substeps)))
     return mesh, pairs

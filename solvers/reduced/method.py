@@ -40,7 +40,12 @@ MOST_CONTROLS = 2000
 
 @checked("the method 'reduced'", tolerance=positive, max_iterations=whole(0))
 def prepare(
-    statement: Statement, options: Options, *, tolerance: float = TOLERANCE, max_iterations: int = 300
+    statement: Statement,
+    options: Options,
+    parameters: Array | None = None,
+    *,
+    tolerance: float = TOLERANCE,
+    max_iterations: int = 300,
 ) -> ReducedSolver:
     """Make a problem ready; its functions are built at the first guess, which gives the scales.
 
@@ -51,6 +56,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh; matrices are eliminated.
+        parameters: values that the mesh is made for; None: the declared ones.
         tolerance: see above.
         max_iterations: of one run.
 
@@ -60,7 +66,7 @@ def prepare(
     Raises:
         ProblemError: an option is wrong, matrices cannot be eliminated, or there are too many control values.
     """
-    mesh = _resolved(statement, options)
+    mesh = _resolved(statement, options, statement.values if parameters is None else parameters)
     count = mesh.control_nodes * statement.nu
     if count > MOST_CONTROLS:
         raise ProblemError(
@@ -72,14 +78,14 @@ def prepare(
     return ReducedSolver(statement, mesh, float(tolerance), int(max_iterations))
 
 
-def _resolved(statement: Statement, options: Options) -> Mesh:
+def _resolved(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """The mesh, matrices eliminated.
 
     Raises:
         ProblemError: they cannot be.
     """
     if not statement.matrices:
-        return resolve_mesh(statement, options, statement.values)
+        return resolve_mesh(statement, options, parameters)
     if options.covariances == "states":
         raise ProblemError(
             "The method 'reduced' has no matrices as variables.",
@@ -88,7 +94,7 @@ def _resolved(statement: Statement, options: Options) -> Mesh:
             remedy="leave covariances= out, or use method='ipopt'",
         )
     try:
-        return resolve_mesh(statement, replace(options, covariances="eliminated"), statement.values)
+        return resolve_mesh(statement, replace(options, covariances="eliminated"), parameters)
     except ProblemError as error:
         if options.covariances == "eliminated" or "eliminated" not in str(error):
             raise

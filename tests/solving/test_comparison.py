@@ -96,7 +96,7 @@ def broken(monkeypatch):
     """A method that raises what it is told to."""
 
     def make(error):
-        def prepare(statement, options, *, strength=1.0):
+        def prepare(statement, options, parameters, *, strength=1.0):
             raise error
 
         monkeypatch.setitem(sys.modules, "broken_method", types.SimpleNamespace(prepare=prepare))

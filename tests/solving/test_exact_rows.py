@@ -126,3 +126,10 @@ def test_guesses_files_and_simulations_have_the_whole_covariance(tmp_path):
     runs = co.simulate(cold, runs=100, seed=1, progress=False)
     assert runs.augmented == ("p", "w", "x", "b")
     assert runs.error_covariance("x")[-1, 0, 0] == pytest.approx(cold["E"][-1, 2, 2], rel=0.45)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+def test_meshes_that_refine_themselves_carry_the_rows_too(method):
+    solution = co.solve(platform(), method, refine=1e-6, progress=False)
+    assert np.abs(solution["E"][-1] - integrated(solution)).max() <= 1e-6
+    assert not solution["E"][:, :2].any()

@@ -47,6 +47,8 @@ SOLVED = 1e-9
 # Steps of the search for a direction that constraints without multipliers allow; what they may be missed by.
 CONE_STEPS = 60
 CONE_MISS = 1e-9
+# Entries up to which what all directions do to the points is one matrix.
+FEW_ENTRIES = 1_000_000
 
 Verdict = Literal["minimum", "saddle", "flat"]
 
@@ -100,9 +102,12 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     if reduced is None:
         return None
     strict = reduced.null_space(reduced.strict)
-    if not strict.shape[1] or not np.isfinite(reduced.apply(strict @ np.ones(strict.shape[1]))).all():
+    if not strict.shape[1]:
         return None
-    values, vectors, error = _extremes(reduced, strict)
+    operator = reduced.operator(strict)
+    if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
+        return None
+    values, vectors, error = _extremes(operator, strict)
     value, v = float(values[0]), vectors[:, 0]
     largest = float(np.abs(values).max())
     error = max(error, SOLVED * largest)
@@ -115,15 +120,15 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     return Curvature(value=value, largest=largest, error=error, direction=u[:, :, 0], start=start)
 
 
-def _extremes(reduced: _Reduced, basis: Array) -> tuple[Array, Array, float]:
-    """Ritz values (rising) and vectors on a subspace, and how far the operator was from symmetric."""
+def _extremes(operator: Callable[[Array], Array], basis: Array) -> tuple[Array, Array, float]:
+    """Ritz values (rising) and vectors on a subspace, and how far the operator on it was from symmetric."""
 
     def known(value: float, residual: float, largest: float) -> bool:
         return residual <= min(LANCZOS_TOLERANCE * largest, max(0.5 * abs(value), SOLVED * largest))
 
     order = np.arange(1.0, basis.shape[1] + 1.0)
     start = np.modf(order**2 * GOLDEN)[0] - 0.5  # like random numbers: across no direction
-    found = krylov(lambda v: np.asarray(basis.T @ reduced.apply(basis @ v)), start, LANCZOS_STEPS, known)
+    found = krylov(operator, start, LANCZOS_STEPS, known)
     return found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry
 
 
@@ -140,7 +145,7 @@ def _in_the_cone(reduced: _Reduced, v: Array, value: float, largest: float, erro
     basis = reduced.null_space(np.vstack([reduced.strict, reduced.loose]))
     best, kept = np.inf, np.zeros_like(v)
     if basis.shape[1]:
-        values, vectors, _ = _extremes(reduced, basis)
+        values, vectors, _ = _extremes(reduced.operator(basis), basis)
         best, kept = float(values[0]), vectors[:, 0]
     if best < -error:
         return best, kept
@@ -236,6 +241,23 @@ class _Reduced:
     def unscaled(self, v: Array) -> Array:
         """v of the tangents."""
         return _solved(self.root, v[:, None])[:, 0]
+
+    def moved(self, v: Array) -> Array:
+        """Changes of points and controls there, one below the other, (rows, m), of v (V, m)."""
+        z, u = self.between.forward(*self.tangents.forward(_solved(self.root, v)))
+        return np.vstack([z.reshape(-1, v.shape[1]), u.reshape(-1, v.shape[1])])
+
+    def operator(self, basis: Array) -> Callable[[Array], Array]:
+        """The reduced Hessian on a subspace, of coordinates in a basis (V, size).
+
+        What the basis does to the points is one matrix where that has few entries; else each direction is run through
+        all of them, and its slopes back.
+        """
+        count = (self.between.A.shape[0] * max(self.between.A.shape[1], 1) + 1) * sum(self.tangents.before.shape[1:])
+        if basis.shape[1] * count > FEW_ENTRIES:
+            return lambda c: np.asarray(basis.T @ self.apply(basis @ c))
+        moved = self.moved(basis)
+        return lambda c: np.asarray(moved.T @ self.product(moved @ c))
 
     def apply(self, v: Array) -> Array:
         """The reduced Hessian times v."""

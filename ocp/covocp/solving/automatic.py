@@ -36,13 +36,19 @@ class PreparedChain(Protocol):
 
 @checked("the method 'auto'", **KINDS)
 def prepare(
-    statement: Statement, options: Options, *, tolerance: float | None = None, max_iterations: int | None = None
+    statement: Statement,
+    options: Options,
+    parameters: Array | None = None,
+    *,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
 ) -> Automatic:
     """Make a problem ready for whichever method is faster.
 
     Args:
         statement: the problem.
         options: mesh and formulation.
+        parameters: values that the mesh is made for; None: the declared ones.
         tolerance: of the method that solves; None: its own.
         max_iterations: of the method that solves; None: its own.
 
@@ -54,7 +60,7 @@ def prepare(
     """
     given = {"tolerance": tolerance, "max_iterations": max_iterations}
     own = {name: value for name, value in given.items() if value is not None}
-    return Automatic(statement, options, own)
+    return Automatic(statement, options, parameters, own)
 
 
 @checked("the method 'auto'", **KINDS)
@@ -92,12 +98,12 @@ def is_suited(statement: Statement, mesh: Mesh) -> bool:
 class Automatic:
     """A problem made ready for both methods; each builds its program when it is first asked."""
 
-    def __init__(self, statement: Statement, options: Options, own: dict[str, Any]) -> None:
+    def __init__(self, statement: Statement, options: Options, parameters: Array | None, own: dict[str, Any]) -> None:
         """Keep what the methods need; see `prepare`."""
-        self._ipopt: Prepared = importlib.import_module(IPOPT).prepare(statement, options, **own)
+        self._ipopt: Prepared = importlib.import_module(IPOPT).prepare(statement, options, parameters, **own)
         self._reduced: Prepared | None = None
         if is_suited(statement, self.mesh):
-            self._reduced = importlib.import_module(REDUCED).prepare(statement, options, **own)
+            self._reduced = importlib.import_module(REDUCED).prepare(statement, options, parameters, **own)
 
     @property
     def mesh(self) -> Mesh:

@@ -16,13 +16,14 @@ from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 
-def made_ready(method: str, statement: Statement, options: Options, **own: Any) -> Prepared:
+def made_ready(method: str, statement: Statement, options: Options, parameters: Array, **own: Any) -> Prepared:
     """A problem made ready for a method, without rows of covariances that stay zero.
 
     Args:
         method: its name.
         statement: the problem.
         options: of the mesh.
+        parameters: values that the mesh is made for.
         own: options of the method.
 
     Raises:
@@ -31,8 +32,8 @@ def made_ready(method: str, statement: Statement, options: Options, **own: Any) 
     prepare = importlib.import_module(METHODS[method]).prepare
     found = carried(statement)
     if found is None:
-        return cast(Prepared, prepare(statement, options, **own))
-    return WithoutRows(statement, found, cast(Prepared, prepare(found.statement, options, **own)))
+        return cast(Prepared, prepare(statement, options, parameters, **own))
+    return WithoutRows(statement, found, cast(Prepared, prepare(found.statement, options, parameters, **own)))
 
 
 class WithoutRows:
@@ -80,4 +81,5 @@ class WithoutRows:
                 matrices=self._rows.taken(multipliers.matrices),
             )
         costates = guess.costates and (guess.costates[0], self._rows.taken(guess.costates[1]))
-        return replace(guess, trajectory=trajectory, multipliers=multipliers, costates=costates)
+        scales = guess.scales and replace(guess.scales, e=self._rows.taken(guess.scales.e))
+        return replace(guess, trajectory=trajectory, multipliers=multipliers, costates=costates, scales=scales)

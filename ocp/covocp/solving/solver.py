@@ -49,6 +49,7 @@ from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
 from covocp.solving.methods import check_method, method_options
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
+from covocp.solving.suited_steps import suits
 from covocp.solving.turns import unwound
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
@@ -147,14 +148,10 @@ class Solver:
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         asked = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
-        self._options = with_instants(self.statement, asked)
-        if refine is not None:
-            self._options = refining.with_layers(self.statement, self._options, self.statement.values)
-        self._own_steps = self._options.substeps == "auto" and refine is None
+        self._asked, self._values = with_instants(self.statement, asked), self.statement.values
+        self._options = self._laid_out()
+        self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = False  # at the steps along the guess
-        if nominal == "deterministic":  # the steps of what runs around it
-            around = evaluation_mesh(self.statement, self._options, self.statement.values)
-            self._options = replace(self._options, substeps=around.substeps)
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = {k: v for k, v in options.items() if k in own}
@@ -165,7 +162,7 @@ class Solver:
             self._own["max_iterations"] = PATIENCE
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
-        self._prepared = self._prepare(solved, self._options, **self._own)
+        self._prepared = self._ready(self._options)
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options, self.statement)
@@ -248,6 +245,8 @@ class Solver:
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
             self._keep(*self._first)
+        with evaluating(self.statement.name):
+            self._suit_steps(values)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options, self.statement)
         guess = later_of(guess, elapsed)
@@ -306,8 +305,8 @@ class Solver:
         guesses = refining.first_guesses(self._options, self._solved, self._prepared.mesh, values, guess)
         first = None
         if guess is None or best is not None:
-            run = partial(self._prepare, self._solved, **self._own)
-            first = from_coarser(self._solved, self._options, self._prepared.mesh, run, (values, guess, reporter))
+            given = (values, guess, reporter)
+            first = from_coarser(self._solved, self._options, self._prepared.mesh, self._ready, given)
         starts = [guesses]
         if first is not None:
             coarse = Solution.of(first, self.method, assess=False)
@@ -320,6 +319,31 @@ class Solver:
                 break
         outcome = outcome if outcome.converged or best is None else self._tightened(outcome, values, best, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
+
+    def _laid_out(self) -> Options:
+        """The options of the first mesh, for the values it is made for."""
+        options = self._asked
+        if options.refine is not None:
+            options = refining.with_layers(self.statement, options, self._values)
+        if self.nominal == "deterministic":  # the steps of what runs around it
+            around = evaluation_mesh(self.statement, options, self._values)
+            options = replace(options, substeps=around.substeps)
+        return options
+
+    def _ready(self, options: Options, statement: Statement | None = None, **changed: Any) -> Prepared:
+        """The problem, or one like it, made ready on a mesh, with other options of the method."""
+        own = {**self._own, **changed}
+        return self._prepare(self._solved if statement is None else statement, options, self._values, **own)
+
+    def _suit_steps(self, values: Array) -> None:
+        """Steps for other values of the parameters where those of the mesh are too long; so are those of later runs."""
+        chosen = self._asked if self.nominal == "deterministic" else self._first[0]
+        if np.array_equal(values, self._values) or suits(self._solved, chosen, self._prepared.mesh, values):
+            return
+        self._values = values
+        options = self._laid_out()
+        self._keep(options, self._ready(options))
+        self._first = options, self._prepared
 
     def _look_at_steps(self, values: Array) -> None:
         """Take shorter steps from the first run on where a large covariance needs them along the guess."""
@@ -334,7 +358,7 @@ class Solver:
         except RuntimeError:  # CasADi's, of a linear system that is singular there: the run tells
             return
         if finer is not None:
-            self._keep(finer, self._prepare(self._solved, finer, **self._own))
+            self._keep(finer, self._ready(finer))
 
     def _tightened(self, failed: Outcome, values: Array, best: Solution, reporter: Progress) -> Outcome:
         """Solved by way of loosened limits of the spread, from the best gain; else as it failed."""
@@ -344,7 +368,7 @@ class Solver:
         begin = make_guess(self._solved, mesh, values, best)
 
         def run(statement: Statement, last: Outcome | None, most: int) -> Outcome:
-            prepared = self._prepare(statement, self._options, **{**self._own, "max_iterations": most})
+            prepared = self._ready(self._options, statement, max_iterations=most)
             start = (
                 begin
                 if last is None
@@ -418,7 +442,7 @@ class Solver:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
         try:
-            prepared = self._prepare(self._solved, self._options, **{**self._own, "tolerance": CONTINUED * tolerance})
+            prepared = self._ready(self._options, tolerance=CONTINUED * tolerance)
         except ProblemError:  # a plugin that has no tolerance
             return solution
         with Progress("", show=False) as reporter:
@@ -490,7 +514,7 @@ class Solver:
         alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
         if self._own_steps and alike and times > 1 and not rest:
             options = with_substeps(self._options, own, mesh.substeps)
-            self._keep(options, self._prepare(self._solved, options, **self._own))
+            self._keep(options, self._ready(options))
 
     def _keep(self, options: Options, prepared: Prepared) -> None:
         """Other steps from now on; what the classical design costs is then another number."""
@@ -503,7 +527,7 @@ class Solver:
             if finer is None:
                 break
             try:
-                prepared = self._prepare(self._solved, finer, **self._own)
+                prepared = self._ready(finer)
                 coarse = Solution.of(outcome, self.method, assess=False)
                 start = make_guess(self._solved, prepared.mesh, values, coarse)
                 again = prepared.solve(values, start, reporter)
@@ -519,9 +543,7 @@ class Solver:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
         if not self._remade or reporter.stop:
             return outcome
-        runs = refining.ProblemRuns(
-            self._solved, values, self.method, partial(self._prepare, self._solved, **self._own), reporter
-        )
+        runs = refining.ProblemRuns(self._solved, values, self.method, self._ready, reporter)
         found = remade(runs.measured(self._options, self._prepared, outcome, refining.unseen(self._own)), runs)
         assert isinstance(found.outcome, Outcome)
         self._keep(found.options[0], found.prepared)

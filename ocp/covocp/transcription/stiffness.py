@@ -9,13 +9,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.instants import with_instants
-from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
+from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step, explicit_substeps
 
 # Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
 DAMPED = -0.5
@@ -70,6 +71,26 @@ def stiffness(statement: Statement, options: Options, parameters: Array, *, at_e
     )
 
 
+def fits(statement: Statement, mesh: Mesh, parameters: Array) -> bool:
+    """Whether the explicit steps of a mesh are short enough at the start for other parameters, looked at quickly.
+
+    Args:
+        statement: the problem.
+        mesh: of it.
+        parameters: their values.
+
+    Returns:
+        False also where a quick look does not tell: implicit steps, matrices in explicit ones, a start that is guessed.
+    """
+    x = statement.boundary_values(parameters)[0]
+    if mesh.step == "rodas" or (mesh.step == "rk4" and statement.ne) or statement.tied or np.isnan(x).any():
+        return False
+    duration, longest = statement.duration.guess, float(np.diff(mesh.nodes).max())
+    u = controls_guess(statement, mesh.nodes[:2], mesh.control)[0]
+    slopes = _slopes_in_numbers(statement).evaluated(x, u, np.zeros(statement.ne), 0.0, duration, parameters)[0]
+    return explicit_substeps(duration * longest * _largest(_eigenvalues(slopes))) <= mesh.substeps
+
+
 def nominal_along(
     statement: Statement, nodes: Array, columns: tuple[Array | float, ...], places: Array, duration: float
 ) -> Stiffness:
@@ -122,6 +143,12 @@ def state_jacobian(statement: Statement) -> ca.Function:
     else:
         rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
     return ca.Function("jacobian", symbols, [ca.jacobian(rate, symbols[0])])
+
+
+@lru_cache(maxsize=KEPT)
+def _slopes_in_numbers(statement: Statement) -> Matrices:
+    """The same, for numbers."""
+    return Matrices(state_jacobian(statement))
 
 
 def _matrix_jacobian(statement: Statement) -> ca.Function:
