@@ -15,7 +15,7 @@ from problems import graded, order, solve
 from scipy.integrate import solve_ivp
 
 import covocp as co
-from covocp.extremal import closed_loop
+from covocp.extremal import closed_loop, joint
 from covocp.extremal.costates import discrete_costates, integrated_costates
 from covocp.models import unknown_lag
 
@@ -50,7 +50,7 @@ def histories(found, exact):
 def test_covariances_without_the_compiled_passage_are_the_same(monkeypatch):
     extremal = evaluated().extremal
     fast = closed_loop.close_loop(extremal)
-    monkeypatch.setattr(closed_loop, "functions", lambda: None)
+    monkeypatch.setattr(joint, "functions", lambda: None)
     plain = closed_loop.close_loop(extremal)
     for one, two in ((fast.E, plain.E), (fast.Xhat, plain.Xhat), (fast.Z, plain.Z), (fast.gain, plain.gain)):
         np.testing.assert_allclose(one, two, atol=1e-12)

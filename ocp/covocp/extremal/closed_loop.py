@@ -23,17 +23,14 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
-from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import Array, pack, pack_symbolic, stacked, unpack, unpack_symbolic
-from covocp.base.quadrature import GAUSS_NODES, gauss_matrix, hermite, lyapunov_after, simpson_weight
+from covocp.base.matrices import Array, pack_symbolic, stacked, unpack, unpack_symbolic
+from covocp.base.quadrature import simpson_weight
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import fine_trajectory
-from covocp.extremal.readings import Readings, readings_along
-from covocp.passage.library import functions
-from covocp.passage.sweep import passed_by
-from covocp.statement.interval import Interval, model_symbols, one_sided
-from covocp.statement.statement import Loop, Statement
+from covocp.extremal.joint import Statistics, joint_covariances, loop_of
+from covocp.statement.interval import model_symbols, one_sided
+from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 
 # Share of the largest slope below which a direction of the state counts as moved by nothing.
@@ -43,22 +40,6 @@ COVARIANCES = "covariances"
 # Pairs of substeps for one time constant of filter or loop in an interval, and the most of them.
 STEPS_PER_RATE = 1.0
 LARGEST_PAIRS = 32
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics:
-    """What is truly uncertain: covariance of the initial deviation, densities of process and measurement noise.
-
-    initial: (n, n); density: (state, control, time, duration, parameters) -> Q (n, n), U (m, m); parameters: its own.
-    variance: (state, control, time, duration, parameters) -> R of what is read at instants; None where nothing is.
-    """
-
-    initial: Array
-    density: ca.Function
-    parameters: Array
-    variance: ca.Function | None = None
-
-    __repr__ = short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,11 +106,11 @@ def _propagated(extremal: Extremal, truth: Statistics | None, start: Array | Non
     statistics = truth if truth is not None else design_statistics(extremal)
     n, m = mesh.intervals, loop_substeps(extremal)
     fine = fine_trajectory(extremal, m)
-    values = _joint_covariances(extremal, fine, statistics, start)
+    values = joint_covariances(extremal, fine, statistics, start)
     cost, other = _costs(extremal, fine, values, truth is None)
     at = values[::m]
     columns = extremal.columns()
-    loop = _loop(st)
+    loop = loop_of(st)
     gain = loop.gain.map(n + 1)(*columns)
     return ClosedLoop(
         E=at[:, :size, :size],
@@ -155,46 +136,9 @@ def covariances_along(extremal: Extremal, fine: Array, start: Array | None = Non
     """
     size = len(extremal.statement.augmented)
     with np.errstate(over="ignore", invalid="ignore"):
-        joint = _joint_covariances(extremal, fine, design_statistics(extremal), start)[:: fine.shape[1] - 1]
+        joint = joint_covariances(extremal, fine, design_statistics(extremal), start)[:: fine.shape[1] - 1]
     E, Z, Xhat = joint[:, :size, :size], joint[:, :size, size:], joint[:, size:, size:]
     return np.asarray(E + Xhat - Z - Z.transpose(0, 2, 1))
-
-
-def _joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, start: Array | None) -> Array:
-    """[E Z; Z' Xhat] at the ends of all parts, with the gains of x, E and S there, (N m + 1, 2n, 2n)."""
-    st, n, m = extremal.statement, extremal.mesh.intervals, fine.shape[1] - 1
-    size = len(st.augmented)
-    common = tuple(np.asarray(ca.DM(c)) for c in extremal.intervals.substeps(m))
-    before, after = (part.reshape(n * m, -1).T for part in (fine[:, :-1], fine[:, 1:]))
-    q = np.tile(statistics.parameters[:, None], (1, n * m))
-    points: Any = _joint_points(st, statistics.density).map(n * m)(before, after, *common, q)
-    jumps = {entry.interval: _jump(extremal, entry, statistics) for entry in readings_along(extremal)}
-    values = np.zeros((n * m + 1, 2 * size, 2 * size))
-    values[0, :size, :size] = statistics.initial
-    if start is not None:
-        values[0] = start
-    if functions() is not None and not jumps:
-        passed = passed_by(ca.DM(pack(values[0])), points, 2 * size)
-        values[1:] = unpack(np.asarray(ca.DM(passed).full()).T, 2 * size)
-        return values
-    step = _joint_step(2 * size).map(n * m)(*(ca.densify(point) for point in points))
-    for k, D in enumerate(stacked(step, n * m)):
-        values[k + 1] = lyapunov_after(D, values[k])
-        if k % m == m - 1 and k // m in jumps:
-            transition, noise = jumps[k // m]
-            values[k + 1] = transition @ values[k + 1] @ transition.T + noise
-    return values
-
-
-def _jump(extremal: Extremal, readings: Readings, statistics: Statistics) -> tuple[Array, Array]:
-    """Transition and noise of [E Z; Z' Xhat] where something is read, under the true variance of it."""
-    variance = readings.R
-    if statistics.variance is not None:
-        k = readings.interval
-        x, u, _, *rest = (np.asarray(column)[:, k] for column in extremal.columns())
-        own = statistics.variance(x, u, *rest[:2], statistics.parameters)
-        variance = np.asarray(own.full())[np.ix_(readings.rows, readings.rows)]
-    return readings.jump(variance)
 
 
 def loop_substeps(extremal: Extremal) -> int:
@@ -202,8 +146,8 @@ def loop_substeps(extremal: Extremal) -> int:
     st, count = extremal.statement, extremal.mesh.intervals + 1
     x, u, e, t, duration, p = extremal.columns()
     size = len(st.augmented)
-    F, G = (stacked(v, count) for v in _loop(st).expansion.map(count)(x, u, t, duration, p)[:2])
-    C = stacked(_loop(st).gain.map(count)(x, u, e, t, duration, p), count)
+    F, G = (stacked(v, count) for v in loop_of(st).expansion.map(count)(x, u, t, duration, p)[:2])
+    C = stacked(loop_of(st).gain.map(count)(x, u, e, t, duration, p), count)
     loops = [F - G @ C]
     if st.measurement is not None:
         _, M, U = (stacked(v, count) for v in st.measurement.map(count)(x, u, t, duration, p))
@@ -239,7 +183,7 @@ def densities(statement: Statement) -> ca.Function:
     """(state, control, time, duration, parameters) -> densities Q of the process and U of the measurement noise."""
     x, u, _, *rest = model_symbols(statement)
     arguments = [x, u, *rest]
-    noise = _loop(statement).slopes(*arguments).Q
+    noise = loop_of(statement).slopes(*arguments).Q
     measured = statement.measurement
     density = ca.DM(0, 0) if measured is None else measured(*arguments)[2]
     return ca.Function("densities", arguments, [noise, ca.densify(density)])
@@ -255,54 +199,6 @@ def variances(statement: Statement) -> ca.Function | None:
     return ca.Function("variances", [x, u, *rest], [ca.densify(variance)])
 
 
-def _loop(statement: Statement) -> Loop:
-    if statement.loop is None:
-        raise ValueError("a problem without an expected cost has no loop")
-    return statement.loop
-
-
-@lru_cache(maxsize=KEPT)
-def _joint_step(size: int) -> ca.Function:
-    """(h H at both points) -> step matrix of a covariance of so many rows."""
-    points = [ca.MX.sym(name, 2 * size, 2 * size) for name in ("first", "second")]
-    return ca.Function("joint_step", points, [gauss_matrix(points, size, LINEAR_SOLVER)])
-
-
-@lru_cache(maxsize=KEPT)
-def _joint_points(statement: Statement, density: ca.Function) -> ca.Function:
-    """(z at both ends of a substep, *common, parameters of the truth) -> h H of [E Z; Z' Xhat] at both Gauss points.
-
-    x, E, S of the design between the ends by cubic Hermite polynomials.
-    """
-    symbolic: Any = statement.symbolic
-    nx, size = statement.nx, len(statement.augmented)
-    za, zb = (symbolic.sym(name, nx + statement.ne) for name in ("za", "zb"))
-    common, q = Interval.symbols(statement), symbolic.sym("q", density.size1_in(4))
-    duration, p, h = common.duration, common.parameters, common.h
-    fa, fb = (ca.vertcat(*statement.rates(*common.at(c, z[:nx], z[nx:]))[:2]) for c, z in ((0.0, za), (1.0, zb)))
-    loop = _loop(statement)
-    points = []
-    for c in GAUSS_NODES:
-        z, u, t = hermite(za, zb, h * fa, h * fb, c), common.control(c), common.time(c)
-        F, G = loop.slopes(z[:nx], u, t, duration, p)[:2]
-        C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
-        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][statement.estimation.span], size), (t, duration, p))
-        noise, measured = density(z[:nx], u, t, duration, q)
-        drift = ca.blockcat([[F - K @ M, symbolic(size, size)], [-K @ M, F - G @ C]])
-        spread = K @ measured @ K.T
-        driven = ca.blockcat([[spread + noise, spread], [spread, spread]])
-        points.append(h * ca.blockcat([[-drift.T, symbolic(2 * size, 2 * size)], [driven, drift]]))
-    return ca.Function("joint_points", [za, zb, *common, q], points)
-
-
-def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
-    if statement.measurement is None:
-        return E[:, :0], E[:0, :]
-    _, M, U = statement.measurement(x, u, *rest)
-    return kalman_gain(E, M, U), ca.densify(M)
-
-
 def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Statistics) -> float | None:
     """Largest relative error of the variances that only noise changes [2.1 of chapter 6, 3 and 4]."""
     st, mesh = extremal.statement, extremal.mesh
@@ -316,7 +212,7 @@ def _conservation(extremal: Extremal, fine: Array, joint: Array, statistics: Sta
     count = n * (m + 1)
     arguments = [column.reshape(count, -1).T for column in _points(extremal, fine)]
     own, true = (np.tile(p[:, None], (1, count)) for p in (extremal.parameters, statistics.parameters))
-    F, G = (np.asarray(v.full()) for v in _loop(st).expansion.map(count)(*arguments, own)[:2])
+    F, G = (np.asarray(v.full()) for v in loop_of(st).expansion.map(count)(*arguments, own)[:2])
     F = F.reshape(size, count, size)[uncertain][:, :, uncertain] * units / units[:, None, None]
     slopes = np.hstack([F.reshape(units.size, -1), G[uncertain] / units[:, None]])
     triangle = np.asarray(np.linalg.qr(slopes.T, mode="r"))  # of a few rows with thousands of columns
@@ -373,7 +269,7 @@ def _costs(extremal: Extremal, fine: Array, joint: Array, design: bool) -> tuple
         deviations += float(weight @ fed)
         other += float(weight @ alternative)
         nonlinear += float(weight @ added)
-    loop = _loop(st)
+    loop = loop_of(st)
     k, S = (np.asarray(v.full()) for v in loop.terminal(t.x[-1], t.duration, extremal.parameters))
     error, cross, estimate = joint[-1][:size, :size], joint[-1][:size, size:], joint[-1][size:, size:]
     spread = error + estimate - cross - cross.T
@@ -407,7 +303,7 @@ def _running(statement: Statement) -> ca.Function:
     size = len(statement.augmented)
     six = model_symbols(statement)
     joint = symbolic.sym("joint", 2 * size, 2 * size)
-    loop = _loop(statement)
+    loop = loop_of(statement)
     plain = (*six[:2], *six[3:])
     at = loop.slopes(*plain)
     A, B, N, Q = at.A, at.B, at.N, at.Q

@@ -10,8 +10,9 @@ import numpy as np
 
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
-from covocp.extremal.closed_loop import ClosedLoop, Statistics, close_loop, design_statistics
+from covocp.extremal.closed_loop import ClosedLoop, close_loop, design_statistics
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.joint import Statistics
 from covocp.extremal.mean_effect import MeanEffect, mean_effect
 from covocp.statement.chain import Link
 

@@ -12,6 +12,11 @@ from covocp.solution.spread import mention_spread
 COARSE_LOOP = 1e-2
 # Share of a limit by which the path may pass it between the points where it is imposed.
 PASSED = 1e-2
+LOST_LOOP = (
+    "The covariances of the closed loop leave the range of numbers along this solution: what is printed as standard "
+    "deviation is that of the error of the estimate alone. The cost and E do not depend on them. Use more intervals, "
+    "or units in which initial variances and densities of the noise differ less."
+)
 REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
 
 
@@ -70,6 +75,8 @@ def mention_limits(solution: Solution) -> None:
 def _mention_loop(solution: Solution) -> None:
     """The covariances of a closed loop, and the deviations from them, may be worse than its cost."""
     if solution.loop is None:
+        if solution.statement is not None and solution.statement.loop is not None:
+            warn_user(LOST_LOOP)
         return
     difference = solution.cost_identity
     if difference is not None and not difference <= COARSE_LOOP:

@@ -18,9 +18,10 @@ from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, distinct, stacked, unpack
 from covocp.base.threads import one_at_a_time
-from covocp.extremal.closed_loop import Statistics, close_loop, densities, start_covariance, variances
+from covocp.extremal.closed_loop import close_loop, densities, start_covariance, variances
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.extremal.joint import Statistics
 from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.path_limits import NOTED
 from covocp.problem.builder import Problem

@@ -17,8 +17,8 @@ from covocp.base.errors import ProblemError, SolveError, evaluating, kind_and_na
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.closed_loop import Statistics
 from covocp.extremal.extremal import Outcome
+from covocp.extremal.joint import Statistics
 from covocp.extremal.links import ChainOutcome
 from covocp.extremal.mean_effect import noted
 from covocp.extremal.mesh_error import finer_steps
