@@ -43,8 +43,8 @@ def feedback(t):
 def deviations(prior, density, times, share=1.0):
     """Covariance X of the actual loop by scipy; the true initial covariance is `share` times the design's.
 
-    Nothing of this is fast: Y = E^-1, Y' = W - F'Y - Y F - Y Q Y; the true covariance of the error with the gains of the
-    design is E + E P D P' E, P' = -(F' + Y Q) P, P(0) = Y(0); that of error and deviation is E R;
+    Nothing of this is fast: Y = E^-1, Y' = W - F'Y - Y F - Y Q Y; the true covariance of the error with the gains of
+    the design is E + E P D P' E, P' = -(F' + Y Q) P, P(0) = Y(0); that of error and deviation is E R;
     X' = (F - G C) X + X (F - G C)' + Q - G C E R - (G C E R)'.
     """
     W = M.T @ np.diag([1e4, 1.0 / density]) @ M

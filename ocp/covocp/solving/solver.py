@@ -37,6 +37,7 @@ from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
+from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
@@ -73,6 +74,7 @@ SUSPICIOUS_GAIN = 0.5
 # Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
+OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
 # Rows of a covariance from which on a look at the steps along the guess is cheaper than a run that is made again.
 LARGE = 16
 
@@ -562,7 +564,7 @@ class Solver:
             violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
             raise SolveError(
                 f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
-                f"{violated}{far_away(solution)}{bent_data(solution)}"
+                f"{violated}{far_away(solution)}{bent_data(solution)}{self._other_way()}"
                 "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
                 solution=solution,
                 violations=outcome.violations,
@@ -571,6 +573,11 @@ class Solver:
             mention_doubts(solution)
             mention_limits(solution)
         return solution
+
+    def _other_way(self) -> str:
+        """A line for a run that failed, where another method is known to be more robust."""
+        ipopt = self.method == "ipopt" and self._own.get("plugin", "ipopt") == "ipopt"
+        return OTHER_WAY if ipopt and is_suited(self._solved, self._prepared.mesh) else ""
 
 
 def _noted(solution: Solution, **stats: Any) -> Solution:
