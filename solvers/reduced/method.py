@@ -45,7 +45,7 @@ def prepare(
     parameters: Array | None = None,
     *,
     tolerance: float = TOLERANCE,
-    max_iterations: int = 300,
+    max_iterations: int = 1000,
 ) -> ReducedSolver:
     """Make a problem ready; its functions are built at the first guess, which gives the scales.
 

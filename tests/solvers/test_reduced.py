@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from random_problems import draw, true_cost
 from scipy.optimize import brentq
 
 import covocp as co
@@ -228,3 +229,13 @@ def test_a_subproblem_that_contradicts_is_eased_by_what_it_takes():
     step, left = eased(problem, np.zeros(1), np.zeros(1), 1e4)
     assert step.change == pytest.approx([1.0], abs=1e-6)
     assert left == pytest.approx(2 / 3, abs=1e-6)
+
+
+def test_long_valleys_are_followed_to_their_end():
+    """900 cheap steps, where limited-memory Ipopt gives up after 1000; the exact Hessian ends at the same cost."""
+    drawn = draw(46)
+    solution = co.solve(drawn.problem, "auto", progress=False)
+    assert solution.method == "reduced"
+    assert solution.cost == pytest.approx(true_cost(drawn, solution, rtol=1e-7), rel=max(1e-6, 2 * solution.mesh_error))
+    assert solution.optimality.stationarity <= 1e-4
+    assert solution.optimality.curvature > 0
