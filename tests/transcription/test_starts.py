@@ -196,3 +196,17 @@ def test_states_that_answer_to_nothing_by_a_power_do_not_make_the_start_vanish(p
     assert solution.cost < 1e-20
     assert solution.stats["iterations"] <= 5
     assert solution["y"][-1] == pytest.approx(-0.1 * 3.0 ** (power + 1) / (power + 1), rel=1e-4)
+
+
+@pytest.mark.parametrize("what", [co.solve, co.Solver])
+def test_a_model_that_is_singular_at_its_start_is_refused_by_name(what):
+    ocp = co.Problem(1.0, name="arm")
+    x, u = ocp.state("x", 2, initial=[0.0, 0.0], final=[1.0, 0.0]), ocp.control("u")
+    inertia = ca.vertcat(ca.horzcat(x[0], 0.0), ca.horzcat(0.0, 1.0))
+    ocp.dynamics(x, ca.solve(inertia, ca.vertcat(u, x[0]), "qr"))
+    ocp.minimize(running=u**2)
+    with pytest.raises(
+        co.ProblemError, match=r"(?s)'arm' cannot be evaluated where it starts.*\[0. 0.\].*other initial"
+    ) as error:
+        what(ocp)
+    assert isinstance(error.value.__cause__, RuntimeError)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.buffered import Matrices
+from covocp.base.errors import CovocpError, ProblemError
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
@@ -33,8 +34,30 @@ def stiffness(statement: Statement, options: Options, parameters: Array, *, at_e
     """The stiffness at the start, for the longest interval: of f_x, and for the matrices of 2 (F - E W).
 
     A graded mesh knows that of the filter on each of its intervals, or that of the nominal along a solution.
-    `at_end`: with the final values of the states that have one.
+    `at_end`: with the final values of the states that have one; none where the model has no value there.
+
+    Raises:
+        ProblemError: the model has no value at its start.
     """
+    try:
+        return _stiffness(statement, options, parameters, at_end)
+    except RuntimeError as error:  # CasADi's: of a solve of linear equations inside the model, or a product of it
+        if isinstance(error, CovocpError):
+            raise
+        if at_end:
+            return Stiffness(nominal=0.0, oscillating=0.0, decaying=0.0)
+        x0 = statement.boundary_values(parameters)[0]
+        raise ProblemError(
+            f"{statement.name or 'The problem'!r} cannot be evaluated where it starts.",
+            expected="rates and measurements with values and slopes at the initial state",
+            received="a solve of linear equations inside them that fails (a singular matrix), with initial values "
+            f"{np.array2string(x0, precision=4, threshold=8)} (nan: free) and the guess of the controls",
+            remedy="give other initial values, or a guess= of the controls, off the singularity",
+        ) from error
+
+
+def _stiffness(statement: Statement, options: Options, parameters: Array, at_end: bool) -> Stiffness:
+    """What `stiffness` returns."""
     nodes, control = options.nodes(), options.control
     u = controls_guess(statement, nodes[:2], control)[0]
     mesh = Mesh(nodes=nodes, control=control, substeps=1, segments=(nodes.size - 1,), eliminated=True, step="rk4")
@@ -87,7 +110,10 @@ def fits(statement: Statement, mesh: Mesh, parameters: Array) -> bool:
         return False
     duration, longest = statement.duration.guess, float(np.diff(mesh.nodes).max())
     u = controls_guess(statement, mesh.nodes[:2], mesh.control)[0]
-    slopes = _slopes_in_numbers(statement).evaluated(x, u, np.zeros(statement.ne), 0.0, duration, parameters)[0]
+    try:
+        slopes = _slopes_in_numbers(statement).evaluated(x, u, np.zeros(statement.ne), 0.0, duration, parameters)[0]
+    except RuntimeError:  # the longer look tells
+        return False
     return explicit_substeps(duration * longest * _largest(_eigenvalues(slopes))) <= mesh.substeps
 
 
