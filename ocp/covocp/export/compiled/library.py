@@ -17,7 +17,7 @@ from covocp.base.errors import ExportError, shown, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, real_numbers
 from covocp.base.threads import TURN
-from covocp.export.laws.law import CODES, STATUSES, Law, Port, span, stacked_size
+from covocp.export.laws.law import CODES, RETURNED, STATUSES, Law, Port, span, stacked_size
 from covocp.export.text.header import struct_name
 
 NAMES = tuple(STATUSES)
@@ -117,7 +117,7 @@ class Library:
         init = getattr(self._library, f"{self._package}_init")
         init.restype = None
         init(ctypes.byref(struct))
-        return np.concatenate([views[port.name] for port in law.outputs]).astype(float)
+        return np.concatenate([views.get(port.name, views["control"]) for port in law.outputs]).astype(float)
 
     def _with_struct(self, law: Law) -> Backend:
         """A C function that fills or keeps a struct."""
@@ -130,9 +130,10 @@ class Library:
         sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
         pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
         kept = [(views[law.held[p.name]], span(law.inputs, p.name)) for p in law.inputs if p.name in law.held]
-        fields = [views[port.name] for port in law.results]
         controls = [port for port in law.outputs if port.name == "control"] if law.kind == "controller" else []
         control = [self._buffer(port.size) for port in controls]
+        handed = [np.frombuffer(buffer, dtype=self._real) for buffer in control]
+        fields = [handed[0] if port.name == RETURNED else views[port.name] for port in law.results]
 
         def call(row: Array) -> tuple[Array, int]:
             given[: row.size] = row
@@ -165,11 +166,11 @@ class Library:
                 return self._real
             return self._real * port.rows if port.columns == 1 else (self._real * port.columns) * port.rows
 
-        fields = [(port.name, kind(port)) for port in law.outputs]
+        fields = [(port.name, kind(port)) for port in law.fields]
         made: Any = type(struct_name(self._package, law), (ctypes.Structure,), {"_fields_": fields})
         struct = made()
         memory = np.frombuffer(struct, dtype=np.dtype(made))
-        return struct, {port.name: memory[port.name].reshape(-1) for port in law.outputs}
+        return struct, {port.name: memory[port.name].reshape(-1) for port in law.fields}
 
 
 class Call:
@@ -295,7 +296,7 @@ class Controller(Call):
         self._size = stacked_size(law.inputs)
         self._places = {port.name: span(law.inputs, port.name) for port in law.inputs}
         self._kept = [(self._places[name], span(law.outputs, field)) for name, field in law.held.items()]
-        self._control, self._estimate = (span(law.outputs, name) for name in ("control", "estimate"))
+        self._control, self._estimate = (span(law.outputs, name) for name in (law.returned, "estimate"))
         self.init()
 
     def init(self) -> None:
@@ -317,7 +318,7 @@ class Controller(Call):
     def state(self) -> dict[str, Any]:
         """Fields of the struct."""
         ports = self.law.outputs
-        return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in ports}
+        return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in self.law.fields}
 
     def step(self, measurement: Given, time: float) -> Array:
         """The control for a measurement at a time.

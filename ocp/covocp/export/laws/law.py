@@ -40,6 +40,8 @@ CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the
 # controllers say; it is finite in single precision.
 LARGEST = 1e30
+# An output of a controller that a step hands to its caller and does not keep.
+RETURNED = "returned"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,7 @@ class Law:
         outputs: ports of the core; of a controller the fields of its struct, the control among them.
         statuses: names of what it may return.
         held: of a controller: input -> field of the struct where it is kept.
+        returned: of a controller: the output that a step hands to its caller; a field unless it is `RETURNED`.
         start: of a controller: first values of the fields, stacked.
         safe: of a solver: outputs where it fails, stacked.
         defaults: of a solver: inputs of the export, stacked.
@@ -118,6 +121,7 @@ class Law:
     points: Points = field(repr=False)
     statuses: tuple[str, ...] = ("OK", "RESULT_NOT_FINITE", "FAILED")
     held: Mapping[str, str] = field(default_factory=dict)
+    returned: str = "control"
     start: Array = field(default_factory=lambda: np.zeros(0))
     safe: Array = field(default_factory=lambda: np.zeros(0))
     defaults: Array = field(default_factory=lambda: np.zeros(0))
@@ -152,6 +156,11 @@ class Law:
     def results(self) -> tuple[Port, ...]:
         """Outputs without the status."""
         return self.outputs if self.kind == "function" else self.outputs[:-1]
+
+    @property
+    def fields(self) -> tuple[Port, ...]:
+        """Outputs that a struct keeps."""
+        return tuple(port for port in self.outputs if port.name != RETURNED)
 
     def values(self, rows: Array) -> Array:
         """Outputs of the core, a row for each row of inputs; steps that ask to be continued are continued."""

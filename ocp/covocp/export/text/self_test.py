@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.law import CODES, Law, Port, span, stacked_size
+from covocp.export.laws.law import CODES, RETURNED, Law, Port, span, stacked_size
 from covocp.export.text.header import struct_name
 from covocp.export.text.numbers import code, row, table, wrapped
 
@@ -251,6 +251,8 @@ def _size(law: Law, name: str) -> int:
 
 def _flat_copy(port: Port, owner: str, law: Law) -> str:
     offset = span(law.results, port.name).start
+    if port.name == RETURNED:
+        return f"memcpy(out + {offset}, control, sizeof(control));"
     if port.scalar:
         return f"out[{offset}] = {owner}.{port.name};"
     return f"memcpy(out + {offset}, {owner}.{port.name}, sizeof({owner}.{port.name}));"
