@@ -265,6 +265,8 @@ class Call:
                 what = f"there is no argument '{name}'"
                 start = f"'initial_{name}' is meant, where '{name}' starts"
                 remedy = start if f"initial_{name}" in names else spelling(name, names, f"leave '{name}' out")
+                if name in self.law.instead:
+                    remedy = f"only a start depends on '{name}': give {self.law.instead[name]}"
                 raise self._unfit(f"{name}={value!r}", remedy, what)
             if name in given:
                 raise self._unfit(f"'{name}' by its place and by its name", "give it once")

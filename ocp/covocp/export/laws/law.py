@@ -103,6 +103,7 @@ class Law:
         start: of a controller: first values of the fields, stacked.
         safe: of a solver: outputs where it fails, stacked.
         defaults: of a solver: inputs of the export, stacked.
+        instead: of a solver: parameters of the problem that are no arguments -> the arguments in their place.
         points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
         constants: numbers for the header, by name and unit: "DURATION [s]".
         notes: what the package says of the law where it is printed.
@@ -125,6 +126,7 @@ class Law:
     start: Array = field(default_factory=lambda: np.zeros(0))
     safe: Array = field(default_factory=lambda: np.zeros(0))
     defaults: Array = field(default_factory=lambda: np.zeros(0))
+    instead: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     most: int = 100_000

@@ -282,7 +282,7 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
     guess = ca.MX.sym("guess", nlp.w.shape[0])
-    p = ca.vertcat(ca.MX(0, 1), *stacked(entries, symbols, task.names))
+    p = ca.vertcat(ca.MX(0, 1), *stacked(task.made, symbols, task.names))
     bounds = _bounds(task, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
     given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
@@ -320,6 +320,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         inputs=ports,
         outputs=made.results,
         statuses=STATUSES,
+        instead=task.made.instead,
         safe=safe,
         defaults=default,
         points=lambda random, count: _points(task, default, random, count),
