@@ -17,13 +17,14 @@ from covocp.export.laws.law import Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
 from covocp.problem.decisions import matters
-from covocp.problem.declarations import Declarations, Free, Matrix, Parameter
+from covocp.problem.declarations import Declarations, Free, Matrix, Parameter, State
 from covocp.problem.expected_cost import derive, statement_of
 from covocp.problem.restart import Start, restartable
 from covocp.statement.statement import Statement
 
 # Shortest and longest duration of a plan, in units of that of the problem.
 DURATIONS = (1e-3, 1e3)
+QUATERNION = "a unit quaternion, scalar first"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,6 +37,7 @@ class Argument:
         value: default, in the shape of the port, flat row by row.
         deviation: how far it may be moved to try the solver, of the same shape.
         symmetric: whether the parameter is the half-vector of the matrix, not its columns one below the other.
+        attitude: of the initial quaternion of an attitude, its rows among the initial states; None of all else.
     """
 
     port: Port
@@ -43,6 +45,7 @@ class Argument:
     value: Array
     deviation: Array
     symmetric: bool = False
+    attitude: slice | None = None
 
     __repr__ = short_repr
 
@@ -159,15 +162,31 @@ def _argument(start: Start, taken: set[str], parameters: tuple[Parameter, ...]) 
         port = Port(name=name, rows=entry.size, columns=entry.size, unit=entry.unit, about=about)
         none = np.zeros(value.size)
         return Argument(port=port, parameter=start.parameter, value=value.ravel(), deviation=none, symmetric=True)
+    if entry.chart is not None:
+        about = f"initial attitude of '{entry.name}', {QUATERNION}{instead}"
+        deviation = np.full(entry.size, max(0.05 * float(_deviations(entry).max()), 0.005))  # half the angle
+        port = Port(name=name, rows=entry.size, about=about)
+        return Argument(
+            port=port, parameter=start.parameter, value=start.value, deviation=deviation, attitude=start.place
+        )
     about = f"initial value of '{entry.name}'"
     about += "" if len(known) == entry.size else f", its entries {', '.join(map(str, known))}"
     about += instead
-    deviation = np.zeros(len(known))
-    if entry.variance.is_constant():
-        deviation = 0.1 * np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(entry.variance).full())), 0.0))[known]
-    deviation = np.maximum(deviation, 0.005 * np.abs(start.value))
+    deviation = np.maximum(0.1 * _deviations(entry)[known], 0.005 * np.abs(start.value))
     port = Port(name=name, rows=len(known), unit=entry.unit, about=about)
     return Argument(port=port, parameter=start.parameter, value=start.value, deviation=deviation)
+
+
+def _deviations(entry: State) -> Array:
+    """Standard deviations of an initial value, of its tangent where it is no vector; zero where they are no numbers."""
+    if not entry.variance.is_constant():
+        return np.zeros(entry.size)
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(entry.variance).full())), 0.0)))
+
+
+def unit_quaternion(value: Expr, near: Expr) -> Any:
+    """A quaternion of unit length; of q and -q, the same attitude, the one that is nearer to another quaternion."""
+    return ca.if_else(ca.dot(value, near) < 0, -value, value) / ca.norm_2(value)
 
 
 def stacked(made: Replannable, values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:

@@ -21,7 +21,7 @@ from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
 from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
-from covocp.export.laws.replanning import Replannable, replannable, stacked
+from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
 from covocp.export.text.names import identifier
 from covocp.passage.written import Tape
 from covocp.problem.builder import Problem
@@ -282,7 +282,12 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
     guess = ca.MX.sym("guess", nlp.w.shape[0])
-    p = ca.vertcat(ca.MX(0, 1), *stacked(task.made, symbols, task.names))
+    turned = {  # from the quaternion, not its opposite, that the guess begins with
+        entry.port.name: unit_quaternion(symbols[entry.port.name], guess[entry.attitude])
+        for entry in entries
+        if entry.attitude is not None
+    }
+    p = ca.vertcat(ca.MX(0, 1), *stacked(task.made, symbols | turned, task.names))
     bounds = _bounds(task, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
     given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
