@@ -87,3 +87,32 @@ def test_a_free_attitude_is_chosen_by_each_plan() -> None:
     plan = made.reference()()
     assert plan["status"] == "OK"
     assert plan["cost"] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_units_are_those_of_quaternions_and_of_rotation_vectors() -> None:
+    """In the header and in the README: quaternions have no unit, rows of the estimate are angles."""
+    ocp = co.Problem(2.0, "pointed")
+    omega = ocp.state("omega", 3, initial=0.0, final=0.0, variance=0.01, unit="rad/s")
+    torque = ocp.control("torque", 3, unit="N m")
+    attitude = ocp.attitude("att", initial=np.eye(3), final=so3.exp([0, 0, 0.6]), rate=omega, variance=0.02 * np.eye(3))
+    ocp.dynamics(omega, torque, noise=1e-3)
+    ocp.measurement("star", attitude.matrix[:, 0], 0.01)
+    ocp.minimize_expected(running=0.5 * ca.sumsqr(torque), terminal_weight={omega: 1.0, attitude: 2.0})
+    made = export_c(co.solve(ocp, intervals=6, progress=False), FOLDER / "pointed")
+    planned = export_c(attitudes.slew(np.eye(3), GOAL)[0], FOLDER / "pointed_plan", **FEW)
+    rates = [f"omega[{i}] [rad/s]" for i in range(3)]
+    ports = {port.name: port for law in made.laws for port in law.outputs}
+    assert ports["estimate"].entries == (*rates, "att[0] [rad]", "att[1] [rad]", "att[2] [rad]")
+    assert ports["nominal_state"].entries == (*rates, "att q0", "att q1", "att q2", "att q3")
+    for package, lines in (
+        (made, ("state 'att', a unit quaternion, scalar first", "the rotation vector, in body axes, by which it")),
+        (
+            planned,
+            ("initial attitude of 'attitude', a unit quaternion, scalar first", "node: a unit quaternion, scalar"),
+        ),
+    ):
+        for name in (f"{package.name}.h", "README.md"):
+            text = " ".join((package.directory / name).read_text().replace("\n *", " ").split())
+            assert "[rad] state 'att" not in text
+            for line in lines:
+                assert line in text, name

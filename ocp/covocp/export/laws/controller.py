@@ -30,10 +30,10 @@ from covocp.base.quadrature import GAUSS_NODES, gauss_step
 from covocp.blocks.updates import without
 from covocp.export.laws.design import Design, measured_blocks
 from covocp.export.laws.history import History, Nominal
-from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
+from covocp.export.laws.law import LARGEST, QUATERNION, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.trajectory import times
-from covocp.statement.statement import Statement, entry_names
+from covocp.statement.statement import Statement, entry_names, error_names
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8
@@ -59,6 +59,10 @@ ABOUT_INSTANTS = (
 ABOUT_FIRST = (
     "Something is read at time zero: give it to a first step at time zero, which corrects the estimate and the control "
     "by it. Before that step the time of the last one is -1.",
+)
+ABOUT_ATTITUDES = (
+    f"An attitude is {QUATERNION}; its three rows of the estimate are the rotation vector, in body axes, by which it "
+    "differs from the nominal."
 )
 
 
@@ -145,7 +149,8 @@ def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr,
 def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:
     """What is said of a law, with what is read at instants where something is."""
     read = ABOUT_INSTANTS if design.always < design.sizes[2] else ()
-    return (*own, *read, *(ABOUT_FIRST if design.reads_first else ()))
+    turns = (ABOUT_ATTITUDES,) if any(block.tangent for block in design.statement.states) else ()
+    return (*own, *read, *turns, *(ABOUT_FIRST if design.reads_first else ()))
 
 
 def finite(estimate: Expr, feedback: Expr) -> Any:
@@ -204,9 +209,9 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
 
 
 def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of entries with the units of their symbols."""
+    """Names of entries, or of rows of an error, with the units of their symbols; that of an attitude is of the error."""
     blocks = (*statement.blocks, *measured_blocks(statement))
-    units = {name: block.unit for block in blocks for name in entry_names((block,))}
+    units = {name: block.unit for block in blocks for name in (error_names if block.tangent else entry_names)((block,))}
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 

@@ -40,6 +40,8 @@ CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the
 # controllers say; it is finite in single precision.
 LARGEST = 1e30
+# What the four numbers of an attitude are.
+QUATERNION = "a unit quaternion, scalar first"
 # An output of a controller that a step hands to its caller and does not keep.
 RETURNED = "returned"
 

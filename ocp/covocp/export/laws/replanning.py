@@ -13,7 +13,7 @@ from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, pack_symbolic, unpack
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.law import Port
+from covocp.export.laws.law import QUATERNION, Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
 from covocp.problem.decisions import matters
@@ -24,7 +24,6 @@ from covocp.statement.statement import Statement
 
 # Shortest and longest duration of a plan, in units of that of the problem.
 DURATIONS = (1e-3, 1e3)
-QUATERNION = "a unit quaternion, scalar first"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

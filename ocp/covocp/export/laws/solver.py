@@ -19,7 +19,7 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
-from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
+from covocp.export.laws.law import CODES, LARGEST, QUATERNION, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
 from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
 from covocp.export.text.names import identifier
@@ -360,7 +360,9 @@ def _results(
                 results.append((port, source[block.span, 0]))
                 continue
             about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
-            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
+            about += f": {QUATERNION}" if block.tangent else ""
+            unit = "" if block.tangent else block.unit  # that of its rotation vector
+            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=unit, about=about)
             results.append((port, source[block.span, :].T))
     for n, (v, about) in last.items():  # of residuals, how far they are below what counts as met is rounding
         least = 1.0 if n in RESIDUALS else 0.0
