@@ -209,16 +209,19 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
 
 
 def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of entries, or of rows of an error, with the units of their symbols; that of an attitude is of the error."""
+    """Names of entries, or of rows of an error, with the units of their symbols: of an attitude that of the error."""
     blocks = (*statement.blocks, *measured_blocks(statement))
     units = {name: block.unit for block in blocks for name in (error_names if block.tangent else entry_names)((block,))}
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 
-def first_fields(design: Design, tables: History, fields: dict[str, Any], last: str) -> Array:
+def first_fields(
+    design: Design, tables: History, fields: dict[str, Any], last: str, gain: Array | None = None
+) -> Array:
     """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits.
 
-    Where something is read at time zero the field `last`, that of the last step, says that there was none.
+    Where something is read at time zero the field `last`, that of the last step, says that there was none. The gain is
+    that of the design, where another one is flown (m, n) that one.
     """
     m = design.sizes[1]
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
@@ -230,7 +233,7 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any], last: 
     }
     if design.reads_first:
         zeros[last] = np.array([NO_STEP])
-    zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
+    zeros["feedback_gain"] = np.ravel(design.gain(x, u, e, 0.0)[0].full() if gain is None else gain)
     return np.concatenate(list(zeros.values()))
 
 
