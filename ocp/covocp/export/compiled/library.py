@@ -243,16 +243,23 @@ class Call:
             if port.name not in given:
                 parts.append(self.law.defaults[span(self.law.inputs, port.name)])
                 continue
-            value = given[port.name]
-            try:
-                array = real_numbers(value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
-            matrices = port.columns > 1 and array.ndim > 1
-            if array.size != port.size or (matrices and array.shape != port.shape):
-                raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
-            parts.append(array.ravel())
+            parts.append(self._flat(port, given[port.name]))
         return np.concatenate([np.zeros(0), *parts])
+
+    def _flat(self, port: Port, value: Given) -> Array:
+        """One argument, flat.
+
+        Raises:
+            ExportError: no numbers, or another shape.
+        """
+        try:
+            array = real_numbers(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
+        matrices = port.columns > 1 and array.ndim > 1
+        if array.size != port.size or (matrices and array.shape != port.shape):
+            raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
+        return array.ravel()
 
     def _given(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
         """What the caller gives by name; complains about names, never about values."""
@@ -297,6 +304,7 @@ class Controller(Call):
         super().__init__(law, library)
         self._size = stacked_size(law.inputs)
         self._places = {port.name: span(law.inputs, port.name) for port in law.inputs}
+        self._ports = law.arguments
         self._kept = [(self._places[name], span(law.outputs, field)) for name, field in law.held.items()]
         self._control, self._estimate = (span(law.outputs, name) for name in (law.returned, "estimate"))
         self.init()
@@ -331,12 +339,15 @@ class Controller(Call):
 
         Returns:
             The control, shape (m,), to be held until the next step.
+
+        Raises:
+            ExportError: no numbers, or not as many as are measured; nothing has happened then.
         """
         row = np.zeros(self._size)
         for place, field in self._kept:
             row[place] = self._values[field]
-        row[self._places["measurement"]] = np.asarray(measurement, dtype=float).ravel()
-        row[self._places["time"]] = time
+        for port, value in zip(self._ports, (measurement, time), strict=True):
+            row[self._places[port.name]] = self._flat(port, value)
         results, status = self._backend(row)
         self._values = np.append(results, status)
         self.status = NAMES[status]
