@@ -35,7 +35,12 @@ def evaluated(law: Law) -> Backend:
 
     def call(row: Array) -> tuple[Array, int]:
         with TURN:
-            values = law.values(row[None, :])[0]
+            try:
+                values = law.values(row[None, :])[0]
+            except RuntimeError:  # a matrix has no inverse there, by which C divides nevertheless
+                if law.kind != "function":
+                    raise
+                values = np.full(stacked_size(law.results), np.nan)
         if law.kind == "function":
             finite = bool(np.isfinite(values).all())
             return values, CODES["OK" if finite else "RESULT_NOT_FINITE"]

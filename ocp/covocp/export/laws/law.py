@@ -185,8 +185,7 @@ class Law:
         """Outputs of one call of the core."""
         if self.kind == "solver":
             return np.array([self._solved(row) for row in rows])
-        columns: Any = self.core.map(rows.shape[0])(*split_columns(rows, self.inputs))
-        columns = columns if isinstance(columns, tuple) else (columns,)
+        columns: Any = self.core.map(rows.shape[0]).call(split_columns(rows, self.inputs))  # a list, without inputs too
         return np.vstack([np.asarray(column.full()) for column in columns]).T
 
     def _solved(self, row: Array) -> Array:

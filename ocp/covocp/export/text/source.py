@@ -41,7 +41,7 @@ def source(package: str, laws: tuple[Law, ...], sizes: dict[str, Sizes]) -> str:
 def _work(package: str, sizes: Sizes, *, arrays: bool = True) -> list[str]:
     """Declarations of the work arrays."""
     real = f"{package}_real"
-    lines = [f"const {real} *arg_[{sizes.arguments}];", f"{real} *res_[{sizes.results}];"]
+    lines = [f"const {real} *arg_[{max(sizes.arguments, 1)}];", f"{real} *res_[{sizes.results}];"]
     if arrays:
         lines += [f"int iw_[{sizes.integers + 1}];", f"{real} w_[{sizes.reals + 1}];"]
     return lines
