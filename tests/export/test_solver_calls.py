@@ -302,3 +302,23 @@ def test_a_parameter_of_the_start_and_of_something_else_is_an_argument():
     assert names == ["initial_x", "initial_E", "x0", "b", "duration", "guess"]
     plan = made.reference()(initial_x=1.0, x0=2.0)
     assert (float(plan["x"].ravel()[0]), float(plan["x"].ravel()[-1])) == pytest.approx((1.0, 0.2), abs=1e-7)
+
+
+def test_a_saddle_is_called_solved_and_the_texts_say_so():
+    """x' = -b x + u from x = 0: at u = 0 nothing is learnt about b, E_bb(T) stays 5; moving either way is better."""
+    ocp = co.Problem(duration=4.0)
+    x, b, u = ocp.state("x", initial=0.0), ocp.unknown("b", mean=1.0, variance=5.0), ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=0.0)
+    ocp.measurement("position", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.1 * u**2, terminal=10.0 * E[b, b])
+    made = export_c(ocp, FOLDER / "saddle", intervals=8)
+    planner = made.reference()
+    plan = planner()
+    still = planner(guess=0.0 * plan["variables"])
+    assert plan["cost"] < 5.0
+    assert (still["status"], still["cost"]) == ("OK", pytest.approx(50.0))
+    for text in ("saddle.h", "README.md"):
+        words = " ".join((made.directory / text).read_text().replace("\n *", " ").split())
+        assert "A saddle fulfils them too: start from a plan, not from a symmetric guess" in words
+        assert "how well the first-order conditions of a minimum hold" in words

@@ -32,7 +32,8 @@ STATUSES = {
     "TIME_NOT_FINITE": "the time is NaN, infinite or beyond 1e30: values of the last valid time",
     "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
-    "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
+    "NOT_CONVERGED": "the iterations ended before the first-order conditions of a minimum held: the last iterate is "
+    "returned",
     "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
 }

@@ -1,7 +1,7 @@
 """The solver of a problem as a law: initial state, parameters and a guess in, a plan out.
 
 The transcription is that of every shooting method, its NLP solver one of CasADi's that has C code. The status is not
-the solver's own opinion: it follows from the conditions of a minimum at what it returns.
+the solver's own opinion: it follows from the first-order conditions of a minimum at what it returns.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ RESIDUALS = ("infeasibility", "stationarity")
 STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
 ABOUT = (
     "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
-    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an "
-    "argument is not finite, the plan made at the export is returned, and the status says so.",
+    "the plan, its cost, and how well the first-order conditions of a minimum hold (in the solver's units). A saddle "
+    "fulfils them too: start from a plan, not from a symmetric guess such as zero. Where it fails, or an argument is "
+    "not finite, the plan made at the export is returned, and the status says so.",
 )
 # What is said of a problem with an expected cost: its plan is no controller.
 NOMINAL = (
