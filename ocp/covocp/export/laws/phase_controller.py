@@ -152,6 +152,26 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         tolerance: largest relative deviation.
     """
     room = _room(legs)
+    return Law(
+        name="step",
+        kind="controller",
+        about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
+        notes=_notes(legs),
+        constants=_constants(legs),
+        core=_core(legs, room, duration, margin),
+        inputs=_inputs(legs, room),
+        outputs=_outputs(legs, room),
+        statuses=STATUSES,
+        held=HELD,
+        returned=RETURNED,
+        start=_first(legs[0], room),
+        points=lambda random, count: _points(legs, room, duration, random, count),
+        tolerance=tolerance,
+    )
+
+
+def _core(legs: tuple[Leg, ...], room: _Room, duration: float, margin: float) -> ca.Function:
+    """(estimate, last, held, measurement, time) -> fields, control that is handed out, status."""
     y, last, held = ca.MX.sym("estimate", room.n), ca.MX.sym("last"), ca.MX.sym("held", room.m)
     measured, time = ca.MX.sym("measurement", room.r), ca.MX.sym("time")
     starts = [leg.start for leg in legs]
@@ -178,7 +198,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
     steps = [_step(leg, room) for leg in legs]
     which: Any = ca.Function.conditional("which", steps[:-1], steps[-1])
     inside = ca.fmin(ca.fmax(asked - begun[after], 0.0), ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])
-    at = ca.fmin(at, ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])  # where the time is in a phase before
+    at = ca.fmin(at, ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])  # of a struct that was never set
     *fields, fine, unread = which(after, own, at, kept, ca.if_else(meets, np.nan, measured), inside, valid)
     found = dict(zip(FIELDS, fields, strict=True))
     good = ca.logic_and(good, fine)
@@ -191,23 +211,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
     given = found["control"]  # kept where the time is valid: the next step must not depend on one that is not
     found["control"] = ca.if_else(valid, given, held)
     outputs = [ca.if_else(valid, asked, last), after, *found.values(), given, status_of(conditions)]
-    core = ca.Function("step", [y, last, held, measured, time], outputs)
-    return Law(
-        name="step",
-        kind="controller",
-        about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
-        notes=_notes(legs),
-        constants=_constants(legs),
-        core=core,
-        inputs=_inputs(legs, room),
-        outputs=_outputs(legs, room),
-        statuses=STATUSES,
-        held=HELD,
-        returned=RETURNED,
-        start=_first(legs[0], room),
-        points=lambda random, count: _points(legs, room, duration, random, count),
-        tolerance=tolerance,
-    )
+    return ca.Function("step", [y, last, held, measured, time], outputs)
 
 
 def _room(legs: tuple[Leg, ...]) -> _Room:
