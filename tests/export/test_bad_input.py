@@ -284,3 +284,18 @@ def test_two_packages_have_no_symbol_in_common():
     assert len(symbols) == len(set(symbols)) > 0
     assert all(symbol.startswith(("lag_", "mars_", "theta_")) for symbol in symbols)
     assert np.size(symbols) > 30
+
+
+@pytest.mark.parametrize("reading", [[0.3], 0.3, [0.3, 0.3], np.zeros(4), [], "a", None, [0.1, "b", 0.2]])
+@pytest.mark.parametrize("kind", ["python", "reference"])
+def test_a_reading_that_is_none_is_an_error_and_no_step(kind, reading):
+    """Three values are measured: one number is not taken for all of them."""
+    controller = getattr(package("swing"), kind)()
+    controller.step([0.1, 0.2, 0.3], 0.5)
+    before = controller.state
+    with pytest.raises(co.ExportError, match=r"(?s)arguments of 'step'.*measurement \(3,\)"):
+        controller.step(reading, 0.55)
+    for name, value in controller.state.items():
+        np.testing.assert_array_equal(value, before[name])
+    with pytest.raises(co.ExportError, match="time"):
+        controller.step([0.1, 0.2, 0.3], [0.5, 0.6])

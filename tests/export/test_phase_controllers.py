@@ -192,18 +192,17 @@ def test_what_should_not_happen_has_a_status_and_nominal_control() -> None:
     kept = step.estimate.copy()
     assert abs(kept).max() > 1e-3
     for time, status, nominal in (
-        (0.7, "TIME_BACKWARDS", fall.at(0.7)["u"]),
+        (0.7, "TIME_BACKWARDS", rise["w"][0]),  # of the phase that it is in, where it begins
         (1.05, "TIME_BACKWARDS", rise.at(0.05)["w"]),
         (9.0, "TIME_AFTER", rise["w"][-1]),
-        (-1.0, "TIME_BACKWARDS", fall["u"][0]),
+        (-1.0, "TIME_BEFORE", rise["w"][0]),
         (np.nan, "TIME_NOT_FINITE", rise.at(0.1)["w"]),
     ):
         control = step.step([0.0, 0.0], time)
-        expected = "TIME_BEFORE" if time == -1.0 else status
-        assert step.status == expected
+        assert step.status == status
         assert float(control[0]) == pytest.approx(float(nominal), rel=1e-9)
         np.testing.assert_array_equal(step.estimate, kept)
-        assert step.state["time"] == 1.1
+        assert (step.state["time"], step.state["phase"]) == (1.1, 1)
 
 
 def _leg(name: str, *, first: bool, control: str = "u") -> co.Problem:
@@ -306,3 +305,50 @@ def test_a_reading_where_a_phase_begins_is_refused_by_name(first: list[float], l
     solution = co.evaluate(parts, nominal=[{"u": 0.1}, {"u": 0.1}], intervals=20)
     with pytest.raises(co.ExportError, match=r"Something is read where '[AB]' begins"):
         export_c(solution, FOLDER / "begins")
+
+
+def _pushed(name: str, order: tuple[str, ...], **start: Any) -> co.Problem:
+    """A lag that u moves, and v where it is in the order in which the controls are declared."""
+    ocp = co.Problem(1.0, name=name)
+    x = ocp.state("x", **start)
+    controls = {own: ocp.control(own) for own in order}
+    u, v = controls["u"], controls.get("v")
+    ocp.dynamics(x, u if v is None else u + 0.5 * v + 0.3, noise=0.01)
+    ocp.measurement("position", x, noise=0.01)
+    cost = 0.5 * u**2 + x**2
+    ocp.minimize_expected(running=cost if v is None else cost + 0.5 * (v - 2.0) ** 2, terminal_weight={x: 4.0})
+    return ocp
+
+
+@pytest.mark.parametrize("order", [("u", "v"), ("v", "u")])
+def test_a_spurious_time_changes_nothing_for_the_next_step(order: tuple[str, ...]) -> None:
+    """C and Python: the struct is that of the last valid step, the control returned the nominal one of its phase."""
+    first = _pushed("one", ("u",), initial=0.5, variance=0.05)
+    phases = co.Phases([first, _pushed("two", order, initial=None, final=0.2)])
+    solution = co.solve(phases, intervals=10, **QUIET)
+    made = export_c(solution, FOLDER / f"spurious_{''.join(order)}")
+    made.build(flags=STRICT)
+    assert made.check(100).ok
+    for laws in (made.python(), made.reference()):
+        step, kept = laws["step"], ("time", "phase", "estimate", "control")
+        for valid, wrong in (((0.1, 0.2, 0.3), (9.0, -1.0, 0.15, np.nan)), ((0.5, 1.0, 1.5), (0.5, 1.2, 9.0, np.inf))):
+            step.init()
+            for time in valid:
+                step.step([float(solution.at(time)["x"]) + 0.3], time)
+            before, phase = step.state, solution[int(step.state["phase"])]
+            known = step.step([np.nan], valid[-1] + 0.1), step.estimate.copy()
+            for stamp in wrong:
+                step.init()
+                for time in valid:
+                    step.step([float(solution.at(time)["x"]) + 0.3], time)
+                returned = step.step([0.0], stamp)
+                assert step.status.startswith("TIME_")
+                for name in kept:
+                    np.testing.assert_array_equal(step.state[name], before[name], err_msg=f"{name} after {stamp}")
+                since = (stamp if np.isfinite(stamp) else valid[-1]) - (1.0 if phase.name == "two" else 0.0)
+                nominal = phase.at(float(np.clip(since, 0.0, 1.0)))
+                names = ("u",) if phase.name == "one" else order
+                for row, name in enumerate(names):
+                    assert returned[row] == pytest.approx(float(nominal[name]), rel=1e-9)
+                np.testing.assert_array_equal(step.step([np.nan], valid[-1] + 0.1), known[0])
+                np.testing.assert_array_equal(step.estimate, known[1])

@@ -77,6 +77,23 @@ def test_gains_are_those_of_the_discrete_regulator():
         S = cost[:2, :2] - cost[:2, 2:] @ gain
 
 
+def test_the_gain_after_init_is_the_one_that_is_flown():
+    """Of the discrete regulator at time zero; that of the continuous one is another."""
+    solution, period = linear_quadratic(), 0.5
+    move, weight = van_loan(period)
+    S = np.diag([5.0, 2.0])
+    for _ in range(12):
+        cost = weight + move[:2].T @ S @ move[:2]
+        gain = np.linalg.solve(cost[2:, 2:], cost[2:, :2])
+        S = cost[:2, :2] - cost[:2, 2:] @ gain
+    assert abs(solution.loop.gain[0] / gain - 1.0).min() > 0.05
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)  # what half a second loses
+        package = co.export_c(solution, FOLDER / "init_gain", period=period, largest_spread=float("inf"))
+    for laws in (package.python(), package.reference()):
+        np.testing.assert_allclose(laws.state["feedback_gain"], gain, rtol=2e-6)
+
+
 def test_spread_as_flown_is_that_of_the_compiled_law_in_the_actual_system(steep_end):
     samples = tables(steep_end, 0.1)
     with warnings.catch_warnings():

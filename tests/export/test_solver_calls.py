@@ -260,3 +260,65 @@ def test_residuals_that_are_rounding_are_no_deviation():
 def test_wrong_options_of_the_plugin_are_refused_by_name(given, words, tmp_path):
     with pytest.raises(co.ExportError, match=words):
         export_c(unknown_lag.problem(), tmp_path / "lag", **FEW, plugin_options=given)
+
+
+def parametric(*, expected=False, shared=False):
+    """The lag whose first state and variance are parameters; shared: the target is a multiple of that state."""
+    ocp = co.Problem(duration=2.0, name="parametric")
+    x0, p0 = ocp.parameter("x0", 0.5), ocp.parameter("p0", 0.3)
+    x = ocp.state("x", initial=x0, final=0.1 * x0 if shared else 0.0, variance=p0)
+    b, u = ocp.unknown("b", mean=1.0, variance=0.5), ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=0.1)
+    ocp.measurement("position", x, noise=0.2)
+    if expected:
+        ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 1.0})
+    else:
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=0.5 * u**2, terminal=E[b, b] + E[x, x])
+    return ocp
+
+
+@pytest.mark.parametrize("expected", [False, True])
+def test_a_parameter_of_the_start_alone_is_no_argument(expected):
+    """Nothing is an argument that does nothing; the start in its place plans what `Solver` plans for the parameter."""
+    name = f"parametric_{expected}"
+    made = export_c(parametric(expected=expected), FOLDER / name, **FEW)
+    ports = {port.name: port for port in made.laws[0].arguments}
+    assert list(ports) == ["initial_x", "initial_E", "b", "duration", "guess"]
+    assert "in place of what 'x0' would give" in ports["initial_x"].about
+    assert "in place of what 'p0' would give" in ports["initial_E"].about
+    planner = made.reference()
+    with pytest.raises(co.ExportError, match="only a start depends on 'x0': give initial_x"):
+        planner(x0=2.0)
+    plan = planner(initial_x=2.0, initial_E=np.diag([1.0, 0.5]))
+    known = co.Solver(parametric(expected=expected), **FEW).solve({"x0": 2.0, "p0": 1.0}, progress=False)
+    assert planner.status == "OK"
+    assert plan["cost"] == pytest.approx(known.cost, rel=1e-6)
+
+
+def test_a_parameter_of_the_start_and_of_something_else_is_an_argument():
+    made = export_c(parametric(shared=True), FOLDER / "parametric_shared", **FEW)
+    names = [port.name for port in made.laws[0].arguments]
+    assert names == ["initial_x", "initial_E", "x0", "b", "duration", "guess"]
+    plan = made.reference()(initial_x=1.0, x0=2.0)
+    assert (float(plan["x"].ravel()[0]), float(plan["x"].ravel()[-1])) == pytest.approx((1.0, 0.2), abs=1e-7)
+
+
+def test_a_saddle_is_called_solved_and_the_texts_say_so():
+    """x' = -b x + u from x = 0: at u = 0 nothing is learnt about b, E_bb(T) stays 5; moving either way is better."""
+    ocp = co.Problem(duration=4.0)
+    x, b, u = ocp.state("x", initial=0.0), ocp.unknown("b", mean=1.0, variance=5.0), ocp.control("u")
+    ocp.dynamics(x, -b * x + u, noise=0.0)
+    ocp.measurement("position", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.1 * u**2, terminal=10.0 * E[b, b])
+    made = export_c(ocp, FOLDER / "saddle", intervals=8)
+    planner = made.reference()
+    plan = planner()
+    still = planner(guess=0.0 * plan["variables"])
+    assert plan["cost"] < 5.0
+    assert (still["status"], still["cost"]) == ("OK", pytest.approx(50.0))
+    for text in ("saddle.h", "README.md"):
+        words = " ".join((made.directory / text).read_text().replace("\n *", " ").split())
+        assert "A saddle fulfils them too: start from a plan, not from a symmetric guess" in words
+        assert "how well the first-order conditions of a minimum hold" in words

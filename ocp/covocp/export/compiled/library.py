@@ -17,7 +17,7 @@ from covocp.base.errors import ExportError, shown, spelling
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, real_numbers
 from covocp.base.threads import TURN
-from covocp.export.laws.law import CODES, STATUSES, Law, Port, span, stacked_size
+from covocp.export.laws.law import CODES, RETURNED, STATUSES, Law, Port, span, stacked_size
 from covocp.export.text.header import struct_name
 
 NAMES = tuple(STATUSES)
@@ -35,7 +35,12 @@ def evaluated(law: Law) -> Backend:
 
     def call(row: Array) -> tuple[Array, int]:
         with TURN:
-            values = law.values(row[None, :])[0]
+            try:
+                values = law.values(row[None, :])[0]
+            except RuntimeError:  # a matrix has no inverse there, by which C divides nevertheless
+                if law.kind != "function":
+                    raise
+                values = np.full(stacked_size(law.results), np.nan)
         if law.kind == "function":
             finite = bool(np.isfinite(values).all())
             return values, CODES["OK" if finite else "RESULT_NOT_FINITE"]
@@ -117,7 +122,7 @@ class Library:
         init = getattr(self._library, f"{self._package}_init")
         init.restype = None
         init(ctypes.byref(struct))
-        return np.concatenate([views[port.name] for port in law.outputs]).astype(float)
+        return np.concatenate([views.get(port.name, views["control"]) for port in law.outputs]).astype(float)
 
     def _with_struct(self, law: Law) -> Backend:
         """A C function that fills or keeps a struct."""
@@ -130,9 +135,10 @@ class Library:
         sources = [(port, span(law.inputs, port.name).start) for port in law.arguments]
         pointers = [None if port.scalar else self._pointer(inputs, offset) for port, offset in sources]
         kept = [(views[law.held[p.name]], span(law.inputs, p.name)) for p in law.inputs if p.name in law.held]
-        fields = [views[port.name] for port in law.results]
         controls = [port for port in law.outputs if port.name == "control"] if law.kind == "controller" else []
         control = [self._buffer(port.size) for port in controls]
+        handed = [np.frombuffer(buffer, dtype=self._real) for buffer in control]
+        fields = [handed[0] if port.name == RETURNED else views[port.name] for port in law.results]
 
         def call(row: Array) -> tuple[Array, int]:
             given[: row.size] = row
@@ -165,11 +171,11 @@ class Library:
                 return self._real
             return self._real * port.rows if port.columns == 1 else (self._real * port.columns) * port.rows
 
-        fields = [(port.name, kind(port)) for port in law.outputs]
+        fields = [(port.name, kind(port)) for port in law.fields]
         made: Any = type(struct_name(self._package, law), (ctypes.Structure,), {"_fields_": fields})
         struct = made()
         memory = np.frombuffer(struct, dtype=np.dtype(made))
-        return struct, {port.name: memory[port.name].reshape(-1) for port in law.outputs}
+        return struct, {port.name: memory[port.name].reshape(-1) for port in law.fields}
 
 
 class Call:
@@ -242,16 +248,23 @@ class Call:
             if port.name not in given:
                 parts.append(self.law.defaults[span(self.law.inputs, port.name)])
                 continue
-            value = given[port.name]
-            try:
-                array = real_numbers(value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
-            matrices = port.columns > 1 and array.ndim > 1
-            if array.size != port.size or (matrices and array.shape != port.shape):
-                raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
-            parts.append(array.ravel())
+            parts.append(self._flat(port, given[port.name]))
         return np.concatenate([np.zeros(0), *parts])
+
+    def _flat(self, port: Port, value: Given) -> Array:
+        """One argument, flat.
+
+        Raises:
+            ExportError: no numbers, or another shape.
+        """
+        try:
+            array = real_numbers(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self._unfit(f"{port.name}={shown(value)}", "give numbers") from error
+        matrices = port.columns > 1 and array.ndim > 1
+        if array.size != port.size or (matrices and array.shape != port.shape):
+            raise self._unfit(f"{port.name} {array.shape or '()'}", f"give '{port.name}' in its shape")
+        return array.ravel()
 
     def _given(self, values: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
         """What the caller gives by name; complains about names, never about values."""
@@ -264,6 +277,8 @@ class Call:
                 what = f"there is no argument '{name}'"
                 start = f"'initial_{name}' is meant, where '{name}' starts"
                 remedy = start if f"initial_{name}" in names else spelling(name, names, f"leave '{name}' out")
+                if name in self.law.instead:
+                    remedy = f"only a start depends on '{name}': give {self.law.instead[name]}"
                 raise self._unfit(f"{name}={value!r}", remedy, what)
             if name in given:
                 raise self._unfit(f"'{name}' by its place and by its name", "give it once")
@@ -294,8 +309,9 @@ class Controller(Call):
         super().__init__(law, library)
         self._size = stacked_size(law.inputs)
         self._places = {port.name: span(law.inputs, port.name) for port in law.inputs}
+        self._ports = law.arguments
         self._kept = [(self._places[name], span(law.outputs, field)) for name, field in law.held.items()]
-        self._control, self._estimate = (span(law.outputs, name) for name in ("control", "estimate"))
+        self._control, self._estimate = (span(law.outputs, name) for name in (law.returned, "estimate"))
         self.init()
 
     def init(self) -> None:
@@ -317,7 +333,7 @@ class Controller(Call):
     def state(self) -> dict[str, Any]:
         """Fields of the struct."""
         ports = self.law.outputs
-        return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in ports}
+        return {p.name: _shaped(self._values[span(ports, p.name)], p) for p in self.law.fields}
 
     def step(self, measurement: Given, time: float) -> Array:
         """The control for a measurement at a time.
@@ -328,12 +344,15 @@ class Controller(Call):
 
         Returns:
             The control, shape (m,), to be held until the next step.
+
+        Raises:
+            ExportError: no numbers, or not as many as are measured; nothing has happened then.
         """
         row = np.zeros(self._size)
         for place, field in self._kept:
             row[place] = self._values[field]
-        row[self._places["measurement"]] = np.asarray(measurement, dtype=float).ravel()
-        row[self._places["time"]] = time
+        for port, value in zip(self._ports, (measurement, time), strict=True):
+            row[self._places[port.name]] = self._flat(port, value)
         results, status = self._backend(row)
         self._values = np.append(results, status)
         self.status = NAMES[status]

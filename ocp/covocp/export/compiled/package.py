@@ -218,8 +218,9 @@ class CPackage:
 
         The arguments of a solver are numbers or arrays, by position or by name, and those that are left out are those
         of the export: `initial_<state>` for each state with a fixed initial value, `initial_<matrix>` for each matrix
-        with one (`initial_E` for the estimation covariance, whole, not as a half-vector), each parameter and each mean
-        of an unknown by its own name, `duration` where it may change, and `guess`, the `variables` of an earlier plan.
+        with one (`initial_E` for the estimation covariance, whole, not as a half-vector), each parameter (but not
+        those that only the start depends on: give the start) and each mean of an unknown by its own name, `duration`
+        where it may change, and `guess`, the `variables` of an earlier plan.
         The plan is a dict of arrays, with its "status". That of a problem with an expected cost is the nominal only:
         it has no gains and cannot be flown in closed loop by itself.
 

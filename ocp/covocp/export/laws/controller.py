@@ -30,10 +30,10 @@ from covocp.base.quadrature import GAUSS_NODES, gauss_step
 from covocp.blocks.updates import without
 from covocp.export.laws.design import Design, measured_blocks
 from covocp.export.laws.history import History, Nominal
-from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
+from covocp.export.laws.law import LARGEST, QUATERNION, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.trajectory import times
-from covocp.statement.statement import Statement, entry_names
+from covocp.statement.statement import Statement, entry_names, error_names
 
 # Up to this size linear systems are written out in scalars.
 SCALAR_SIZE = 8
@@ -59,6 +59,10 @@ ABOUT_INSTANTS = (
 ABOUT_FIRST = (
     "Something is read at time zero: give it to a first step at time zero, which corrects the estimate and the control "
     "by it. Before that step the time of the last one is -1.",
+)
+ABOUT_ATTITUDES = (
+    f"An attitude is {QUATERNION}; its three rows of the estimate are the rotation vector, in body axes, by which it "
+    "differs from the nominal."
 )
 
 
@@ -145,7 +149,8 @@ def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr,
 def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:
     """What is said of a law, with what is read at instants where something is."""
     read = ABOUT_INSTANTS if design.always < design.sizes[2] else ()
-    return (*own, *read, *(ABOUT_FIRST if design.reads_first else ()))
+    turns = (ABOUT_ATTITUDES,) if any(block.tangent for block in design.statement.states) else ()
+    return (*own, *read, *turns, *(ABOUT_FIRST if design.reads_first else ()))
 
 
 def finite(estimate: Expr, feedback: Expr) -> Any:
@@ -204,16 +209,19 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
 
 
 def with_units(statement: Statement, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of entries with the units of their symbols."""
+    """Names of entries, or of rows of an error, with the units of their symbols: of an attitude that of the error."""
     blocks = (*statement.blocks, *measured_blocks(statement))
-    units = {name: block.unit for block in blocks for name in entry_names((block,))}
+    units = {name: block.unit for block in blocks for name in (error_names if block.tangent else entry_names)((block,))}
     return tuple(f"{name} [{units[name]}]" if units.get(name) else name for name in names)
 
 
-def first_fields(design: Design, tables: History, fields: dict[str, Any], last: str) -> Array:
+def first_fields(
+    design: Design, tables: History, fields: dict[str, Any], last: str, gain: Array | None = None
+) -> Array:
     """First values of the fields: the filter at the mean, the nominal at time zero, its control within the limits.
 
-    Where something is read at time zero the field `last`, that of the last step, says that there was none.
+    Where something is read at time zero the field `last`, that of the last step, says that there was none. The gain is
+    that of the design, where another one is flown (m, n) that one.
     """
     m = design.sizes[1]
     zeros = {name: np.zeros(int(np.prod(value.shape))) for name, value in fields.items()}
@@ -225,7 +233,7 @@ def first_fields(design: Design, tables: History, fields: dict[str, Any], last: 
     }
     if design.reads_first:
         zeros[last] = np.array([NO_STEP])
-    zeros["feedback_gain"] = np.asarray(design.gain(x, u, e, 0.0)[0].full()).ravel()
+    zeros["feedback_gain"] = np.ravel(design.gain(x, u, e, 0.0)[0].full() if gain is None else gain)
     return np.concatenate(list(zeros.values()))
 
 

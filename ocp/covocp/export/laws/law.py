@@ -32,7 +32,8 @@ STATUSES = {
     "TIME_NOT_FINITE": "the time is NaN, infinite or beyond 1e30: values of the last valid time",
     "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
-    "NOT_CONVERGED": "the iterations ended before the conditions of a minimum held: the last iterate is returned",
+    "NOT_CONVERGED": "the iterations ended before the first-order conditions of a minimum held: the last iterate is "
+    "returned",
     "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
 }
@@ -40,6 +41,10 @@ CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the
 # controllers say; it is finite in single precision.
 LARGEST = 1e30
+# What the four numbers of an attitude are.
+QUATERNION = "a unit quaternion, scalar first"
+# An output of a controller that a step hands to its caller and does not keep.
+RETURNED = "returned"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,9 +102,11 @@ class Law:
         outputs: ports of the core; of a controller the fields of its struct, the control among them.
         statuses: names of what it may return.
         held: of a controller: input -> field of the struct where it is kept.
+        returned: of a controller: the output that a step hands to its caller; a field unless it is `RETURNED`.
         start: of a controller: first values of the fields, stacked.
         safe: of a solver: outputs where it fails, stacked.
         defaults: of a solver: inputs of the export, stacked.
+        instead: of a solver: parameters of the problem that are no arguments -> the arguments in their place.
         points: (random numbers, count) -> inputs at which C is compared with Python, a row for each.
         constants: numbers for the header, by name and unit: "DURATION [s]".
         notes: what the package says of the law where it is printed.
@@ -118,9 +125,11 @@ class Law:
     points: Points = field(repr=False)
     statuses: tuple[str, ...] = ("OK", "RESULT_NOT_FINITE", "FAILED")
     held: Mapping[str, str] = field(default_factory=dict)
+    returned: str = "control"
     start: Array = field(default_factory=lambda: np.zeros(0))
     safe: Array = field(default_factory=lambda: np.zeros(0))
     defaults: Array = field(default_factory=lambda: np.zeros(0))
+    instead: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     most: int = 100_000
@@ -153,6 +162,11 @@ class Law:
         """Outputs without the status."""
         return self.outputs if self.kind == "function" else self.outputs[:-1]
 
+    @property
+    def fields(self) -> tuple[Port, ...]:
+        """Outputs that a struct keeps."""
+        return tuple(port for port in self.outputs if port.name != RETURNED)
+
     def values(self, rows: Array) -> Array:
         """Outputs of the core, a row for each row of inputs; steps that ask to be continued are continued."""
         result = self._once(rows)
@@ -172,8 +186,7 @@ class Law:
         """Outputs of one call of the core."""
         if self.kind == "solver":
             return np.array([self._solved(row) for row in rows])
-        columns: Any = self.core.map(rows.shape[0])(*split_columns(rows, self.inputs))
-        columns = columns if isinstance(columns, tuple) else (columns,)
+        columns: Any = self.core.map(rows.shape[0]).call(split_columns(rows, self.inputs))  # a list, without inputs too
         return np.vstack([np.asarray(column.full()) for column in columns]).T
 
     def _solved(self, row: Array) -> Array:

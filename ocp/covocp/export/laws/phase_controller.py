@@ -26,7 +26,7 @@ from covocp.base.short_repr import short_repr
 from covocp.export.laws.controller import ABOUT, HELD, STATUSES, about, first_fields, points, stepped, with_units
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, clock
-from covocp.export.laws.law import Law, Port, flat, span, status_of
+from covocp.export.laws.law import RETURNED, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import limit_constants, limits_notes, limits_text
 from covocp.solution.phases import PhasesSolution
 from covocp.statement.statement import entry_names
@@ -38,6 +38,9 @@ ABOUT_PHASES = (
     "of the phase that ends and returns the control of the one that begins. A step across takes the measurement of the "
     "later phase, for the time since it began; until then the controls of the same name are held, the others those "
     "that the nominal of the later phase begins with.",
+    "A time that is not valid does not lead out of the phase: the control returned is then the nominal one of the "
+    "phase at that time or, outside of it, at its nearer end. Time, phase, estimate and control of the struct stay, "
+    "so the next step computes what it would have computed without this one.",
 )
 FIELDS = ("estimate", "control", "nominal_state", "nominal_control", "feedback_gain", "filter_gain")
 
@@ -149,6 +152,26 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         tolerance: largest relative deviation.
     """
     room = _room(legs)
+    return Law(
+        name="step",
+        kind="controller",
+        about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
+        notes=_notes(legs),
+        constants=_constants(legs),
+        core=_core(legs, room, duration, margin),
+        inputs=_inputs(legs, room),
+        outputs=_outputs(legs, room),
+        statuses=STATUSES,
+        held=HELD,
+        returned=RETURNED,
+        start=_first(legs[0], room),
+        points=lambda random, count: _points(legs, room, duration, random, count),
+        tolerance=tolerance,
+    )
+
+
+def _core(legs: tuple[Leg, ...], room: _Room, duration: float, margin: float) -> ca.Function:
+    """(estimate, last, held, measurement, time) -> fields, control that is handed out, status."""
     y, last, held = ca.MX.sym("estimate", room.n), ca.MX.sym("last"), ca.MX.sym("held", room.m)
     measured, time = ca.MX.sym("measurement", room.r), ca.MX.sym("time")
     starts = [leg.start for leg in legs]
@@ -159,6 +182,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
     backwards = asked < last
     valid = ca.if_else(backwards, 0.0, now.within)
     before, after = (sum((t >= start for start in starts[1:]), ca.MX(0)) for t in (last, asked))
+    after = ca.if_else(valid, after, before)  # a time that is not valid must not lead out of the phase
     begun = ca.MX(ca.DM(starts))
     meets = ca.logic_and(asked == begun[after], before < after)
     at = ca.if_else(ca.logic_and(valid, before < after), 0.0, last - begun[before])
@@ -174,7 +198,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
     steps = [_step(leg, room) for leg in legs]
     which: Any = ca.Function.conditional("which", steps[:-1], steps[-1])
     inside = ca.fmin(ca.fmax(asked - begun[after], 0.0), ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])
-    at = ca.fmin(at, ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])  # where the time is in a phase before
+    at = ca.fmin(at, ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])  # of a struct that was never set
     *fields, fine, unread = which(after, own, at, kept, ca.if_else(meets, np.nan, measured), inside, valid)
     found = dict(zip(FIELDS, fields, strict=True))
     good = ca.logic_and(good, fine)
@@ -184,23 +208,10 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         *now.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
         (missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
-    outputs = [ca.if_else(valid, asked, last), after, *found.values(), status_of(conditions)]
-    core = ca.Function("step", [y, last, held, measured, time], outputs)
-    return Law(
-        name="step",
-        kind="controller",
-        about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
-        notes=_notes(legs),
-        constants=_constants(legs),
-        core=core,
-        inputs=_inputs(legs, room),
-        outputs=_outputs(legs, room),
-        statuses=STATUSES,
-        held=HELD,
-        start=_first(legs[0], room),
-        points=lambda random, count: _points(legs, room, duration, random, count),
-        tolerance=tolerance,
-    )
+    given = found["control"]  # kept where the time is valid: the next step must not depend on one that is not
+    found["control"] = ca.if_else(valid, given, held)
+    outputs = [ca.if_else(valid, asked, last), after, *found.values(), given, status_of(conditions)]
+    return ca.Function("step", [y, last, held, measured, time], outputs)
 
 
 def _room(legs: tuple[Leg, ...]) -> _Room:
@@ -291,7 +302,10 @@ def _outputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
             "of the deviation of the state (and of unknown constants) from the nominal",
             _entries([(leg.name, _named(leg, leg.design.labels)) for leg in legs]),
         ),
-        "control": ("given out by the last step and held since; overwrite it where another one was applied", controls),
+        "control": (
+            "given out by the last step at a valid time and held since; overwrite it where another one was applied",
+            controls,
+        ),
         "nominal_state": (
             "the nominal at that time",
             _entries([(leg.name, _named(leg, leg.design.statement.state_names)) for leg in legs]),
@@ -308,6 +322,7 @@ def _outputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
         Port(name="time", unit="s", about="of the last step"),
         Port(name="phase", about=f"that this time is in: {listed}", whole=True),
         *fields,
+        Port(name=RETURNED, rows=room.m),
         Port(name="status", about="of the last step", whole=True),
     )
 
@@ -347,7 +362,7 @@ def _first(leg: Leg, room: _Room) -> Array:
         whole[:rows, :columns] = values[offset : offset + rows * columns].reshape(rows, columns)
         offset += rows * columns
         parts.append(whole.ravel())
-    return np.concatenate([*parts, np.zeros(1)])
+    return np.concatenate([*parts, parts[1 + FIELDS.index("control")], np.zeros(1)])
 
 
 def _points(legs: tuple[Leg, ...], room: _Room, duration: float, random: np.random.Generator, count: int) -> Array:

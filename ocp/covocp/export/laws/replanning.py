@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +13,12 @@ from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, pack, pack_symbolic, unpack
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.law import Port
+from covocp.export.laws.law import QUATERNION, Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
-from covocp.problem.declarations import Declarations, Free, Matrix
-from covocp.problem.expected_cost import statement_of
+from covocp.problem.decisions import matters
+from covocp.problem.declarations import Declarations, Free, Matrix, Parameter, State
+from covocp.problem.expected_cost import derive, statement_of
 from covocp.problem.restart import Start, restartable
 from covocp.statement.statement import Statement
 
@@ -34,6 +36,7 @@ class Argument:
         value: default, in the shape of the port, flat row by row.
         deviation: how far it may be moved to try the solver, of the same shape.
         symmetric: whether the parameter is the half-vector of the matrix, not its columns one below the other.
+        attitude: of the initial quaternion of an attitude, its rows among the initial states; None of all else.
     """
 
     port: Port
@@ -41,6 +44,7 @@ class Argument:
     value: Array
     deviation: Array
     symmetric: bool = False
+    attitude: slice | None = None
 
     __repr__ = short_repr
 
@@ -53,11 +57,15 @@ class Replannable:
         statement: with initial values as parameters, the duration a variable where it is an argument.
         fixed: the same with the fixed duration: what a reference is solved for.
         entries: arguments of the solver.
+        replaced: parameters that are no arguments, as nothing but the start depends on them, with their values.
+        instead: arguments in their place, by the name of such a parameter.
     """
 
     statement: Statement
     fixed: Problem
     entries: tuple[Argument, ...]
+    replaced: Mapping[str, Array]
+    instead: Mapping[str, str]
 
     __repr__ = short_repr
 
@@ -67,7 +75,8 @@ def replannable(problem: Problem) -> Replannable:
 
     Fixed initial values of states become "initial_<state>", initial matrices "initial_<matrix>" (that of the estimation
     covariance too), a fixed duration "duration", unless something depends on the time explicitly. Free initial values,
-    a free duration and decisions are chosen anew by each plan.
+    a free duration and decisions are chosen anew by each plan. Parameters that only such a start depends on are no
+    arguments: in C every argument is given, so the start is, and they would do nothing.
     """
     statement, own = problem.statement(), problem.declarations
     if own.sampled:
@@ -79,9 +88,15 @@ def replannable(problem: Problem) -> Replannable:
         )
     taken = {"workspace", "guess", "variables", "cost", "time", "status", "infeasibility", "stationarity"}
     found = restartable(own, statement)
-    own, entries = found.declarations, [_argument(start, taken) for start in found.starts]
+    entries = [_argument(start, taken, own.parameters) for start in found.starts]
+    own = found.declarations
+    instead = _instead(own, found.starts, [entry.port.name for entry in entries])
+    replaced = {}
     for block in (*statement.of_kind("parameter"), *statement.of_kind("unknown")):
         rows, columns = statement.matrix_parameters.get(block.name, (block.size, 1))
+        if block.name in instead:
+            replaced[block.name] = statement.values[block.span]
+            continue
         value = statement.values[block.span].reshape(rows, columns, order="F").ravel()
         about = "parameter" if block.kind == "parameter" else "mean of the unknown"
         about = f"{about} '{block.name}'" + (f", {rows} by {columns}, row by row" if columns > 1 else "")
@@ -95,7 +110,36 @@ def replannable(problem: Problem) -> Replannable:
         moving = replace(own, free_duration=free, duration=ca.MX.sym("duration"))
         port = Port(name="duration", unit="s", about="from now to the end")
         entries.append(Argument(port=port, parameter="", value=np.array([T]), deviation=np.array([0.02 * T])))
-    return Replannable(statement=statement_of(moving), fixed=Problem.of(own), entries=tuple(entries))
+    return Replannable(
+        statement=statement_of(moving),
+        fixed=Problem.of(own),
+        entries=tuple(entries),
+        replaced=replaced,
+        instead=instead,
+    )
+
+
+def _instead(own: Declarations, starts: tuple[Start, ...], ports: list[str]) -> dict[str, str]:
+    """Parameters that mattered for the start alone, which is an argument now, and the arguments in their place."""
+    places = {
+        entry.name: [port for start, port in zip(starts, ports, strict=True) if _follows(start, entry)]
+        for entry in own.parameters
+    }
+    if not any(places.values()):
+        return {}
+    derived = own if own.expected is None else derive(own)
+    values = [c.chance.expression for c in derived.constraints if c.chance is not None]
+    rest = ca.veccat(*values, *(state.target for state in derived.states if state.target is not None))
+    return {
+        entry.name: ", ".join(places[entry.name])
+        for entry in own.parameters
+        if places[entry.name] and not matters(derived, entry.symbol) and not ca.depends_on(rest, entry.symbol)
+    }
+
+
+def _follows(start: Start, entry: Parameter) -> bool:
+    """Whether an initial value was declared in terms of a parameter."""
+    return start.of.initial is not None and ca.depends_on(ca.MX(start.of.initial), entry.symbol)
 
 
 def _timed(problem: Declarations) -> bool:
@@ -105,31 +149,53 @@ def _timed(problem: Declarations) -> bool:
     return any(ca.depends_on(expression, problem.time) for expression in expressions)
 
 
-def _argument(start: Start, taken: set[str]) -> Argument:
+def _argument(start: Start, taken: set[str], parameters: tuple[Parameter, ...]) -> Argument:
     """An initial value as an argument of the solver."""
+    given = [f"'{entry.name}'" for entry in parameters if _follows(start, entry)]
+    instead = f", in place of what {' and '.join(given)} would give" if given else ""
     entry, known = start.of, list(start.known)
     name = identifier(start.parameter, taken)
     if isinstance(entry, Matrix):
         value = unpack(start.value, entry.size)
-        about = f"initial value of the matrix '{entry.name}', rows {', '.join(entry.labels)}"
+        about = f"initial value of the matrix '{entry.name}', rows {', '.join(entry.labels)}{instead}"
         port = Port(name=name, rows=entry.size, columns=entry.size, unit=entry.unit, about=about)
         none = np.zeros(value.size)
         return Argument(port=port, parameter=start.parameter, value=value.ravel(), deviation=none, symmetric=True)
+    if entry.chart is not None:
+        about = f"initial attitude of '{entry.name}', {QUATERNION}{instead}"
+        deviation = np.full(entry.size, max(0.05 * float(_deviations(entry).max()), 0.005))  # half the angle
+        port = Port(name=name, rows=entry.size, about=about)
+        return Argument(
+            port=port, parameter=start.parameter, value=start.value, deviation=deviation, attitude=start.place
+        )
     about = f"initial value of '{entry.name}'"
     about += "" if len(known) == entry.size else f", its entries {', '.join(map(str, known))}"
-    deviation = np.zeros(len(known))
-    if entry.variance.is_constant():
-        deviation = 0.1 * np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(entry.variance).full())), 0.0))[known]
-    deviation = np.maximum(deviation, 0.005 * np.abs(start.value))
+    about += instead
+    deviation = np.maximum(0.1 * _deviations(entry)[known], 0.005 * np.abs(start.value))
     port = Port(name=name, rows=len(known), unit=entry.unit, about=about)
     return Argument(port=port, parameter=start.parameter, value=start.value, deviation=deviation)
 
 
-def stacked(entries: tuple[Argument, ...], values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
+def _deviations(entry: State) -> Array:
+    """Standard deviations of an initial value, of its tangent where it is no vector; zero where they are no numbers."""
+    if not entry.variance.is_constant():
+        return np.zeros(entry.size)
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(np.asarray(ca.evalf(entry.variance).full())), 0.0)))
+
+
+def unit_quaternion(value: Expr, near: Expr) -> Any:
+    """A quaternion of unit length; of q and -q, the same attitude, the one that is nearer to another quaternion."""
+    return ca.if_else(ca.dot(value, near) < 0, -value, value) / ca.norm_2(value)
+
+
+def stacked(made: Replannable, values: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
     """The parameters of a statement from the arguments, in the order of their names, as it has matrices."""
-    by_parameter = {entry.parameter: entry for entry in entries}
+    by_parameter, replaced = {entry.parameter: entry for entry in made.entries}, made.replaced
     result = []
     for name in names:
+        if name in replaced:
+            result.append(replaced[name])
+            continue
         entry = by_parameter[name]
         value = values[entry.port.name]
         rows, columns = entry.port.rows, entry.port.columns

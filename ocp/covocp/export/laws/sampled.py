@@ -156,7 +156,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         outputs=field_ports(design, fields),
         statuses=STATUSES,
         held=HELD,
-        start=first_fields(design, tables, fields, "index"),
+        start=first_fields(design, tables, fields, "index", samples.parts["C"][0]),
         points=lambda random, count: _points(design, tables, samples, random, count),
         tolerance=tolerance,
     )

@@ -1,7 +1,7 @@
 """The solver of a problem as a law: initial state, parameters and a guess in, a plan out.
 
 The transcription is that of every shooting method, its NLP solver one of CasADi's that has C code. The status is not
-the solver's own opinion: it follows from the conditions of a minimum at what it returns.
+the solver's own opinion: it follows from the first-order conditions of a minimum at what it returns.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
-from covocp.export.laws.law import CODES, LARGEST, Law, Port, flat, span
+from covocp.export.laws.law import CODES, LARGEST, QUATERNION, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
-from covocp.export.laws.replanning import Replannable, replannable, stacked
+from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
 from covocp.export.text.names import identifier
 from covocp.passage.written import Tape
 from covocp.problem.builder import Problem
@@ -58,8 +58,9 @@ RESIDUALS = ("infeasibility", "stationarity")
 STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
 ABOUT = (
     "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
-    "the plan, its cost, and how well the conditions of a minimum hold (in the solver's units). Where it fails, or an "
-    "argument is not finite, the plan made at the export is returned, and the status says so.",
+    "the plan, its cost, and how well the first-order conditions of a minimum hold (in the solver's units). A saddle "
+    "fulfils them too: start from a plan, not from a symmetric guess such as zero. Where it fails, or an argument is "
+    "not finite, the plan made at the export is returned, and the status says so.",
 )
 # What is said of a problem with an expected cost: its plan is no controller.
 NOMINAL = (
@@ -282,7 +283,12 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
         ) from error
     symbols = {entry.port.name: ca.MX.sym(entry.port.name, entry.port.size) for entry in entries}
     guess = ca.MX.sym("guess", nlp.w.shape[0])
-    p = ca.vertcat(ca.MX(0, 1), *stacked(entries, symbols, task.names))
+    turned = {  # from the quaternion, not its opposite, that the guess begins with
+        entry.port.name: unit_quaternion(symbols[entry.port.name], guess[entry.attitude])
+        for entry in entries
+        if entry.attitude is not None
+    }
+    p = ca.vertcat(ca.MX(0, 1), *stacked(task.made, symbols | turned, task.names))
     bounds = _bounds(task, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
     given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
@@ -320,6 +326,7 @@ def _law(task: _Task, method: str, settings: dict[str, Any]) -> Law:
         inputs=ports,
         outputs=made.results,
         statuses=STATUSES,
+        instead=task.made.instead,
         safe=safe,
         defaults=default,
         points=lambda random, count: _points(task, default, random, count),
@@ -354,7 +361,9 @@ def _results(
                 results.append((port, source[block.span, 0]))
                 continue
             about = f"{what} '{block.name}', a row for each {_where(what, nlp)}"
-            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=block.unit, about=about)
+            about += f": {QUATERNION}" if block.tangent else ""
+            unit = "" if block.tangent else block.unit  # that of its rotation vector
+            port = Port(name=name, rows=int(source.shape[1]), columns=block.size, unit=unit, about=about)
             results.append((port, source[block.span, :].T))
     for n, (v, about) in last.items():  # of residuals, how far they are below what counts as met is rounding
         least = 1.0 if n in RESIDUALS else 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack_symbolic
 from covocp.export.laws.history import History, Nominal, time_status
-from covocp.export.laws.law import Law, Port, flat
+from covocp.export.laws.law import QUATERNION, Law, Port, flat
 from covocp.export.text.names import identifier
 from covocp.solution.solution import Solution
 from covocp.statement.statement import Block
@@ -77,7 +77,9 @@ def block_port(block: Block, taken: set[str]) -> Port:
         return Port(
             name=identifier(block.name, taken), rows=block.size, columns=block.size, unit=block.unit, about=about
         )
-    return Port(name=identifier(block.name, taken), rows=block.size, unit=block.unit, about=f"{about} '{block.name}'")
+    about = f"{about} '{block.name}'" + (f", {QUATERNION}" if block.tangent else "")
+    unit = "" if block.tangent else block.unit  # that of its rotation vector
+    return Port(name=identifier(block.name, taken), rows=block.size, unit=unit, about=about)
 
 
 def _value(block: Block, nominal: Given) -> Any:

@@ -71,7 +71,7 @@ def signature(package: str, law: Law) -> str:
 
 def _declared(package: str, law: Law, generated: Generated) -> str:
     """Sizes, type and prototype of a law."""
-    ports = {port.name: port for port in (*law.inputs, *law.outputs)}
+    ports = {port.name: port for port in (*law.inputs, *law.fields)}
     defined = []
     for name, constants in size_names(package, law).items():
         for text, number in zip(constants, (ports[name].rows, ports[name].columns), strict=False):
@@ -123,7 +123,7 @@ def _explained(package: str, law: Law, alone: bool) -> list[str]:
 def _fields(package: str, law: Law) -> str:
     """The struct of a sample or a controller."""
     names, lines = size_names(package, law), []
-    for port in law.outputs:
+    for port in law.fields:
         kind = "int" if port.whole else f"{package}_real"
         dimensions = "".join(f"[{name}]" for name in names.get(port.name, ()))
         about = described(port).replace(", row by row", "")

@@ -67,7 +67,7 @@ def size_names(package: str, law: Law) -> dict[str, tuple[str, ...]]:
     """Constants of the sizes of the ports of a law, by name: rows, or rows and columns; different in capitals too."""
     taken: set[str] = set()
     names: dict[str, tuple[str, ...]] = {}
-    for port in (*law.inputs, *law.outputs):
+    for port in (*law.inputs, *law.fields):
         if port.scalar or port.name in names:
             continue
         base, number = constant(package, law.name, port.name), 2

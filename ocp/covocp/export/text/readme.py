@@ -149,7 +149,7 @@ def _function(name: str, law: Law) -> str:
     """Signature, meaning, arguments, results."""
     lines = [f"### `{name}_{law.name}`", f"```c\n{signature(name, law)};\n```", "\n\n".join(law.about)]
     listed = [(port, "argument") for port in law.arguments]
-    listed += [(port, "field" if law.kind in ("sample", "controller") else "result") for port in law.outputs]
+    listed += [(port, "field" if law.kind in ("sample", "controller") else "result") for port in law.fields]
     rows = [f"| `{port.name}` | {role} | {described(port) or '-'} |" for port, role in listed if port.name != "status"]
     lines.append("| name | | what it is |\n|---|---|---|\n" + "\n".join(rows))
     if law.kind == "controller":

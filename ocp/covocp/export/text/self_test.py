@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from covocp.base.errors import ExportError
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.law import CODES, Law, Port, span, stacked_size
+from covocp.export.laws.law import CODES, RETURNED, Law, Port, span, stacked_size
 from covocp.export.text.header import struct_name
 from covocp.export.text.numbers import code, row, table, wrapped
 
@@ -17,6 +18,8 @@ from covocp.export.text.numbers import code, row, table, wrapped
 FLOORS = {"double": 1e-3, "single": 1.0}
 SEED = 1971
 POINTS = 40
+# Points of functions that are not random, at which some of them fail.
+EDGES = 4
 MAIN = """\
 static volatile {real} sink_;
 
@@ -128,12 +131,11 @@ def reference(law: Law, count: int, seed: int, precision: str) -> Reference:
         count: number of points.
         seed: of the random ones.
         precision: inputs are rounded to it.
+
+    Raises:
+        ExportError: a function that cannot be evaluated at most of its points.
     """
-    rows = law.points(np.random.default_rng(seed), min(count, law.most))
-    if precision == "single":
-        with np.errstate(over="ignore"):
-            rows = rows.astype(np.float32).astype(float)
-    values = law.values(rows)
+    rows, values = _evaluated(law, min(count, law.most), seed, precision)
     if law.kind == "function":
         broken = ~np.isfinite(values).all(axis=1)
         status = np.where(broken, CODES["RESULT_NOT_FINITE"], CODES["OK"])
@@ -143,6 +145,44 @@ def reference(law: Law, count: int, seed: int, precision: str) -> Reference:
     least = np.repeat([port.least for port in law.results], [port.size for port in law.results])
     smallest = np.maximum(FLOORS[precision] * np.median(finite, axis=0), least)
     return Reference(rows=rows, values=values, status=status.astype(int), smallest=smallest)
+
+
+def _evaluated(law: Law, count: int, seed: int, precision: str) -> tuple[Array, Array]:
+    """Points and the values there; of a function without those where it fails, as where a matrix has no inverse."""
+    rows = _points(law, count, seed, precision)
+    try:
+        return rows, law.values(rows)
+    except RuntimeError as error:
+        if law.kind != "function":
+            raise
+        reason = str(error).strip().splitlines()[-1]
+    rows = _points(law, 2 * count + EDGES, seed, precision)
+    known = [(row, values) for row in rows if (values := _value(law, row)) is not None]
+    if len(known) < count:
+        raise ExportError(
+            f"The function '{law.name}' cannot be evaluated at most points at which C is to be compared with it.",
+            expected=f"{count} of {len(rows)} points between the ranges, or of normal numbers, where it has a value",
+            received=f"{len(known)}; at the others: {reason}"[:200],
+            remedy="give ranges= of its inputs within which it has values: no singular matrices",
+        )
+    return np.array([row for row, _ in known[:count]]), np.array([values for _, values in known[:count]])
+
+
+def _points(law: Law, count: int, seed: int, precision: str) -> Array:
+    """Points as a machine of this precision has them."""
+    rows = law.points(np.random.default_rng(seed), count)
+    if precision == "single":
+        with np.errstate(over="ignore"):
+            rows = rows.astype(np.float32).astype(float)
+    return rows
+
+
+def _value(law: Law, row: Array) -> Array | None:
+    """What a law returns at one point; None where it fails."""
+    try:
+        return np.asarray(law.values(row[None, :])[0])
+    except RuntimeError:
+        return None
 
 
 def self_test(package: str, laws: tuple[Law, ...], precision: str, tolerance: float | None = None) -> str:
@@ -194,7 +234,7 @@ def _data(package: str, law: Law, known: Reference) -> str:
     status = "{" + ", ".join(str(s) for s in known.status) + "}"
     return "\n".join(
         [
-            table(f"{name}_in", known.rows, real),
+            table(f"{name}_in", known.rows if known.rows.shape[1] else np.zeros((len(known.rows), 1)), real),
             table(f"{name}_out", known.values, real),
             f"static const int {name}_status[{known.status.size}] =\n{wrapped(status)};",
             f"static const double {name}_smallest[{known.smallest.size}] =\n{wrapped(row(known.smallest))};",
@@ -215,7 +255,8 @@ def _call(package: str, law: Law) -> str:
     lines: list[str] = []
     function = f"{package}_{law.name}"
     if law.kind == "function":
-        lines = [f"return {function}({', '.join([*arguments, *results])});"]
+        lines = [] if arguments else ["(void)in;"]
+        lines += [f"return {function}({', '.join([*arguments, *results])});"]
     elif law.kind == "solver":
         lines = [f"static {struct_name(package, law)} workspace;"]
         lines.append(f"return {function}({', '.join(['&workspace', *arguments, *results])});")
@@ -251,6 +292,8 @@ def _size(law: Law, name: str) -> int:
 
 def _flat_copy(port: Port, owner: str, law: Law) -> str:
     offset = span(law.results, port.name).start
+    if port.name == RETURNED:
+        return f"memcpy(out + {offset}, control, sizeof(control));"
     if port.scalar:
         return f"out[{offset}] = {owner}.{port.name};"
     return f"memcpy(out + {offset}, {owner}.{port.name}, sizeof({owner}.{port.name}));"

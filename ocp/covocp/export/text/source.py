@@ -5,7 +5,7 @@ from __future__ import annotations
 from textwrap import indent
 
 from covocp.base.matrices import Array
-from covocp.export.laws.law import Law, Port, span
+from covocp.export.laws.law import RETURNED, Law, Port, span
 from covocp.export.text.casadi_code import Sizes, core_name
 from covocp.export.text.header import signature, struct_name
 from covocp.export.text.numbers import code, row, table
@@ -41,7 +41,7 @@ def source(package: str, laws: tuple[Law, ...], sizes: dict[str, Sizes]) -> str:
 def _work(package: str, sizes: Sizes, *, arrays: bool = True) -> list[str]:
     """Declarations of the work arrays."""
     real = f"{package}_real"
-    lines = [f"const {real} *arg_[{sizes.arguments}];", f"{real} *res_[{sizes.results}];"]
+    lines = [f"const {real} *arg_[{max(sizes.arguments, 1)}];", f"{real} *res_[{sizes.results}];"]
     if arrays:
         lines += [f"int iw_[{sizes.integers + 1}];", f"{real} w_[{sizes.reals + 1}];"]
     return lines
@@ -106,12 +106,14 @@ def _controller(package: str, law: Law, sizes: Sizes) -> str:
     """The struct before a step in, the one after it out."""
     kind = struct_name(package, law)
     whole = {port.name for port in law.results if port.whole}
+    ports = {port.name: port for port in law.fields}
     lines = [f"{kind} next_;", *_work(package, sizes), f"{package}_real status_;"]
     lines += [f"{package}_real {name}_after_;" for name in sorted(whole)]
     lines += [f"{package}_real {name}_before_;" for name in sorted(whole & set(law.held.values()))]
+    own = law.returned == RETURNED  # through an array, as the caller's may be that of an argument
+    lines += [f"{package}_real {RETURNED}_[{ports['control'].size}];"] if own else []
     lines.append("do {")
     inner = []
-    ports = {port.name: port for port in law.outputs}
     for i, port in enumerate(law.inputs):
         kept = law.held.get(port.name)
         if kept in whole:
@@ -120,6 +122,7 @@ def _controller(package: str, law: Law, sizes: Sizes) -> str:
             inner.append(f"arg_[{i}] = {_address(ports[kept], 'self->') if kept else _address(port)};")
     for i, port in enumerate(law.results):
         target = f"&{port.name}_after_" if port.name in whole else _address(port, "next_.")
+        target = f"{RETURNED}_" if port.name == RETURNED else target
         inner.append(f"res_[{i}] = {target};")
     inner.append(f"res_[{len(law.results)}] = &status_;")
     inner += [f"if ({_called(package, law)}) {{", f"    self->status = {code(package, 'FAILED')};", "    break;", "}"]
@@ -128,7 +131,12 @@ def _controller(package: str, law: Law, sizes: Sizes) -> str:
     lines += [f"    {line}" for line in inner]
     lines += ["} while (self->status < 0);"]
     control = ports["control"]
-    lines.append(_copied(control, f"({_address(control, 'self->')})"))
+    kept = _copied(control, f"({_address(control, 'self->')})")
+    if own:
+        failed = f"if (self->status == {code(package, 'FAILED')}) {{"
+        lines += [failed, f"    {kept}", "} else {", f"    {_copied(control, f'{RETURNED}_')}", "}"]
+    else:
+        lines.append(kept)
     lines.append("return self->status;")
     step = f"{signature(package, law)}\n{{\n{_body(lines)}\n}}"
     begin = f"    static const {kind} start_ = {{\n        {_initial(law)}\n    }};\n    *self = start_;"
@@ -138,7 +146,7 @@ def _controller(package: str, law: Law, sizes: Sizes) -> str:
 def _initial(law: Law) -> str:
     """First values of the fields, nested as the struct is."""
     fields = []
-    for port in law.outputs:
+    for port in law.fields:
         values = law.start[span(law.outputs, port.name)]
         if port.whole:
             fields.append(str(int(values[0])))
