@@ -205,8 +205,6 @@ def test_a_model_that_is_singular_at_its_start_is_refused_by_name(what):
     inertia = ca.vertcat(ca.horzcat(x[0], 0.0), ca.horzcat(0.0, 1.0))
     ocp.dynamics(x, ca.solve(inertia, ca.vertcat(u, x[0]), "qr"))
     ocp.minimize(running=u**2)
-    with pytest.raises(
-        co.ProblemError, match=r"(?s)'arm' cannot be evaluated where it starts.*\[0. 0.\].*other initial"
-    ) as error:
+    with pytest.raises(co.ProblemError, match=r"(?s)'arm' cannot be evaluated.*\[0. 0.\].*other initial") as error:
         what(ocp)
     assert isinstance(error.value.__cause__, RuntimeError)
