@@ -81,6 +81,10 @@ class Engine:
         """How the last call ended."""
         return self._stats
 
+    def forget(self) -> None:
+        """Begin the next run without what was learnt."""
+        self._memory = None
+
     @property
     def functions(self) -> AtPoint:
         """Of the program."""

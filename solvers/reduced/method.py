@@ -140,8 +140,11 @@ class ReducedRuns(Runs):
         return None if engine is None else engine.functions
 
     def _tighten(self, found: Residuals) -> None:
-        """All by the tolerance: nothing here is compared with one."""
+        """All by the tolerance: nothing here is compared with one. What led to no step at all is not asked again."""
         self._strictness *= share_for(found.worst / LIMIT)
+        engine = self._solvers.get(False)
+        if isinstance(engine, Engine) and engine.stats()["iter_count"] == 0:
+            engine.forget()
 
     def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
         """The Hessian has a magnitude of its own."""

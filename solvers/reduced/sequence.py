@@ -41,6 +41,8 @@ ABOVE = 1.5
 ROUNDOFF = 1e-13
 # Largest step of a scaled variable, in multiples of its unit or of itself.
 LONGEST = 10.0
+# What a step closes of gaps, as a multiple of what it moves, above which it tells nothing of the curvature.
+CLOSING = 1.0
 # Largest violation at the end, in the units of the rows.
 FEASIBLE = 1e-8
 # Price of the violations that an eased subproblem leaves, in multiples of what they cost by their multipliers.
@@ -166,9 +168,7 @@ class Sequence:
                     curvature, fresh = self._first(place), True
                     continue
                 return self._ended(place, rows, (lam_x, lam_g), Status.NO_PROGRESS, iterations, None)
-            change = (following.w - place.w)[self._layout.chosen]
-            difference = self._difference(place, following, rows, lam_g)
-            curvature, fresh = learnt(curvature, change, difference), False
+            curvature, fresh = self._learnt(curvature, place, following, rows, lam_g), False
             place, iterations = following, iterations + 1
             rows = self._condensed(place)
 
@@ -270,6 +270,21 @@ class Sequence:
     def _inside(self, w: Array) -> Array:
         """A point within the bounds: roundoff alone takes it out of them."""
         return np.asarray(np.clip(w, self._bounds.lbx, self._bounds.ubx))
+
+    def _learnt(
+        self, curvature: Curvature, place: Place, following: Place, rows: Subproblem, lam_g: Array
+    ) -> Curvature:
+        """What a step tells of the Hessian: nothing where it closes gaps more than it moves what is chosen.
+
+        The slope then changes by the gaps: a step of 1e-7 beside a start that moved by 1e-4 shows curvatures of 1e6.
+        """
+        whole = following.w - place.w
+        change = whole[self._layout.chosen]
+        moved_by = (rows.follows[:, :, :-1] @ change).ravel()
+        closed = whole[self._layout.given] - moved_by
+        if np.linalg.norm(closed) > CLOSING * np.hypot(np.linalg.norm(change), np.linalg.norm(moved_by)):
+            return curvature
+        return learnt(curvature, change, self._difference(place, following, rows, lam_g))
 
     def _difference(self, place: Place, following: Place, rows: Subproblem, lam_g: Array) -> Array:
         """Change of the slope of the Lagrangian, in the chosen variables."""

@@ -239,3 +239,21 @@ def test_long_valleys_are_followed_to_their_end():
     assert solution.cost == pytest.approx(true_cost(drawn, solution, rtol=1e-7), rel=max(1e-6, 2 * solution.mesh_error))
     assert solution.optimality.stationarity <= 1e-4
     assert solution.optimality.curvature > 0
+
+
+def test_starts_that_move_a_little_do_not_spoil_what_was_learnt():
+    """A loop that plans again: the steps that close the gaps of a new start say nothing of the curvature."""
+    ocp = co.Problem(2.0, name="pendulum")
+    a, w = ocp.state("a", initial=0.3), ocp.state("w", initial=0.0)
+    u = ocp.control("u", lower=-3.0, upper=3.0)
+    ocp.dynamics(a, w)
+    ocp.dynamics(w, 1.962 * ca.sin(a) + u - 0.1 * w)
+    ocp.minimize(running=a**2 + 0.1 * w**2 + 0.05 * u**2)
+    solver, other = (co.Solver(ocp, method, intervals=40) for method in ("reduced", "ipopt"))
+    plan = solver.solve(progress=False)
+    for k in range(14):
+        start = {a: 0.3 + 1e-4 * (k % 7)}
+        plan = solver.solve(initial=start, guess=plan, progress=False, assess=False)
+        assert plan.stats["iterations"] <= 12
+        cost = other.solve(initial=start, progress=False, assess=False).cost
+        assert plan.cost == pytest.approx(cost, rel=1e-9)
