@@ -37,7 +37,7 @@ from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
-from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse
+from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse, left_open
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.decisions import bent_data, far_away
@@ -387,12 +387,12 @@ class Solver:
             return solution
         try:
             if self._classical is None:
-                names = [field.name for field in fields(Options) if field.name != "refine"]
-                mesh = {name: getattr(self._options, name) for name in names}
-                self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+                self._classical = self._classical_on(self._options)
             with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
                 classical, missing = self._classical._solve_values(given)
+                if left_open(solution, classical):
+                    classical = self._on_equal_steps(classical, given)
         except KeyboardInterrupt:
             message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
             raise Interrupted(message, solution=solution) from None
@@ -413,6 +413,19 @@ class Solver:
                 f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
             )
         return _noted(solution, **Classical(cost=classical).counts)
+
+    def _classical_on(self, options: Options) -> Solver:
+        """What finds the classical design on the mesh of some options."""
+        mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
+        return Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+
+    def _on_equal_steps(self, classical: float, values: Array) -> float:
+        """Cost of the classical design with the steps of the combined one, where that is more: they are compared so."""
+        options = with_substeps(self._options, self._prepared.mesh, self._prepared.mesh.substeps)
+        if options.substeps == self._options.substeps:
+            return classical
+        cost, missing = self._classical_on(options)._solve_values(values)
+        return classical if missing else max(classical, cost)
 
     def _continued(self, solution: Solution, values: Array) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
