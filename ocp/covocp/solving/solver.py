@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -72,6 +73,8 @@ SUSPICIOUS_GAIN = 0.5
 # Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
+# Times of the runs of a solution [s], and of what else was waited for: runs that lead to its start, what is looked at.
+RUN_SECONDS, OTHER_SECONDS = ("build_seconds", "solve_seconds"), "other_seconds"
 # Rows of a covariance from which on a look at the steps along the guess is cheaper than a run that is made again.
 LARGE = 16
 
@@ -113,6 +116,7 @@ class Solver:
         **options: Any,
     ) -> None:
         """Build the statement and make the method ready."""
+        begin = time.perf_counter()
         check_method(method)
         check_problem(problem)
         self._prepare = partial(made_ready, method)
@@ -169,6 +173,7 @@ class Solver:
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options, self.statement)
+        self._ready = time.perf_counter() - begin  # [s], told with the first solution
 
     @checked(
         progress=truth,
@@ -244,6 +249,7 @@ class Solver:
                 time_limit=time_limit,
                 iteration_limit=iteration_limit,
             )
+        begin = time.perf_counter()
         check_multistart(guess, starts, seed)
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
@@ -277,9 +283,15 @@ class Solver:
             outcome = with_gain_told(self._problem, outcome, first)
             if reporter.spent and not outcome.converged:
                 outcome = replace(outcome, message=f"stopped at {reporter.spent}")
-                return self._finish(outcome, allow_failure=True, assess=assess)
+                return self._timed(self._finish(outcome, allow_failure=True, assess=assess), begin)
             solution = self._finish(outcome, allow_failure, assess)
-            return self._beside_classical(solution, values) if assess else solution
+            return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
+
+    def _timed(self, solution: Solution, begin: float) -> Solution:
+        """The solution with the time that was waited for it beside that of its own runs: for others, and in looking."""
+        waited, self._ready = time.perf_counter() - begin + self._ready, 0.0
+        told = sum(float(solution.stats.get(name, 0.0)) for name in RUN_SECONDS)
+        return _noted(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress) -> Solution | None:
         """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
