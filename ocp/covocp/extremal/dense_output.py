@@ -26,6 +26,7 @@ from covocp.extremal.nodes import rates_along
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.mesh import SAME_NODE
 from covocp.transcription.steps import joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
@@ -36,8 +37,9 @@ OF_SIZE, ROUNDOFF = 1e-6, 1e-11
 # Share of what its rate would move it by in a step by which an entry that is the same at all nodes is thought to move,
 # and by how much less it moves between them to be the same.
 OF_MOVE, SAME_AT_NODES = 1e-3, 1e-12
-# A step grows and shrinks by no more than these factors, and never below the share of its interval.
-GROW, SHRINK, SMALLEST = 4.0, 0.1, 1e-9
+# A step grows and shrinks by no more than these factors, and never below this share of what is before it in its
+# interval; the first, where a filter that begins with a large variance is fastest, never below the last share.
+GROW, SHRINK, SMALLEST, FIRST = 4.0, 0.1, 1e-9, 1e-22
 MOST_ROUNDS = 500
 # The next step is this share of the longest that seems possible; errors below the second count as it.
 SAFETY, TINY = 0.8, 1e-9
@@ -45,7 +47,7 @@ SAFETY, TINY = 0.8, 1e-9
 CHUNKS = (1, 4, 16, 64, 256, 1024)
 # Points inside a piece at which a covariance is looked at.
 LOOKS = 7
-# Knots closer than this share of their interval are one.
+# Knots closer than this share of what is before them in their interval, or of it before its end, are one.
 SAME = 1e-10
 
 
@@ -182,7 +184,8 @@ class _Steps:
         values = coarse.values[:, rows]
         step = np.diff(coarse.knots)[:, None] / extremal.mesh.substeps
         moved = np.abs(step * coarse.first[:, rows]).max(axis=0)
-        still = np.ptp(values, axis=0) <= SAME_AT_NODES * moved
+        still, pairs = np.ptp(values, axis=0) <= SAME_AT_NODES * moved, _variances(st, rows)
+        still &= ~_varying(values, pairs)
         moved = np.where(still, OF_MOVE * moved, 0.0)
         size = np.maximum(np.abs(values).max(axis=0), moved)
         ends = (values[1:], values[:-1]) if backward else (values[:-1], values[1:])
@@ -195,7 +198,7 @@ class _Steps:
             goal=ends[1],
             seen=np.array([values.min(axis=0), np.maximum(values.max(axis=0), values.min(axis=0) + moved)]),
             size=np.where(size > 0, size, 1.0),
-            pairs=_variances(st, rows),
+            pairs=pairs,
         )
 
     @property
@@ -343,6 +346,16 @@ def _read(steps: _Steps, k: Expr) -> _Pieces:
     return _Pieces(k=k, c=zero, d=zero + 1.0, low=steps.start[k], high=steps.goal[k], first=still, last=still)
 
 
+def _varying(values: Array, pairs: Any) -> Any:
+    """Entries of covariances that differ from node to node by more than roundoff, (rows,).
+
+    A filter that begins with a large variance and an accurate sensor has rates beside which any change seems none.
+    """
+    largest = np.abs(values).max(axis=0)
+    deviations = np.sqrt(largest[pairs[0]]) * np.sqrt(largest[pairs[1]])
+    return (pairs[0] >= 0) & (np.ptp(values, axis=0) > OF_SIZE * largest) & (largest > ROUNDOFF * deviations)
+
+
 def _march(steps: _Steps) -> Dense:
     """All intervals from their start to their end by steps of their own lengths; one that is lost is left cubic."""
     n = steps.extremal.mesh.intervals
@@ -356,7 +369,7 @@ def _march(steps: _Steps) -> Dense:
         k, at = active, c[active]
         to = np.where(h[k] >= 1.0 - at, 1.0, at + h[k])
         tried, error, after = _step(steps, k, (at, to), z[k], slope[k])
-        last_try = to - at <= SMALLEST
+        last_try = to - at <= np.maximum(SMALLEST * at, FIRST)
         lost, good = last_try & np.isinf(error), (error <= 1.0) | (last_try & np.isfinite(error))
         h[k] = (to - at) * np.clip(SAFETY * np.maximum(error, TINY) ** -0.25, SHRINK, GROW)
         kept = k[good]
@@ -480,9 +493,11 @@ def _union(nodes: Array, groups: list[Array]) -> Array:
     """The knots of all, without those that differ by roundoff from a node or from the one before."""
     inside = distinct(*groups)
     k = np.clip(np.searchsorted(nodes, inside) - 1, 0, nodes.size - 2)
-    near = SAME * np.diff(nodes)[k]
-    inside = inside[(inside - nodes[k] > near) & (nodes[k + 1] - inside > near)]
-    apart = np.diff(inside, prepend=-1.0) > SAME * _lengths(np.diff(nodes)).min()
+    length = np.diff(nodes)[k]
+    known = np.maximum(SAME**2 * length, SAME_NODE * nodes[k])
+    kept = (inside - nodes[k] > known) & (nodes[k + 1] - inside > SAME * length)
+    inside, passed = inside[kept], (inside - nodes[k])[kept]
+    apart = np.diff(inside, prepend=-1.0) > SAME * passed
     return np.sort(np.concatenate([nodes, inside[apart]]))
 
 

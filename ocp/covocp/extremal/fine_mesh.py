@@ -94,3 +94,20 @@ def refined(extremal: Extremal) -> Extremal:
         duration=t.duration,
     )
     return replace(extremal, mesh=fine, trajectory=trajectory, multipliers=multipliers)
+
+
+def halved(extremal: Extremal) -> Extremal:
+    """The same extremal with the middles of the intervals as nodes, its steps those of the mesh where their ends are.
+
+    Args:
+        extremal: on a mesh whose limits are imposed at its nodes.
+    """
+    st, mesh, m = extremal.statement, extremal.mesh, extremal.multipliers
+    paired = 2 if st.running_uses_matrices else 1  # of Simpson's rule
+    substeps = mesh.substeps if mesh.substeps % (2 * paired) == 0 else 2 * mesh.substeps
+    nothing = replace(
+        m,
+        inside_path=np.zeros((mesh.intervals, 1, m.path.shape[1])),
+        inside_states=np.zeros((mesh.intervals, 1, st.nx)),
+    )
+    return refined(replace(extremal, mesh=replace(mesh, points=2, substeps=substeps), multipliers=nothing))

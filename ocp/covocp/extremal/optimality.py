@@ -9,22 +9,23 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.expressions import Expr, slopes_by
+from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, stacked, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.closed_loop import ClosedLoop
+from covocp.extremal.control_error import absolute_cost, estimate_control_error
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
-from covocp.extremal.fine_mesh import fine_trajectory, prolongation, refined
+from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
 from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
-from covocp.statement.interval import model_symbols, repeated
+from covocp.statement.interval import model_symbols
 from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
@@ -38,10 +39,6 @@ TOUCHED = 1e-4
 LARGE_SLOPE = 1e-5
 # Costs below this count as zero.
 NO_COST = 1e-12
-# Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
-QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
-# Weights of the integral over [0, 1] of a value at 0, 1/2 and 1.
-SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +63,8 @@ class Optimality:
         mesh_error: relative change of the cost by halving the integration steps.
         node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
             relative to its range.
-        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; None
+            also where implicit steps pass a nominal so stiff that H is not known pointwise, and H_uu is not positive.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
@@ -150,7 +148,7 @@ def assess(
         others = 0.0 if within is None else within.size
         whole = free[:-1] & free[1:]
         bounded = ~whole & ~(beside[:-1] | beside[1:])
-        control_error = _control_error(extremal, costates, (whole, bounded), others)
+        control_error = estimate_control_error(extremal, (whole, bounded), others)
     return Optimality(
         stationarity=_stationarity(extremal, residual, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
         control_slope=control_slope,
@@ -176,7 +174,7 @@ def _stationarity(extremal: Extremal, residual: Array, scale: float, others: flo
         return value
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
     changed = np.abs(residual).max(axis=0) * units * extremal.trajectory.duration
-    cost = VANISHING * (_absolute_cost(extremal) + others)
+    cost = VANISHING * (absolute_cost(extremal) + others)
     return min(value, float(changed.max()) / max(cost, np.finfo(float).tiny))
 
 
@@ -212,7 +210,7 @@ def complementarity(extremal: Extremal, others: float = 0.0) -> float:
     for weights, values, lower, upper in groups:
         kept, distance = complementary(weights, values, lower, upper)
         total += float(np.sum(np.abs(kept) * distance))
-    return total / max(_absolute_cost(extremal) + others, NO_COST)
+    return total / max(absolute_cost(extremal) + others, NO_COST)
 
 
 def identities(
@@ -251,10 +249,6 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
         "cross_covariance": float(cross.max(initial=0.0)),
         "conservation": loop.conservation,
     }
-
-
-# A truth value for each control of each interval.
-Mask = NDArray[np.bool_]
 
 
 class _AtNodes(NamedTuple):
@@ -304,80 +298,6 @@ def _limit_slopes(extremal: Extremal) -> Array:
     if mesh.control == "constant":
         result[-1] += values[-1]
     return mesh.gathered(result)
-
-
-def _control_error(extremal: Extremal, costates: Costates, kinds: tuple[Mask, Mask], others: float) -> float:
-    """Relative cost of the piecewise form of the control: 1/2 int H_u H_uu^-1 H_u dt.
-
-    H_u is a quadratic polynomial through its values at both ends and in the middle of an interval. Controls at a bound
-    somewhere in it count with what the Hamiltonian, quadratic in each of them, can fall between the bounds, by
-    Simpson's rule. Intervals in which H_uu is not positive definite count with what the Hamiltonian is above its value
-    with the control of one of their ends, by the same rule.
-
-    `kinds`: of the controls in each interval, (N, nu): free in all of it; at a bound somewhere. Others do not count.
-    """
-    points = extremal.mesh.points
-    if points > 1:  # costates jump inside the intervals
-        fine = refined(extremal)
-        inside = [np.repeat(kind, points, axis=0) for kind in kinds]
-        return _control_error(fine, discrete_costates(fine)[0], (inside[0], inside[1]), others)
-    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
-    values = fine_trajectory(extremal, 2 * mesh.substeps)
-    h = np.diff(extremal.time)[:, None]
-    after, rates = np.hstack([costates.state, costates.matrices]), _costate_rates(extremal, costates)
-    middle = 0.5 * (after[1:] + after[:-1]) + h / 8 * (rates[:-1] - rates[1:])
-    u = extremal.controls
-    ends = u[:-1] if mesh.control == "constant" else u[1:]
-    function = hamiltonian(st)("point", lambda v, x, w, e, t: [v, ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
-    slopes, curvatures, above, held_back = [], [], np.zeros((3, n)), np.zeros((3, n))
-    (free, bounded), (lower, upper) = kinds, st.control_bounds
-    for j, costate in enumerate((after[:-1], middle, after[1:])):
-        z = values[:, j * mesh.substeps, :]
-        arguments = (
-            z[:, : st.nx].T,
-            (u[:-1] + j / 2 * (ends - u[:-1])).T,
-            z[:, st.nx :].T,
-            extremal.time[None, :-1] + j / 2 * h.T,
-            *repeated(extremal.trajectory.duration, extremal.parameters, n),
-            costate[:, : st.nx].T,
-            costate[:, st.nx :].T,
-        )
-        value, slope, curvature = (stacked(v, n) for v in function(*arguments))
-        held = [stacked(function(arguments[0], w.T, *arguments[2:])[0], n) for w in (u[:-1], ends)]
-        above[j] = (value - np.minimum(np.minimum(*held), value)).ravel()
-        fall = _fall(arguments[1].T, slope[:, :, 0], curvature, lower, upper)
-        held_back[j] = np.where(bounded, fall, 0.0).sum(axis=1)
-        slopes.append(np.where(free, slope[:, :, 0], 0.0))
-        curvatures.append(curvature)
-    definite = np.asarray((np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0))
-    curvature = np.where(definite[:, None, None], curvatures[1], np.eye(st.nu))
-    steps = np.linalg.solve(curvature, np.array(slopes)[..., None])[..., 0]
-    gained = 0.5 * np.einsum("jk,jni,kni->n", QUADRATIC_PRODUCTS, slopes, steps)
-    total = h[:, 0] @ np.where(definite, gained + SIMPSON @ held_back, SIMPSON @ above)
-    return float(total / max(_absolute_cost(extremal) + others, np.finfo(float).tiny))
-
-
-def _fall(u: Array, slope: Array, curvature: Array, lower: Array, upper: Array) -> Array:
-    """What a function with these slopes and curvatures, (n, nu, nu), falls where entries of u move within bounds."""
-    bend = np.diagonal(curvature, axis1=1, axis2=2)
-    bend = np.where(bend > 0, bend, 1.0)
-    move = np.clip(u - slope / bend, lower, upper) - u
-    return np.asarray(np.maximum(-(slope * move + bend / 2 * move**2), 0.0))
-
-
-def _absolute_cost(extremal: Extremal) -> float:
-    """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
-    st, t = extremal.statement, extremal.trajectory
-    terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    running = np.asarray(st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())[2].full()).ravel()
-    return abs(terminal) + abs(float(np.trapezoid(running, extremal.time)))
-
-
-def _costate_rates(extremal: Extremal, costates: Costates) -> Array:
-    """-H_x and -H_e at the nodes, stacked."""
-    make = hamiltonian(extremal.statement)
-    function = make("rates", lambda h, x, u, e, t: [-slope for slope in slopes_by(h, (x, e))])
-    return np.hstack(along(function, extremal, costates))
 
 
 def _costate_difference(extremal: Extremal, costates: Costates) -> float | None:

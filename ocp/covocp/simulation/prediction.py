@@ -12,16 +12,19 @@ contain what another mean does, so its part of d, which stands in the mean of d 
 
 Where something is read at an instant y jumps by K (Ha d - (H + (hau - hu) C) y + ha - h + v).
 
-Where the truth is the design, the covariance of d is E + Xhat of (A-31 .. 33) and that of y - d is E.
+Where the truth is the design, the covariance of d is E + Xhat of (A-31 .. 33) and that of y - d is E. It is d and y - d
+that are integrated: the difference of a large d and a y that follows it would be roundoff.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -43,8 +46,13 @@ from covocp.solution.solution import Solution
 
 # Length of a step times the fastest rate: classical Runge-Kutta then errs by less than 1e-6.
 STEP_PER_RATE = 0.1
-# Steps of the prediction within one interval of the base grid, at most.
+# Steps of the prediction within one interval of the base grid, at most; where they would be more, and at one end the
+# rate is less by this factor, the interval is halved, down to pieces of so few steps: a filter that begins with a large
+# variance and an accurate sensor is faster there by orders of magnitude, and only there.
 MOST_PARTS = 2000
+# Length of a step times the fastest rate up to which classical Runge-Kutta is used: it is stable up to 2.78.
+STABLE = 2.0
+STEEP, FEW_PARTS = 2.0, 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +104,7 @@ class Prediction:
 def predict(
     solution: Solution, design: System, actual: System, grid: Grid, start: tuple[Array, Array] | None = None
 ) -> Prediction:
-    """Integrate mean and covariance along the nominal by classical Runge-Kutta steps.
+    """Integrate mean and covariance along the nominal by classical Runge-Kutta steps, implicit where few can be.
 
     Args:
         solution: whose nominal, filter and feedback are used.
@@ -109,7 +117,12 @@ def predict(
     n = design.size
     joint = _joint(design, actual)
     rates, step_rates = _fastest_rates(solution, joint, grid, actual, n)
-    fine = grid.divided(np.minimum(grid.parts(STEP_PER_RATE / np.maximum(rates, 1e-300)), MOST_PARTS))
+    fine, resolved = _graded(
+        grid, rates, lambda t, interval: _fastest(_evaluate(solution, joint, t, interval, actual, n)[0])
+    )
+    parts = fine.parts(STEP_PER_RATE / np.maximum(resolved, 1e-300), MOST_PARTS)
+    fine = fine.divided(parts)
+    stiff = fine.h * np.repeat(resolved, parts) > STABLE
     kept = {int(k) for k in indices(fine, grid.t)}
     jumps = _jumps(solution, design, actual, fine)
     sides = [_evaluate(solution, joint, fine.t[:-1] + c * fine.h, fine.interval, actual, n) for c in (0.0, 0.5, 1.0)]
@@ -118,6 +131,9 @@ def predict(
     covariance[:n, :n] = actual.variance
     if start is not None:
         mean, covariance = start
+    unit, none = np.eye(n), np.zeros((n, n))
+    to_error, from_error = (np.block([[unit, none], [sign * unit, unit]]) for sign in (-1.0, 1.0))
+    mean, covariance = to_error @ mean, to_error @ covariance @ to_error.T
     means, covariances = [mean], [covariance]
     with np.errstate(over="ignore", invalid="ignore"):  # gains that the mesh does not resolve: the verdict says it
         for k, h in enumerate(fine.h.tolist()):
@@ -125,11 +141,13 @@ def predict(
                 transition, noise, offset = jumps[k]
                 mean, covariance = transition @ mean + offset, transition @ covariance @ transition.T + noise
             else:
-                mean, covariance = _step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
+                step = _implicit_step if stiff[k] else _step
+                mean, covariance = step(mean, covariance, h, [tuple(part[k] for part in side) for side in sides])
             if k + 1 in kept:
                 means.append(mean)
                 covariances.append(covariance)
-    return Prediction(mean=np.array(means), covariance=np.array(covariances), rates=rates, step_rates=step_rates)
+        means_of, covariances_of = np.array(means) @ from_error.T, from_error @ np.array(covariances) @ from_error.T
+    return Prediction(mean=means_of, covariance=covariances_of, rates=rates, step_rates=step_rates)
 
 
 def control_spread(solution: Solution, design: System, prediction: Prediction, nominal: Nominal) -> Array:
@@ -143,7 +161,7 @@ def control_spread(solution: Solution, design: System, prediction: Prediction, n
 
 
 def _joint(design: System, actual: System) -> ca.Function:
-    """(design's six arguments, parameters of the truth) -> drift (2n, 2n), noise (2n, 2n), offset (2n,)."""
+    """(design's six arguments, parameters of the truth) -> drift, noise (2n, 2n), offset (2n,) of (d, y - d)."""
     st, other = design.statement, actual.statement
     symbolic: Any = ca.SX if st.symbolic is ca.SX and other.symbolic is ca.SX else ca.MX
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np, other.np)
@@ -153,11 +171,13 @@ def _joint(design: System, actual: System) -> ca.Function:
     f, F, G, Q, h, M, Hu, U = actual.model(x[: other.nx], u[: other.nu], t, T, q)
     C, K = c["C"], c["K"]
     rate = design.model(x, u, t, T, p).rate
-    own = c["F"] - K @ c["M"] - (c["G"] - K @ c["Hu"]) @ C
-    drift = ca.blockcat([[F, -G @ C], [K @ M, own - K @ Hu @ C]])
-    noise = ca.diagcat(Q, K @ U @ K.T)
+    other_control = ((G - c["G"]) + K @ (c["Hu"] - Hu)) @ C
+    wrong = K @ (M - c["M"]) + (c["F"] - F) + other_control
+    drift = ca.blockcat([[F - G @ C, -G @ C], [wrong, c["F"] - K @ c["M"] + other_control]])
+    noise = ca.blockcat([[Q, -Q], [-Q, Q + K @ U @ K.T]])
     known = ca.DM(np.concatenate([np.zeros(design.states), design.error(actual.start)[design.states :]]))
-    offset = ca.vertcat(f - rate - F @ known, K @ (h - c["h"] - M @ known))
+    moved = f - rate - F @ known
+    offset = ca.vertcat(moved, K @ (h - c["h"] - M @ known) - moved)
     return ca.Function("joint", a, [ca.densify(value) for value in (drift, noise, offset)])
 
 
@@ -181,7 +201,7 @@ def _jumps(solution: Solution, design: System, actual: System, grid: Grid) -> di
 
 
 def _read_jump(design: System, actual: System) -> ca.Function:
-    """(x, u, coefficients, t, T, reading, parameters of the truth) -> transition, noise, offset of (d, y)."""
+    """(x, u, coefficients, t, T, reading, parameters of the truth) -> transition, noise, offset of (d, y - d)."""
     st, other, n = design.statement, actual.statement, design.size
     symbolic: Any = ca.SX if st.symbolic is ca.SX and other.symbolic is ca.SX else ca.MX
     chosen = coefficients(design, "perturbation")
@@ -196,7 +216,7 @@ def _read_jump(design: System, actual: System) -> ca.Function:
     share = ca.if_else(taken > 0, 1 / ca.sqrt(ca.fmax(taken, 1e-9)), 0)
     noise = K @ (ca.diag(share) @ own.R @ ca.diag(share)) @ K.T
     known = ca.DM(np.concatenate([np.zeros(design.states), design.error(actual.start)[design.states :]]))
-    transition = ca.blockcat([[unit, none], [K @ seen, unit - K @ expected]])
+    transition = ca.blockcat([[unit, none], [K @ (seen - expected), unit - K @ expected]])
     offset = ca.vertcat(symbolic.zeros(n), K @ (own.h - c["hr"] - seen @ known))
     values = [ca.densify(v) for v in (transition, ca.blockcat([[none, none], [none, noise]]), offset)]
     return ca.Function("read_jump", a, values)
@@ -225,6 +245,13 @@ def _step(mean: Array, covariance: Array, h: float, sides: list[tuple[Array, ...
     return after[:, 0], after[:, 1:]
 
 
+def _implicit_step(mean: Array, covariance: Array, h: float, sides: list[tuple[Array, ...]]) -> tuple[Array, Array]:
+    """One implicit Euler step of the same: what is much faster than it has died away at its end."""
+    drift, noise, offset = sides[-1]
+    moves = np.linalg.inv(np.eye(mean.size) - h * drift)
+    return moves @ (mean + h * offset), moves @ (covariance + h * noise) @ moves.T
+
+
 def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: System, n: int) -> tuple[Array, Array]:
     """`Prediction.rates` and `Prediction.step_rates` of each step of a grid, (N,)."""
     sides = [_evaluate(solution, joint, t, grid.interval, actual, n)[0] for t in (grid.t[:-1], grid.t[1:])]
@@ -237,8 +264,36 @@ def _fastest_rates(solution: Solution, joint: ca.Function, grid: Grid, actual: S
         )
     whole = [_fastest(side) for side in sides]
     # With an estimate that is right the deviation goes by F - G C.
-    plant = [_fastest(matrix) for side in sides for matrix in (side[:, :n, :n], side[:, :n, :n] + side[:, :n, n:])]
+    plant = [_fastest(matrix) for side in sides for matrix in (side[:, :n, :n], side[:, :n, :n] - side[:, :n, n:])]
     return np.maximum(*whole), np.max([*plant, np.minimum(*whole)], axis=0)
+
+
+def _graded(grid: Grid, rates: Array, fastest: Callable[[Array, Given], Array]) -> tuple[Grid, Array]:
+    """Steps that are halved towards where the rate is highest, and the fastest rate in each.
+
+    Args:
+        grid: whose steps are halved.
+        rates: fastest rate in each of them [1/s].
+        fastest: (times, interval of the mesh of each) -> the rate there.
+    """
+    steep: NDArray[np.bool_] = grid.h * rates > STEP_PER_RATE * MOST_PARTS
+    before, after = rates.copy(), rates.copy()
+    chosen = np.flatnonzero(steep)
+    if chosen.size:
+        before[chosen], after[chosen] = (fastest(t[chosen], grid.interval[chosen]) for t in (grid.t[:-1], grid.t[1:]))
+    while True:
+        most, middle = np.maximum(before, after), grid.t[:-1] + 0.5 * grid.h
+        inside = (grid.t[:-1] < middle) & (middle < grid.t[1:])
+        uneven = most > STEEP * np.minimum(before, after)
+        split = steep & inside & uneven & (grid.h * most > STEP_PER_RATE * FEW_PARTS)
+        if not split.any():
+            return grid, most
+        found = fastest(middle[split], grid.interval[split])
+        counts = 1 + split
+        first = np.flatnonzero(split) + np.arange(found.size)  # of each pair of halves
+        grid, steep = grid.divided(counts), np.repeat(steep, counts)
+        before, after = np.repeat(before, counts), np.repeat(after, counts)
+        after[first], before[first + 1] = found, found
 
 
 def _fastest(matrices: Array) -> Array:

@@ -64,15 +64,21 @@ class Grid:
         share = self.share[step] / counts[step]
         return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step], share=share)
 
-    def parts(self, length: Given) -> Any:
-        """Into how many parts each step must be divided so that none is longer than `length`."""
+    def parts(self, length: Given, most: int | None = None) -> Any:
+        """Into how many parts each step must be divided so that none is longer than `length`; into `most` at most.
+
+        Raises:
+            ProblemError: without `most`, too many in all.
+        """
         needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
+        if most is not None:
+            return np.fmin(needed, most).astype(int)
         if not float(np.sum(needed)) <= MOST_STEPS:
             raise ProblemError(
                 "The simulation would need too many steps.",
                 expected=f"at most {MOST_STEPS:.0e} steps a run",
                 received=f"{float(np.sum(needed)):.1e} steps of {float(np.min(length)):.2g} s",
-                remedy="correct the truth if it moves too fast, or give a longer step=",
+                remedy="give a longer step=, or leave it out",
             )
         return needed.astype(int)
 

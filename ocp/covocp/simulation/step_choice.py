@@ -16,7 +16,7 @@ from covocp.base.short_repr import short_repr
 from covocp.simulation.batches import Batch, Cloud, run_batch
 from covocp.simulation.plan import make_plan
 from covocp.simulation.run_parts import Setting
-from covocp.simulation.schedule import WHOLE, Grid
+from covocp.simulation.schedule import Grid
 
 # First step times the fastest rate of filter, loop and plant: Heun's method then errs by 1 % of a variance.
 STEP_PER_RATE = 0.2
@@ -82,7 +82,7 @@ def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
         step: [s].
         rates: fastest rate in each of them [1/s].
     """
-    parts, needed = base.parts(step), np.ceil(base.h * rates / STABLE - WHOLE).astype(int)
+    parts, needed = base.parts(step), base.parts(STABLE / np.maximum(rates, np.finfo(float).tiny), MOST_STEPS + 1)
     shortened = bool((needed > parts).any())
     parts = np.minimum(np.maximum(parts, needed), np.maximum(parts, MOST_STEPS // base.steps))
     return StepChoice(grid=base.divided(parts), change=np.nan, settled=True, given=True, shortened=shortened)
@@ -130,8 +130,8 @@ def choose_step(
     Raises:
         StoppedError: when `stop` said so.
     """
-    parts = base.parts(STEP_PER_RATE / np.maximum(rates, np.finfo(float).tiny))
     most = max(1, MOST_STEPS // base.steps)
+    parts = base.parts(STEP_PER_RATE / np.maximum(rates, np.finfo(float).tiny), most + 1)
     unresolved = bool((parts > most).any())
     parts = np.minimum(parts, most)
     change = np.inf

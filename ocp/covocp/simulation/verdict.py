@@ -22,11 +22,17 @@ LEFT = 100.0
 NOTICEABLE = 0.01
 # Share by which deviations as flown may differ from those that the solution promises: of quadratures, not of gains.
 AS_PROMISED = 0.1
+# Share of the largest predicted deviation of a component on the way below which it is known exactly at the end: what is
+# left is of the steps of nominal and runs.
+EXACT = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Component:
-    """One component at the end: predicted standard deviation, that of the sample with its band, the bias."""
+    """One component at the end: predicted standard deviation, that of the sample with its band, the bias.
+
+    exact: standard deviations up to this are zero.
+    """
 
     name: str
     predicted: float
@@ -35,12 +41,13 @@ class Component:
     high: float
     bias: float
     robust: float
+    exact: float = 0.0
 
     @property
     def inside(self) -> bool:
         """Whether the prediction is inside the band of the sample."""
-        if self.sample == 0.0:
-            return self.predicted == 0.0
+        if self.sample <= self.exact:
+            return self.predicted <= self.exact
         return self.low <= self.predicted <= self.high
 
     @property
@@ -131,7 +138,7 @@ class Verdict:
             text = f"{self.headline}: " + "; ".join(self._because(reason) for reason in self.reasons) + "."
         missed = [entry for entry in self.errors if not entry.inside]
         if self.fed_back and missed:
-            ratios = ", ".join(f"{entry.name} {entry.ratio:.3g}" for entry in missed)
+            ratios = ", ".join(_compared(entry) for entry in missed)
             text += f" The errors of the filter are not the predicted ones (sample over prediction: {ratios})."
         return text
 
@@ -179,9 +186,11 @@ def judge(sample: MonteCarlo) -> Verdict:
     answered = np.isinf(sample.unanswered)
     unstable = ((distance & (reference > 0)).any(axis=1) | ~stayed) & answered
     numbers = predicted if sample.fed_back else errors
+    largest = np.nan_to_num(standard_deviations(sample.predicted), nan=0.0, posinf=0.0).max(axis=0)
+    exact = EXACT * largest
     return Verdict(
-        deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level),
-        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level)
+        deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level, exact),
+        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level, exact)
         if sample.estimated
         else (),
         left=sample.left_share,
@@ -199,7 +208,7 @@ def judge(sample: MonteCarlo) -> Verdict:
 
 
 def _entries(
-    names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float
+    names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float, exact: Array
 ) -> tuple[Component, ...]:
     """The components of some terminal values, (R, rows)."""
     inside = values[stayed]
@@ -218,9 +227,17 @@ def _entries(
                 high=float(np.sqrt(high)),
                 bias=float(column.mean()) if column.size else np.nan,
                 robust=float(robust_deviation(values[:, i : i + 1])[0]),
+                exact=float(exact[i]),
             )
         )
     return tuple(result)
+
+
+def _compared(entry: Component) -> str:
+    """Sample over prediction, or both where nothing is predicted."""
+    if entry.predicted > 0:
+        return f"{entry.name} {entry.ratio:.3g}"
+    return f"{entry.name} {entry.sample:.3g} over {entry.predicted:.3g}"
 
 
 def _number(value: float) -> str:

@@ -27,6 +27,9 @@ UNSTABLE = (
 ROUNDOFF = 1e-10
 # Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
 WORSE = 1e-6
+# Multiple of the error of the mesh up to which an excess may be that of unequal steps: around a given nominal they are
+# shorter, and the error is an estimate of the combined design's own.
+STEPS = 10.0
 
 
 def drift(x: Array, run: Extremal) -> float:
@@ -39,6 +42,12 @@ def drift(x: Array, run: Extremal) -> float:
 def is_worse(solution: Solution, classical: float) -> bool:
     """Whether a combined design costs more than the classical one, by more than the mesh leaves open."""
     return bool(solution.cost - classical > (WORSE + solution.mesh_error) * abs(classical))
+
+
+def left_open(solution: Solution, classical: float) -> bool:
+    """Whether a combined design costs more than the classical one on shorter steps, by what these may explain."""
+    excess = solution.cost - classical
+    return is_worse(solution, classical) and bool(excess <= (WORSE + STEPS * solution.mesh_error) * abs(classical))
 
 
 def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -38,7 +39,7 @@ from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.automatic import is_suited
-from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse
+from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse, left_open
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.decisions import bent_data, far_away
@@ -75,6 +76,8 @@ SUSPICIOUS_GAIN = 0.5
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
 OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
+# Times of the runs of a solution [s], and of what else was waited for: runs that lead to its start, what is looked at.
+RUN_SECONDS, OTHER_SECONDS = ("build_seconds", "solve_seconds"), "other_seconds"
 # Rows of a covariance from which on a look at the steps along the guess is cheaper than a run that is made again.
 LARGE = 16
 
@@ -116,6 +119,7 @@ class Solver:
         **options: Any,
     ) -> None:
         """Build the statement and make the method ready."""
+        begin = time.perf_counter()
         check_method(method)
         check_problem(problem)
         self._prepare = partial(made_ready, method)
@@ -168,6 +172,7 @@ class Solver:
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
         mention_forgotten(problem)
         mention_lengths(self.statement.guesses, self._options, self.statement)
+        self._made_in = time.perf_counter() - begin  # [s], told with the first solution
 
     @checked(
         progress=truth,
@@ -243,6 +248,7 @@ class Solver:
                 time_limit=time_limit,
                 iteration_limit=iteration_limit,
             )
+        begin = time.perf_counter()
         check_multistart(guess, starts, seed)
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
         if self._remade:
@@ -278,9 +284,15 @@ class Solver:
             outcome = with_gain_told(self._problem, outcome, first)
             if reporter.spent and not outcome.converged:
                 outcome = replace(outcome, message=f"stopped at {reporter.spent}")
-                return self._finish(outcome, allow_failure=True, assess=assess)
+                return self._timed(self._finish(outcome, allow_failure=True, assess=assess), begin)
             solution = self._finish(outcome, allow_failure, assess)
-            return self._beside_classical(solution, values) if assess else solution
+            return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
+
+    def _timed(self, solution: Solution, begin: float) -> Solution:
+        """The solution with the time that was waited for it beside that of its own runs: for others, and in looking."""
+        waited, self._made_in = time.perf_counter() - begin + self._made_in, 0.0
+        told = sum(float(solution.stats.get(name, 0.0)) for name in RUN_SECONDS)
+        return _noted(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
 
     def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress) -> Solution | None:
         """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
@@ -413,12 +425,12 @@ class Solver:
             return solution
         try:
             if self._classical is None:
-                names = [field.name for field in fields(Options) if field.name != "refine"]
-                mesh = {name: getattr(self._options, name) for name in names}
-                self._classical = Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+                self._classical = self._classical_on(self._options)
             with without_warnings():  # they concern another solution
                 given = values[: self.statement.np]
                 classical, missing = self._classical._solve_values(given)
+                if left_open(solution, classical):
+                    classical = self._on_equal_steps(classical, given)
         except KeyboardInterrupt:
             message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
             raise Interrupted(message, solution=solution) from None
@@ -439,6 +451,19 @@ class Solver:
                 f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
             )
         return _noted(solution, **Classical(cost=classical).counts)
+
+    def _classical_on(self, options: Options) -> Solver:
+        """What finds the classical design on the mesh of some options."""
+        mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
+        return Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+
+    def _on_equal_steps(self, classical: float, values: Array) -> float:
+        """Cost of the classical design with the steps of the combined one, where that is more: they are compared so."""
+        options = with_substeps(self._options, self._prepared.mesh, self._prepared.mesh.substeps)
+        if options.substeps == self._options.substeps:
+            return classical
+        cost, missing = self._classical_on(options)._solve_values(values)
+        return classical if missing else max(classical, cost)
 
     def _continued(self, solution: Solution, values: Array) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""

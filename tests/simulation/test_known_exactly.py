@@ -1,0 +1,37 @@
+"""What is known exactly at the end is not compared: what is left of it is roundoff and the error of steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.simulation.verdict import Component
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.05])
+def test_an_error_that_has_died_out_is_no_failure_of_the_filter(lag):
+    """A fast state without noise: its error falls by e^(-10 / lag); "f nan" was told of what Heun's steps leave."""
+    ocp = co.Problem(10.0, name="fast actuator")
+    x, f = ocp.state("x", initial=1.0, final=0.0, variance=0.1), ocp.state("f", initial=0.0, variance=1e-2)
+    u = ocp.control("u")
+    ocp.dynamics(x, f, noise=0.01)
+    ocp.dynamics(f, (u - f) / lag)
+    ocp.measurement("position", x, noise=1e-2)
+    ocp.minimize_expected(running=u**2 + x**2, terminal_weight={x: 5.0})
+    runs = co.simulate(co.solve(ocp, progress=False), runs=500, seed=1, progress=False)
+    text = str(runs)
+    assert "nan" not in text
+    assert "OUTSIDE" not in text
+    assert "errors of the filter are not" not in text
+    known = runs.verdict.errors[1]
+    assert known.name == "f"
+    assert known.sample < 1e-6 * np.sqrt(1e-2)
+
+
+@pytest.mark.parametrize(("predicted", "sample", "inside"), [(0.0, 1e-3, False), (1e-3, 0.0, False), (0.0, 1e-9, True)])
+def test_more_than_the_error_of_steps_is_compared(predicted, sample, inside):
+    component = Component(
+        name="x", predicted=predicted, sample=sample, low=0.9 * sample, high=1.1 * sample, bias=0, robust=0, exact=1e-7
+    )
+    assert component.inside == inside
