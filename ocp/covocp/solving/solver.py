@@ -16,14 +16,12 @@ from covocp.base.errors import (
     CovocpError,
     Interrupted,
     ProblemError,
-    SolveError,
     evaluating,
     no_option,
     warn_user,
     without_warnings,
 )
 from covocp.base.expressions import Given
-from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time
@@ -42,17 +40,17 @@ from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse, left_open
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
-from covocp.solving.decisions import bent_data, far_away
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
+from covocp.solving.failure import failure
 from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
 from covocp.solving.methods import check_method, method_options
+from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.suited_steps import suits
-from covocp.solving.turns import unwound
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -62,11 +60,6 @@ from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, with_substeps
 from covocp.transcription.starts import own_start
 
-# A run that ends after so few iterations began at a stationary point, which need not be a minimum.
-SUSPICIOUS_ITERATIONS = 3
-# A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
-UNMOVED = 1e-6
-ESCAPES = (1.0, -1.0)
 # Arguments of `solve` beside the options of mesh and method.
 ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
 NOMINALS = ("combined", "deterministic")
@@ -273,8 +266,8 @@ class Solver:
                     if assess and guess is None and first is None:
                         self._look_at_steps(values)
                     outcome, start = self._from_start(values, guess, first, reporter)
-                    outcome = self._leave_saddle(outcome, values, reporter, start) if assess else outcome
-                outcome = self._unwound(outcome, values, reporter) if assess else outcome
+                    outcome = away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome
+                outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
@@ -499,41 +492,6 @@ class Solver:
         outcome: Outcome = best_of(self._prepared, values, guesses, starts + 1, reporter)
         return outcome
 
-    def _leave_saddle(self, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
-        """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it."""
-        iterations = outcome.stats.get("iterations", -1)
-        exact = outcome.stats.get("hessian") == "exact"
-        few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
-        before, after = start.trajectory.u, outcome.extremal.trajectory.u
-        stayed = before.size > 0 and bool(np.abs(after - before).max() <= UNMOVED * np.abs(before).max() + UNMOVED)
-        if not outcome.converged or not (few or stayed):
-            return outcome
-        curvature = later("extremal.curvature").smallest_curvature(outcome.extremal)
-        if curvature is None or curvature.verdict != "saddle":
-            return outcome
-        candidates = []
-        for sign in ESCAPES:
-            moved = curvature.displaced(outcome.extremal, sign)
-            displaced = make_guess(self._solved, self._prepared.mesh, values, moved)
-            candidates.append(self._prepared.solve(values, displaced, reporter))
-        better = [c for c in candidates if c.converged and cost_of(c) < cost_of(outcome)]
-        if not better:
-            return outcome
-        warn_user(
-            "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
-        )
-        return with_stats(min(better, key=cost_of), left_saddle=True)
-
-    def _unwound(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Solved again without the turns that angles make between nodes, where that is cheaper."""
-        straight = unwound(outcome.extremal) if outcome.converged and not reporter.stop else None
-        if straight is None:
-            return outcome
-        again = self._prepared.solve(values, Guess(trajectory=straight), reporter)
-        if not again.converged or not cost_of(again) < cost_of(outcome):
-            return outcome
-        return with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
-
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
         own = self._prepared.mesh
@@ -585,15 +543,7 @@ class Solver:
         if not outcome.converged:
             if allow_failure:
                 return solution
-            lines = [f"  {name}: {value:.6g}" for name, value in list(outcome.violations.items())[:10]]
-            violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
-            raise SolveError(
-                f"'{self.statement.name or 'The problem'}' was not solved by {self.method}: {outcome.message}."
-                f"{violated}{far_away(solution)}{bent_data(solution)}{self._other_way()}"
-                "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
-                solution=solution,
-                violations=outcome.violations,
-            )
+            raise failure(self.statement.name, self.method, outcome, solution, self._other_way())
         if assess:
             mention_doubts(solution)
             mention_limits(solution)

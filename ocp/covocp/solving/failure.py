@@ -1,0 +1,32 @@
+"""What is said of a run that did not converge."""
+
+from __future__ import annotations
+
+from covocp.base.errors import SolveError
+from covocp.extremal.extremal import Outcome
+from covocp.solution.solution import Solution
+from covocp.solving.decisions import bent_data, far_away
+
+# Violations that are named.
+NAMED = 10
+
+
+def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_way: str) -> SolveError:
+    """The error of a run that did not converge, with its last iterate.
+
+    Args:
+        name: of the problem.
+        method: that ran.
+        outcome: of the run.
+        solution: the last iterate.
+        other_way: a line about another method; empty: none.
+    """
+    lines = [f"  {row}: {value:.6g}" for row, value in list(outcome.violations.items())[:NAMED]]
+    violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
+    return SolveError(
+        f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
+        f"{violated}{far_away(solution)}{bent_data(solution)}{other_way}"
+        "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
+        solution=solution,
+        violations=outcome.violations,
+    )
