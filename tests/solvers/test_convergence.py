@@ -168,3 +168,24 @@ def test_a_run_that_stands_still_is_asked_for_more() -> None:
     solution = co.solve(ocp, progress=False)
     assert solution.optimality.stationarity is not None
     assert solution.optimality.stationarity < 1e-5
+
+
+@pytest.mark.parametrize("limit", [1e-2, 1e-3, 1e-4])
+def test_limits_of_small_variances_are_met_in_their_own_unit(limit: float) -> None:
+    """E <= limit and E/limit <= 1 are one condition: a limit of 1e-3 was met to 1e-5 of itself, and refused for it."""
+
+    def cost(unit: float) -> float:
+        ocp = co.Problem(10.0, name="learn gain")
+        x, v = ocp.state("x", initial=0.0, variance=0.01), ocp.state("v", initial=0.0, variance=0.01)
+        g, u = ocp.unknown("g", mean=1.0, variance=0.25), ocp.control("u")
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, g * u, noise=1e-4)
+        ocp.measurement("m", x, noise=1e-4)
+        E = ocp.estimation_covariance()
+        ocp.subject_to(E[g, g] / unit, upper=limit / unit, at="final", name="gain known")
+        ocp.minimize(running=u**2)
+        solution = co.solve(ocp, intervals=50, progress=False)
+        assert solution["E"][-1, 2, 2] <= limit * (1 + 1e-6)
+        return solution.cost
+
+    assert cost(1.0) == pytest.approx(cost(limit), rel=1e-5)

@@ -45,6 +45,8 @@ MOST_ROUNDS = 500
 SAFETY, TINY = 0.8, 1e-9
 # Columns that a mapped function takes at a time.
 CHUNKS = (1, 4, 16, 64, 256, 1024)
+# Such functions that are kept.
+MAPS = 32
 # Points inside a piece at which a covariance is looked at.
 LOOKS = 7
 # Knots closer than this share of what is before them in their interval, or of it before its end, are one.
@@ -309,9 +311,15 @@ def mapped(function: ca.Function, *columns: Array) -> list[Array]:
     while begin < count:
         chunk = next((size for size in CHUNKS if size >= count - begin), CHUNKS[-1])
         taken = np.minimum(np.arange(begin, begin + chunk), count - 1)
-        parts.append(Matrices(function.map(chunk)).evaluated(*(column[:, taken] for column in columns)))
+        parts.append(_for_columns(function, chunk).evaluated(*(column[:, taken] for column in columns)))
         begin += chunk
     return [np.hstack(values)[:, :count] for values in zip(*parts, strict=True)]
+
+
+@lru_cache(maxsize=MAPS)
+def _for_columns(function: ca.Function, count: int) -> Matrices:
+    """A function of so many columns, for numbers; steps of one interval after the other ask for the same ones."""
+    return Matrices(function.map(count))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,8 +18,8 @@ RESPONSE_STEP = 1e-3
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
 STRETCH = 10.0
-# Limits below the first and above the second are the units of their rows.
-SMALL, LARGE = 1e-3, 1e3
+# Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
+SMALL, LARGE = 0.1, 1e3
 
 
 def limit_units(lower: Array, upper: Array) -> Array:
