@@ -173,12 +173,12 @@ def _made_ready(
             # multipliers of fixed variables come from the costates; Ipopt would evaluate the gradient twice for them
             "fixed_variable_treatment": "make_parameter_nodual",
         }
-        for statement, mesh in pairs:
+        for (statement, mesh), values in zip(pairs, parameters, strict=True):
             if statement.loop is not None and not mesh.eliminated:
                 settings["ipopt"] |= INSIDE[_gain_kind(statement)]
-            start, e0 = starts(statement, mesh, statement.values)
+            start, e0 = starts(statement, mesh, values)
             # a decided variance that is relaxed below its bound would be negative
-            if statement.decisions or needs_exact_bounds(statement, mesh, start, e0, statement.values):
+            if statement.decisions or needs_exact_bounds(statement, mesh, start, e0, values):
                 settings["ipopt"]["bound_relax_factor"] = 0.0
         if limited:
             settings["ipopt"] |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": HISTORY}

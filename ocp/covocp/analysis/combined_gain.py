@@ -35,8 +35,14 @@ from covocp.solving.evaluation import evaluate
 from covocp.solving.once import solve
 from covocp.transcription.first_guess import control_scale
 from covocp.transcription.mesh import Options
+from covocp.transcription.scales import magnitudes
+from covocp.transcription.steering import Run, final_pull
 
 # Steps along the statistical gradient at which the expected cost is evaluated.
+# Corrections of the final values, and the miss, in magnitudes of the states, at which they end.
+CORRECTIONS, MET = 12, 1e-8
+# Largest miss of a final value, in the magnitude of its state, that is weighed to first order.
+MISSED = 1e-3
 STEPS = tuple(2.0 ** np.arange(2, -13, -1))
 # Relative gains below which the classical design is as good, and above which the combined one is worth its while.
 NOTHING, MUCH = 1e-4, 1e-2
@@ -193,13 +199,40 @@ def _metric(extremal: Extremal) -> Array | None:
 
 
 def _decrease(classical: Solution, change: Array, ell: Array) -> float:
-    """Decrease of the expected cost, with what the step misses of the conditions held weighted by l."""
+    """Decrease of the expected cost by a change of the controls, within their bounds and to the same final values.
+
+    What steering leaves of a miss is weighed by l; where bounds leave much of it the change is none that is possible.
+    """
     extremal = classical.extremal
     st, t = extremal.statement, extremal.trajectory
-    u = np.clip(t.u + change, *st.control_bounds)
     mesh = replace(extremal.mesh, segments=(extremal.mesh.intervals,), eliminated=True)
+    u, fixed = np.clip(t.u + change, *st.control_bounds), ~np.isnan(st.boundary_values(extremal.parameters)[1])
+    scales = magnitudes(st, t, extremal.parameters)
+    if fixed.any():
+        known = {"start": t.x[0], "duration": t.duration, "parameters": extremal.parameters}
+        run = Run(statement=st, mesh=mesh, scale=scales.x, units=scales.u, **known)
+        u = _met(run, tuple(np.flatnonzero(fixed).tolist()), t.x[-1, fixed], u)
     outcome = evaluate_controls(st, mesh, u, t.duration, extremal.parameters, t.x[0])
-    fixed = ~np.isnan(st.boundary_values(extremal.parameters)[1])
     missed = (outcome.extremal.trajectory.x[-1] - t.x[-1])[fixed]
+    if not (np.abs(missed) <= MISSED * scales.x[fixed]).all():
+        return -np.inf
     cost = float(sum(outcome.cost_terms.values())) + float(ell[: missed.size] @ missed)
     return classical.cost - cost if np.isfinite(cost) else -np.inf
+
+
+def _met(run: Run, fixed: tuple[int, ...], target: Array, u: Array) -> Array:
+    """Controls near the given ones, within their bounds, that bring some states to final values where they can.
+
+    Each correction is that of least energy by the controls that are not at a bound.
+    """
+    lower, upper = run.statement.control_bounds
+    for _ in range(CORRECTIONS):
+        gap, slope = final_pull(run, fixed, target, u, often=False)
+        free = ((u > lower) & (u < upper)).ravel()
+        if not np.isfinite(slope).all() or not np.linalg.norm(gap) > MET or not free.any():
+            break
+        weighed = slope[:, free] / run.weights[free]
+        change = np.zeros(u.size)
+        change[free] = -weighed.T @ np.linalg.pinv(weighed @ slope[:, free].T, rcond=1e-10) @ gap
+        u = run.clip(u + change.reshape(u.shape))
+    return u

@@ -219,8 +219,12 @@ def identities(
     smallest_eigenvalue: float,
     loop: ClosedLoop | None,
     cost_identity: float | None,
+    other_truth: bool = False,
 ) -> Optimality:
-    """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
+    """What holds along a nominal that was not chosen for this cost: no condition of optimality does.
+
+    Under other statistics than the design's estimate and error are correlated, and should be.
+    """
     return Optimality(
         stationarity=None,
         control_slope=None,
@@ -233,7 +237,7 @@ def identities(
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=None,
         cost_identity=cost_identity,
-        **_loop_identities(loop),
+        **(_loop_identities(loop) | ({"cross_covariance": None} if other_truth else {})),
     )
 
 
@@ -362,9 +366,11 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
     jumps = extremal.mesh.instants  # H jumps where something is read or holds, and the instant moves with T
     moved = extremal.mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
     residual = slope + float(values[-1, 0]) - float(moved)
-    at_lower = trajectory.duration <= st.duration.lower * (1 + ACTIVE)
-    at_upper = trajectory.duration >= st.duration.upper * (1 - ACTIVE)
-    if (at_lower and residual > 0) or (at_upper and residual < 0):
+    bound = st.duration.lower if residual > 0 else st.duration.upper
+    distance, others = abs(trajectory.duration - bound), 0.0 if within is None else within.size
+    # close, or as close as the cost sees: solvers stay off a bound by what it costs them
+    near = distance <= ACTIVE * bound or distance * abs(residual) <= ACTIVE * (absolute_cost(extremal) + others)
+    if np.isfinite(bound) and near:
         residual = 0.0  # the bound holds what would go on
     return abs(residual) / max(float(values[:, 1].max()), abs(slope), float(np.finfo(float).tiny))
 

@@ -25,6 +25,7 @@ from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.phase_loops import ChainStatistics, phase_loops
 from covocp.problem.phase_feedback import in_phase
 from covocp.problem.phases import Phases
+from covocp.solution.chances import reached
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.evaluation import SAME, check_same, first_options, run_along, statistics_along, told
@@ -206,18 +207,17 @@ def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
             )
         assert phase.within is not None
         own = {**noted(closed.mean), "origin": Origin.OTHER_TRUTH.value}
-        phases.append(
-            replace(
-                phase,
-                method=METHOD,
-                message="evaluated under other statistics than the design's",
-                stats={**phase.stats, **own},
-                cost_terms=dict(closed.loop.cost),
-                loop=closed.loop,
-                stored_optimality=None,
-                within=replace(phase.within, deviations=closed.start, handed=0.0),
-            )
+        evaluated = replace(
+            phase,
+            method=METHOD,
+            message="evaluated under other statistics than the design's",
+            stats={**phase.stats, **own},
+            cost_terms=dict(closed.loop.cost),
+            loop=closed.loop,
+            stored_optimality=None,
+            within=replace(phase.within, deviations=closed.start, handed=0.0),
         )
+        phases.append(replace(evaluated, chances=reached(evaluated)))
     message = "evaluated under other statistics than the design's"
     return replace(solution, method=METHOD, message=message, phases=tuple(phases))
 

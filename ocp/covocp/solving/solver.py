@@ -50,7 +50,7 @@ from covocp.solving.methods import check_method, method_options
 from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
-from covocp.solving.suited_steps import suits
+from covocp.solving.suited_mesh import regraded, suits
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.names import stacked_parameters
@@ -146,8 +146,9 @@ class Solver:
         best = with_best_gain_problems(problem)
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
-        asked = graded(best[-1].statement() if best else self.statement, asked, self.statement.values)
-        self._asked, self._values = with_instants(self.statement, asked), self.statement.values
+        self._ungraded = best[-1].statement() if best else self.statement, asked
+        self._asked = with_instants(self.statement, graded(*self._ungraded, self.statement.values))
+        self._values = self.statement.values
         self._options = self._laid_out()
         self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = False  # at the steps along the guess
@@ -247,7 +248,7 @@ class Solver:
         if self._remade:
             self._keep(*self._first)
         with evaluating(self.statement.name):
-            self._suit_steps(values)
+            self._suit(values, nodes=assess)
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, self._options, self.statement)
         guess = later_of(guess, elapsed)
@@ -342,14 +343,30 @@ class Solver:
         own = {**self._own, **changed}
         return self._prepare(self._solved if statement is None else statement, options, self._values, **own)
 
-    def _suit_steps(self, values: Array) -> None:
-        """Steps for other values of the parameters where those of the mesh are too long; so are those of later runs."""
-        chosen = self._asked if self.nominal == "deterministic" else self._first[0]
-        if np.array_equal(values, self._values) or suits(self._solved, chosen, self._prepared.mesh, values):
+    def _suit(self, values: Array, *, nodes: bool) -> None:
+        """Another mesh for other values of the parameters where this one is too coarse for them, kept for later runs.
+
+        Its steps are looked at always, its nodes where it takes no more time than what else is looked at.
+        """
+        if np.array_equal(values, self._values):
             return
-        self._values = values
-        options = self._laid_out()
-        self._keep(options, self._ready(options))
+        mesh = self._prepared.mesh
+        nodes = nodes or (mesh.step == "rk4" and bool(self.statement.matrices))  # of which the steps depend on them
+        more = regraded(*self._ungraded, self._asked, values) if nodes else None
+        if self.nominal == "deterministic":
+            suited = evaluation_mesh(self.statement, self._asked, values).substeps <= mesh.substeps
+        else:
+            suited = suits(self._solved, self._first[0], mesh, values)
+        if suited and more is None:
+            return
+        before = self._values, self._asked
+        try:
+            self._values, self._asked = values, self._asked if more is None else with_instants(self.statement, more)
+            options = self._laid_out()
+            self._keep(options, self._ready(options))
+        except BaseException:
+            self._values, self._asked = before
+            raise
         self._first = options, self._prepared
 
     def _look_at_steps(self, values: Array) -> None:
@@ -393,6 +410,7 @@ class Solver:
         mesh = evaluation_mesh(self.statement, self._options, found.parameters)
         t = found.trajectory
         closed = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
+        moved = drift(found.trajectory.x, closed.extremal)  # by steps of the same length
         options = self._options
         while self._own_steps and closed.converged and (finer := finer_steps(closed.extremal, options)):
             mesh = evaluation_mesh(self.statement, finer, found.parameters)
@@ -400,7 +418,6 @@ class Solver:
             if not shorter.converged:
                 break
             closed, options = shorter, finer
-        moved = drift(found.trajectory.x, closed.extremal)
         if closed.converged and outcome.converged and not moved <= DRIFTED:
             message = UNSTABLE.format(moved)
             return replace(closed, converged=False, message=message, violations=outcome.violations)
@@ -478,6 +495,7 @@ class Solver:
     def _solve_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
         with Progress("", show=False) as reporter:
+            self._suit(values, nodes=False)
             guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
             outcome = self._closed(from_starts(self._prepared, values, guesses, reporter)[0])
             if reporter.stop:

@@ -17,7 +17,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.instants import with_instants
-from covocp.transcription.mesh import Graded, Mesh, Options, Stiffness, choose_mesh, choose_step, explicit_substeps
+from covocp.transcription.mesh import STIFFNESS_PER_STEP, Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
 
 # Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
 DAMPED = -0.5
@@ -114,7 +114,7 @@ def fits(statement: Statement, mesh: Mesh, parameters: Array) -> bool:
         slopes = _slopes_in_numbers(statement).evaluated(x, u, np.zeros(statement.ne), 0.0, duration, parameters)[0]
     except RuntimeError:  # the longer look tells
         return False
-    return explicit_substeps(duration * longest * _largest(_eigenvalues(slopes))) <= mesh.substeps
+    return duration * longest * _largest(_eigenvalues(slopes)) <= STIFFNESS_PER_STEP * mesh.substeps
 
 
 def nominal_along(

@@ -1,4 +1,4 @@
-"""Whether the integration steps of a mesh suit other values of the parameters than those that they were chosen for."""
+"""Whether a mesh suits other values of the parameters than those that it was made for."""
 
 from __future__ import annotations
 
@@ -6,8 +6,27 @@ from dataclasses import replace
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
+from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.stiffness import fits, resolve_mesh
+
+# Share of its nodes by which a mesh that is graded anew must have more to be taken.
+MORE_NODES = 0.1
+
+
+def regraded(statement: Statement, options: Options, present: Options, parameters: Array) -> Options | None:
+    """Options with the nodes that a default mesh has for some parameters, where these are clearly more than at present.
+
+    Args:
+        statement: whose covariances and gains the mesh is graded for.
+        options: before they were graded.
+        present: of the present mesh.
+        parameters: their values.
+    """
+    if options.grid is not None:
+        return None
+    wanted = graded(statement, options, parameters)
+    return wanted if wanted.nodes().size > (1.0 + MORE_NODES) * present.nodes().size else None
 
 
 def suits(statement: Statement, options: Options, mesh: Mesh, parameters: Array) -> bool:
@@ -26,5 +45,7 @@ def suits(statement: Statement, options: Options, mesh: Mesh, parameters: Array)
         return True
     if statement.matrices:
         options = replace(options, covariances="eliminated" if mesh.eliminated else "states")
+    if mesh.step == "rodas":  # as many implicit steps as are needed, not as explicit ones would be
+        options = replace(options, step="rodas")
     wanted = resolve_mesh(statement, options, parameters)
     return wanted.substeps <= mesh.substeps and not (wanted.step == "rodas" != mesh.step)
