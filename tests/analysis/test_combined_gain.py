@@ -163,6 +163,21 @@ def test_without_curvature_the_step_is_as_long_as_the_scale_of_the_control():
     assert np.abs(found.direction).max() == pytest.approx(0.5, rel=1e-9)  # half the range of the bounds
 
 
+@pytest.mark.parametrize("bound", [1.3, 1.6])
+def test_what_is_promised_can_be_had_within_the_bounds(bound):
+    """A step cut at the bounds misses the end by a quarter: to first order 14 % were promised, where 5 % can be had."""
+    ocp = co.Problem(duration=10.0)
+    x, b = ocp.state("x", initial=0.0, final=1.0), ocp.unknown("b", mean=1.0, variance=5.0)
+    u = ocp.control("u", lower=-bound, upper=bound)
+    ocp.dynamics(x, u - b * x)
+    ocp.measurement("m", x, noise=0.1)
+    ocp.minimize_expected(running=u**2, terminal_weight={x: 2.0})
+    found = co.worth(ocp)
+    best = co.solve(ocp, guess=found.classical, progress=False)
+    saved = 1.0 - best.cost / found.classical.cost
+    assert 0.25 * saved <= found.gain <= saved * (1 + 1e-6)
+
+
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ import phased
 import phased_loops
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.stats import norm
 
 import covocp as co
 
@@ -282,3 +283,47 @@ def test_a_nominal_that_leaves_the_domain_is_an_error_that_names_the_phase() -> 
         co.evaluate(co.Phases([one, two]), nominal=[{"u": 0.0}, {"u": -3.0}], intervals=10)
     with pytest.raises(co.ProblemError, match="keeps its nominal"):
         co.evaluate(designed(), nominal={"one": {"u": 0.0}})
+
+
+def test_chances_under_another_truth_are_those_of_its_deviations():
+    """The probability of a normal variable with the deviations of the loop under that truth, at the worst node."""
+
+    def flight(name, noise, initial=None, variance=None):
+        ocp = co.Problem(1.0, name=name)
+        x, u = ocp.state("x", initial=initial, variance=variance), ocp.control("u")
+        ocp.dynamics(x, u, noise=noise)
+        ocp.measurement("y", x, noise=noise / 2)
+        ocp.minimize_expected(running=0.5 * u**2 + 2 * (x - 1) ** 2)
+        ocp.chance(x, upper=0.8, probability=0.95, name="wall", at="path")
+        return ocp
+
+    def both(noise):
+        return co.Phases([flight("a", noise, 0.0, 0.02), flight("b", noise)])
+
+    found = co.evaluate(co.solve(both(0.02), intervals=20, progress=False), truth=both(0.08))
+    for phase in found.phases:
+        spread = np.sqrt(phase.loop.X[:, 0, 0])
+        expected = float(np.min(norm.cdf((0.8 - phase["x"]) / spread)))
+        assert phase.chances[0].reached == pytest.approx(expected, abs=1e-6)
+        assert not phase.chances[0].met
+
+
+def test_a_free_duration_at_its_bound_is_held_by_it():
+    """A double integrator from rest to rest through a free place: both durations end at their bounds.
+
+    An interior-point method stays off them by what that costs: the Hamiltonian there is no residual.
+    """
+
+    def leg(name, mass, first):
+        ocp = co.Problem(co.Free(1.0, 0.2, 5.0), name=name)
+        x = ocp.state("x", initial=0.0 if first else None, final=None if first else 2.0)
+        v = ocp.state("v", initial=0.0 if first else None, final=None if first else 0.0)
+        u = ocp.control("u", lower=-20.0, upper=20.0)
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, u / mass)
+        ocp.minimize(running=u**2 + (0.3 if first else 0.1))
+        return ocp
+
+    found = co.solve(co.Phases([leg("a", 2.0, True), leg("b", 1.0, False)]), intervals=20, progress=False)
+    assert found.durations == pytest.approx([0.2, 5.0], rel=1e-4)
+    assert all(phase.optimality.transversality <= 1e-6 for phase in found.phases)

@@ -76,3 +76,50 @@ def test_steps_that_were_given_and_diverge_are_refused():
     with pytest.raises(co.ProblemError, match=r"integration steps of the nominal are too long.*"):
         solver.solve({"k": 200.0}, progress=False, assess=False)
     assert abs(solver.solve(progress=False).cost / first.cost - 1) <= 1e-9
+
+
+def steered(rate=RATE, prior=0.1, density=0.05):
+    """A lag behind an actuator, under feedback from its filter."""
+    ocp = co.Problem(5.0, name="steered")
+    k, variance, noise = ocp.parameter("k", rate), ocp.parameter("P", prior), ocp.parameter("R", density)
+    x, a = ocp.state("x", initial=1.0, variance=variance), ocp.state("a", initial=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, a - x, noise=0.01)
+    ocp.dynamics(a, k * (u - a))
+    ocp.measurement("m", x, noise=noise)
+    ocp.minimize_expected(running=0.5 * u**2 + x**2, terminal_weight={x: 1.0})
+    return ocp
+
+
+def test_the_classical_design_beside_it_has_the_steps_of_these_values_too():
+    solver = co.Solver(steered(), intervals=40)
+    solution = solver.solve({"k": 22.0}, progress=False)
+    alone = co.solve(steered(22.0), intervals=40, nominal="deterministic", progress=False)
+    assert solution.stats["classical_cost"] == pytest.approx(alone.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("rate", [10.0, 16.0])
+def test_a_stable_plant_is_not_called_unstable_by_the_steps_of_two_runs(rate):
+    solution = co.solve(steered(rate), intervals=40, nominal="deterministic", progress=False)
+    finer = co.solve(steered(rate), intervals=80, substeps=4, nominal="deterministic", progress=False)
+    assert solution.cost == pytest.approx(finer.cost, rel=1e-5)
+
+
+@pytest.mark.parametrize(("name", "value"), [("P", 200.0), ("R", 1e-4)])
+@pytest.mark.parametrize("options", [{}, {"covariance_step": "rk4"}, {"nominal": "deterministic"}])
+def test_a_default_mesh_is_graded_for_the_values_that_are_solved_for(name, value, options):
+    declared = {"P": {"prior": value}, "R": {"density": value}}[name]
+    solution = co.Solver(steered(), intervals=40, **options).solve({name: value}, progress=False)
+    other = co.solve(steered(**declared), intervals=40, progress=False, **options)
+    assert solution.t.size == other.t.size > 41
+    assert solution.cost == pytest.approx(other.cost, rel=1e-7)
+
+
+def test_values_that_alternate_do_not_make_the_problem_ready_again(monkeypatch):
+    solver, made = co.Solver(actuator(), intervals=40), []
+    solver.solve({"k": 200.0}, progress=False, assess=False)
+    ready = co.Solver._ready
+    monkeypatch.setattr(co.Solver, "_ready", lambda self, *args, **own: made.append(1) or ready(self, *args, **own))
+    for rate in (50.0, 200.0, 5.0, 200.0):
+        solver.solve({"k": rate}, progress=False, assess=False)
+    assert not made
