@@ -17,6 +17,7 @@ from covocp.base.matrices import (
     pack,
     pack_costate,
     pack_symbolic,
+    semidefinite_part,
     smallest_eigenvalue,
     unpack,
     unpack_costate,
@@ -148,3 +149,15 @@ def test_roundoff_is_forgiven_but_not_more():
 
 def test_one_indefinite_matrix_among_many():
     assert not is_semidefinite(np.stack([np.eye(2), np.diag([1.0, -0.1]), np.eye(2)]))
+
+
+def test_the_semidefinite_part_is_the_nearest_covariance():
+    """Of diag(2, -1) in a turned basis what is left is 2 along the first direction; a covariance stays what it is."""
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    np.testing.assert_allclose(
+        semidefinite_part(turn @ np.diag([2.0, -1.0]) @ turn.T), 2 * np.outer(turn[:, 0], turn[:, 0])
+    )
+    np.testing.assert_allclose(
+        semidefinite_part(turn @ np.diag([2.0, 1.0]) @ turn.T), turn @ np.diag([2.0, 1.0]) @ turn.T
+    )
+    assert semidefinite_part(np.array([[-9.9]])) == 0.0

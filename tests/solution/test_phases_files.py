@@ -57,3 +57,42 @@ def test_a_loaded_solution_is_a_start(solution: co.PhasesSolution, tmp_path: Pat
     found = co.load(solution.save(tmp_path / "bounce.npz"))
     again = co.solve(bounce(), intervals=10, guess=found, progress=False)
     assert again.cost == pytest.approx(solution.cost, rel=1e-8)
+
+
+def with_parameter(k: float = 1.0) -> co.Phases:
+    """Two closed loops with a jump between them, whose rates, noises, costs and initial values have a parameter."""
+    problems = []
+    for name in ("one", "two"):
+        ocp = co.Problem(1.0, name=name)
+        own = ocp.parameter("k", k)
+        first = name == "one"
+        x = ocp.state("x", initial=own if first else None, variance=0.02 * own if first else None)
+        u = ocp.control("u")
+        ocp.dynamics(x, u - own * x, noise=0.05 * own)
+        ocp.measurement("y", x, noise=0.01)
+        ocp.minimize_expected(running=0.5 * u**2 + own * (x - 1) ** 2, terminal=x**2)
+        problems.append((ocp, x, own))
+    phases = co.Phases([ocp for ocp, _, _ in problems])
+    (_, before, own), (_, after, _) = problems
+    phases.jump(after, 0.9 * own * before, noise=0.01 * own)
+    return phases
+
+
+@pytest.mark.parametrize("how", ["ipopt", "gradient", "refined", "evaluated"])
+def test_phases_that_were_solved_for_other_parameters_come_back(how: str, tmp_path: Path) -> None:
+    """The file knows what was declared, not only what was solved for; either may be given, nothing else."""
+    phases, parameters = with_parameter(), {"k": 1.7}
+    run = {"refine": 1e-4} if how == "refined" else {"intervals": 10}
+    method = "gradient" if how == "gradient" else "ipopt"
+    solved = co.solve(phases, parameters=parameters, method=method, progress=False, **run)
+    if how == "evaluated":
+        solved = co.evaluate(phases, nominal=solved, parameters=parameters, intervals=10)
+    path = solved.save(tmp_path / "phases.npz")
+    for given in (phases, with_parameter(), with_parameter(1.7)):
+        found = co.load(path, given)
+        assert found.cost == solved.cost
+        assert [phase["k"][0] for phase in found] == [1.7, 1.7]
+        again = co.evaluate(found, truth={"k": 1.7})  # what passes between the phases is that of the file
+        assert again.cost == pytest.approx(co.evaluate(solved, truth={"k": 1.7}).cost, rel=1e-12)
+    with pytest.raises(co.ProblemError, match="value of 'k' differs"):
+        co.load(path, with_parameter(1.3))

@@ -479,3 +479,60 @@ def test_truth_without_noise_at_all():
 )
 def test_bad_input(call, parts):
     refused(lambda: call(parametric()), *parts)
+
+
+def spread_limited(noise=0.02, measured=0.01):
+    """A lag whose spread is limited: along the path, at an instant and at the end; one condition without X."""
+    ocp = co.Problem(1.0, name="spread")
+    x = ocp.state("x", initial=0.0, variance=0.02)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=noise)
+    ocp.measurement("y", x, noise=measured)
+    ocp.minimize_expected(running=0.5 * u**2 + 2 * (x - 1) ** 2)
+    X = ocp.closed_loop_covariance()
+    ocp.subject_to(X[x, x] / 0.0165, upper=1.0, at="final", name="end")
+    ocp.subject_to(X[x, x], upper=0.03, name="path")
+    ocp.subject_to(X[u, u] - X[x, u], upper=0.06, at=0.5, name="both")
+    ocp.subject_to(u, upper=9.0, name="plain")
+    return ocp, x, u, X
+
+
+def test_conditions_on_the_spread_under_a_truth():
+    """Violations, check_path and what is subscripted are those of the loop under the truth, not the design's."""
+    ocp, x, u, X = spread_limited()
+    design = co.solve(ocp, intervals=20, progress=False)
+    found = co.evaluate(design, truth=spread_limited(noise=0.08, measured=0.04)[0])
+    loop, C = found.loop, found.loop.gain
+    np.testing.assert_allclose(found[X[x, x]], loop.X[:, 0, 0], rtol=1e-12)
+    np.testing.assert_allclose(found["Xhat"], loop.Xhat, rtol=0)
+    np.testing.assert_allclose(found[X.matrix[0, 0] + x], loop.X[:, 0, 0] + found[x], rtol=1e-12)
+    np.testing.assert_allclose(found[X[u, u]], (C @ loop.Xhat @ C.transpose(0, 2, 1))[:, 0, 0], atol=1e-15)
+    crossed = -((loop.Xhat - loop.Z) @ C.transpose(0, 2, 1))[:, 0, 0]  # <d du>, d = y - e, du = -C y
+    np.testing.assert_allclose(found[X[x, u]], crossed, atol=1e-15)
+    assert abs(loop.Z).max() > 1e-3  # else E + Xhat would do
+    assert found.violations["end"] == pytest.approx(loop.X[-1, 0, 0] / 0.0165 - 1.0, rel=1e-9)
+    assert found.violations["path"] == pytest.approx(loop.X[:, 0, 0].max() - 0.03, rel=1e-9)
+    half = np.flatnonzero(found.t == 0.5)[-2]  # there, with the control that goes on
+    both = (found[X[u, u]] - found[X[x, u]])[half]
+    assert found.violations["both"] == pytest.approx(both - 0.06, rel=1e-9)
+    assert found.check_path() == pytest.approx({"path": found.violations["path"]})
+    assert "Xhat" not in found.at(0.33).values  # known at the nodes only
+    assert design["Xhat"][-1] < found["Xhat"][-1]
+
+
+def test_conditions_on_the_spread_under_the_truth_of_the_design():
+    """What the design met it meets under its own statistics: two integrators differ by less than is said."""
+    ocp, x, _, X = spread_limited()
+    design = co.solve(ocp, intervals=20, progress=False)
+    found = co.evaluate(design, truth=ocp)
+    assert found.violations == {}
+    assert found.check_path() == {}
+    np.testing.assert_allclose(found[X[x, x]], design[X[x, x]], rtol=1e-3)
+
+
+def test_conditions_that_a_better_truth_meets():
+    """A violation that a worse truth has is gone under a better one."""
+    design = co.solve(spread_limited()[0], intervals=20, progress=False)
+    worse = co.evaluate(design, truth=spread_limited(noise=0.08, measured=0.04)[0])
+    assert set(worse.violations) == {"end", "path", "both"}
+    assert co.evaluate(worse, truth=spread_limited(noise=0.01)[0]).violations == {}

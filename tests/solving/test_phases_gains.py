@@ -206,3 +206,59 @@ def test_before_a_sensor_is_on_nothing_is_fed_back() -> None:
     np.testing.assert_allclose(found["b"].loop.X[0], np.diag([grown, 0.03]), rtol=1e-6)
     assert found["b"].loop.X[-1, 0, 0] == pytest.approx(0.15, rel=1e-6)
     assert max(phase.optimality.stationarity for phase in found) < 1e-7
+
+
+# --- conditions that the gains of the first guess meet too steeply ----------------------------------------------------
+
+
+def noted(duration: float, name: str, *, first: bool, at: tuple[Any, ...], limit: float) -> co.Problem:
+    """An integrator that is drawn to one, whose spread has a limit at some places."""
+    ocp = co.Problem(duration, name)
+    x = ocp.state("x", initial=0.0 if first else None, variance=0.02 if first else None)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=0.02)
+    ocp.measurement("y", x, noise=0.01)
+    ocp.minimize_expected(running=0.5 * u**2 + 2 * (x - 1) ** 2)
+    X = ocp.closed_loop_covariance()
+    for k, place in enumerate(at):
+        ocp.subject_to(X[x, x] / limit, upper=1.0, at=place, name=f"limit {k}")
+    return ocp
+
+
+@pytest.mark.parametrize("count", [20, 60])
+@pytest.mark.parametrize(("limit", "both"), [(0.0165, False), (0.0165, True), (0.0185, True)])
+def test_limits_where_phases_meet_cost_what_they_cost_at_an_instant_of_the_whole(
+    count: int, limit: float, both: bool
+) -> None:
+    """The gain that meets the limit along the first nominal is too steep for the steps: another start is tried."""
+    whole = noted(2.0, "whole", first=True, at=(1.0, "final") if both else (1.0,), limit=limit)
+    parts = [
+        noted(1.0, "a", first=True, at=("final",), limit=limit),
+        noted(1.0, "b", first=False, at=("final",) if both else (), limit=limit),
+    ]
+    found = co.solve(co.Phases(parts), intervals=count, **QUIET)
+    assert found.cost == pytest.approx(co.solve(whole, intervals=2 * count, **QUIET).cost, rel=2e-6)
+    assert found["a"].loop.X[-1, 0, 0] <= limit * (1 + 1e-4)
+    if (limit, both) == (0.0165, False):
+        assert found.cost == pytest.approx(1.102295, abs=2e-6)  # from the solution with a looser limit
+
+
+@pytest.mark.parametrize("gain", [-30.0, 60.0])
+def test_a_gain_that_leaves_no_covariance_is_no_error_of_the_problem(gain: float) -> None:
+    """A guess along which long steps make a variance negative is a poor start, not a wrong initial value."""
+    a = noted(1.0, "a", first=True, at=(), limit=1.0)
+    b = noted(1.0, "b", first=False, at=("final",), limit=0.0165)
+    found = co.solve(co.Phases([a, b]), intervals=20, guess={"a": {"C": gain}}, allow_failure=True, **QUIET)
+    assert isinstance(found, co.PhasesSolution)
+
+
+def test_a_jump_that_leaves_no_covariance_is_one() -> None:
+    """What the user's own jump makes of a covariance is said, and not mended."""
+    a = noted(1.0, "a", first=True, at=(), limit=1.0)
+    b = noted(1.0, "b", first=False, at=("final",), limit=0.0165)
+    x, y = (next(iter(ocp.states)).symbol for ocp in (a, b))
+    noise = a.parameter("noise", 0.001)
+    phases = co.Phases([a, b])
+    phases.jump(y, x, noise=noise)
+    with pytest.raises(co.ProblemError, match="negative"):
+        co.solve(phases, intervals=20, parameters={"noise": -0.5}, **QUIET)

@@ -110,6 +110,12 @@ def unpack(half: ArrayLike, size: int) -> Array:
     return np.asarray(np.asarray(half, dtype=float)[..., unpack_indices(size)])
 
 
+def semidefinite_part(matrix: Array) -> Array:
+    """The nearest positive semidefinite matrix of a symmetric one."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
 def unpack_costate(half: ArrayLike, size: int) -> Array:
     """Matrix costate P from the costates of the half-vector: off-diagonal entries are halved."""
     half = np.asarray(half, dtype=float)

@@ -29,7 +29,7 @@ class Passed:
     Attributes:
         name: of the state or the constraint.
         by: largest violation, in the unit of the constraint.
-        share: the same relative to the limit (see `_sizes`).
+        share: the same relative to the limit (see `limit_sizes`).
         time: where it is largest relative to the limit [s].
     """
 
@@ -121,7 +121,7 @@ def _passed(
             found = excess[place, np.arange(len(names))]
             when[side] = np.where(found > worst[side], s[place], when[side])
             worst[side] = np.maximum(worst[side], found)
-    shares = worst / _sizes(lower, upper, largest)
+    shares = worst / limit_sizes(lower, upper, largest)
     side = shares.argmax(axis=0)
     result = [
         Passed(
@@ -136,7 +136,7 @@ def _passed(
     return tuple(sorted(result, key=lambda entry: -entry.share))
 
 
-def _sizes(lower: Array, upper: Array, largest: Array) -> Array:
+def limit_sizes(lower: Array, upper: Array, largest: Array) -> Array:
     """What a violation is relative to, (2, rows): the limit, the width between both, the least of them.
 
     Where the limit is zero, it is the largest value along the path.

@@ -18,7 +18,7 @@ from covocp.problem.chances import check_uncertain, uncertainties
 from covocp.problem.checks import check_dynamics
 from covocp.problem.data import used_data
 from covocp.problem.decisions import check_decisions
-from covocp.problem.declarations import Declarations, Matrix
+from covocp.problem.declarations import Declarations, Matrix, Spread
 from covocp.problem.ends import boundary, tied_values, with_end_conditions
 from covocp.problem.inequalities import conditions_at, conditions_inside, row_names
 from covocp.problem.integrals import check_integrals
@@ -98,7 +98,7 @@ def freeze(problem: Declarations, *, part: bool = False) -> Statement:
         running_uses_matrices=running_uses,
         symbols=_symbols(problem),
         matrix_parameters={e.name: (e.size // e.columns, e.columns) for e in problem.parameters if e.columns > 1},
-        expression=_expression_builder(stacked),
+        expression=_expression_builder(stacked, problem.spread),
     )
 
 
@@ -450,10 +450,15 @@ def _diagonal_bounds(entry: Matrix) -> Any:
     return bounds[columns, rows]
 
 
-def _expression_builder(stacked: Stacked) -> Callable[[Any], ca.Function]:
-    """What turns a user's expression into a function of the six stacked inputs."""
+def _expression_builder(stacked: Stacked, spread: Spread | None) -> Callable[..., ca.Function]:
+    """What turns a user's expression into a function of the six stacked inputs, and of the half-vector of X if asked.
 
-    def build(expression: Expr) -> ca.Function:
+    Where X is no symbol of the program there are the six in any case.
+    """
+
+    def build(expression: Expr, *, scattered: bool = False) -> ca.Function:
+        if scattered and spread is not None and spread.value is not None:
+            return stacked.with_spread("expression", [expression], spread.size)
         return stacked.function("expression", stacked.substitute(expression))
 
     return build

@@ -62,14 +62,16 @@ def _conditions(problem: Declarations, stacked: Stacked, at: Where, chosen: list
     """Some inequalities as one function."""
     values = ca.vertcat(stacked.symbolic(0, 1), *stacked.substitute(*(c.expression for c in chosen)))
     names = [name for c in chosen for name in row_names(c)]
-    realised, spread = None, problem.spread
+    realised, scattered, spread = None, None, problem.spread
     if spread is not None and any(used_in(problem, c.expression) for c in chosen):
         none: Any = floored(stacked.symbolic.zeros(spread.symbol.shape[0]), spread.size)  # type: ignore[attr-defined]
         own = stacked.substitute(*(c.expression for c in chosen), spread=none)
         realised = stacked.function(f"{at}_realised", [ca.vertcat(*own)])
+        scattered = stacked.with_spread(f"{at}_scattered", [c.expression for c in chosen], spread.size)
     return Conditions(
         function=stacked.function(f"{at}_conditions", [values]),
         realised=realised,
+        scattered=scattered,
         names=tuple(names),
         between=tuple(c.between for c in chosen for _ in range(c.lower.size)),
         lower=np.concatenate([np.zeros(0), *(c.lower for c in chosen)]),

@@ -12,7 +12,9 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
+from covocp.base.matrices import half_length
 from covocp.base.short_repr import short_repr
+from covocp.problem.closed_loop_covariance import floored
 from covocp.problem.declarations import Declarations
 from covocp.statement.statement import INPUTS
 
@@ -44,6 +46,12 @@ class Stacked:
         kept = [(symbol, label) for symbol, label in zip(self.inputs, INPUTS, strict=True) if label not in without]
         outputs = [f"out{i}" for i in range(len(expressions))]
         return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
+
+    def with_spread(self, name: str, expressions: list[Any], size: int) -> ca.Function:
+        """A function of the stacked vectors and of the half-vector of X, of so many rows: the user's expressions."""
+        half = self.symbolic.sym("spread", half_length(size))  # type: ignore[attr-defined]
+        values = self.substitute(*expressions, spread=floored(half, size))
+        return ca.Function(name, [*self.inputs, half], [ca.vertcat(*values)], [*INPUTS, "spread"], ["out0"])
 
 
 def stack(problem: Declarations) -> Stacked:

@@ -31,6 +31,7 @@ from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.phase_loops import PhaseLoop
+from covocp.extremal.spread_limits import passed_by_spread, scattered, spread_names
 from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
@@ -57,7 +58,8 @@ class Solution:
     """An optimal control problem solved (or its last iterate: see `converged`).
 
     `solution[key]`, with the symbol, its name, or any expression of the problem's symbols, gives the values at the
-    nodes, time first: (K,) for scalars, (K, n) for vectors, (K, n, n) for matrices.
+    nodes, time first: (K,) for scalars, (K, n) for vectors, (K, n, n) for matrices. Under another truth (`evaluate`) X
+    and Xhat are those under it; E is what the filter of the design computes.
 
     Attributes:
         name: of the problem.
@@ -194,6 +196,11 @@ class Solution:
         return origin_of(self.method, self.stats)
 
     @property
+    def _otherwise(self) -> ClosedLoop | None:
+        """The loop under other statistics than the design's, of which the matrices are; None: there are no others."""
+        return self.loop if self.origin is Origin.OTHER_TRUTH else None
+
+    @property
     def status(self) -> str:
         """How the run ended, in words."""
         return self.message if self.converged else f"NOT CONVERGED: {self.message}"
@@ -294,7 +301,10 @@ class Solution:
     @cached
     def values(self) -> Mapping[str, Array]:
         """Values of all symbols at the nodes by name; read-only."""
-        return read_only(self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e))
+        found = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
+        if self._otherwise is not None and ESTIMATE in found:
+            found[ESTIMATE] = self._otherwise.Xhat
+        return read_only(found)
 
     @property
     def controls(self) -> Array:
@@ -331,11 +341,14 @@ class Solution:
             return values if own is None or own.role == "moving" else np.squeeze(values[-1])
         statement = self.extremal.statement
         try:
-            function = statement.expression(key)
+            function = statement.expression(key, scattered=self._otherwise is not None)
         except RuntimeError as error:
             raise unknown_name(key, tuple(self.values)) from error
         count = self.mesh.nodes.size
-        value = np.asarray(function.map(count)(*self.extremal.columns()).full())
+        columns = self.extremal.columns()
+        if self._otherwise is not None and function.n_in() > len(columns):
+            columns = (*columns, scattered(self._otherwise).T)
+        value = np.asarray(function.map(count)(*columns).full())
         rows, columns = key.shape
         shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
         return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
@@ -352,7 +365,8 @@ class Solution:
             side: "after" or "before", where something jumps there: a covariance at a measurement that is taken then.
 
         Returns:
-            What `[symbol or name]` gives the values of.
+            What `[symbol or name]` gives the values of; without Xhat where `evaluate(..., truth=)` put other statistics
+            than the design's, under which it is known at the nodes only.
 
         Raises:
             ProblemError: where a time lies outside, or is not a number.
@@ -371,6 +385,8 @@ class Solution:
         u = self.controls_at(times, before=before)
         nx = self.trajectory.x.shape[1]
         values = self._assemble(times, z[:, :nx], u, z[:, nx:])
+        if self._otherwise is not None:
+            values.pop(ESTIMATE, None)  # under this truth it is known at the nodes only
         if np.ndim(t) == 0:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols=self.symbols)
@@ -493,7 +509,9 @@ class Solution:
         """Largest violation of each path constraint and state bound along the true path.
 
         They are imposed at a few points of each interval (`points=` of `solve`); this looks at the ends of `points`
-        equal parts of it, and wherever the path bends sharply. Memory does not grow with the points.
+        equal parts of it, and wherever the path bends sharply. Memory does not grow with the points. Under another
+        truth (`evaluate`), constraints on the covariance X of the closed loop are looked at where that is known: at the
+        nodes.
 
         Args:
             points: parts of each interval.
@@ -519,7 +537,14 @@ class Solution:
         """What `check_path` finds, with the share of the limit and the time, the worst first."""
         if not limited(self.extremal):
             return ()
-        return passed_limits(self.extremal, self._dense_for(self.extremal.statement.path), points)
+        path = self.extremal.statement.path
+        found = passed_limits(self.extremal, self._dense_for(path), points)
+        if self._otherwise is None or path.scattered is None:
+            return found
+        believed = spread_names(self.extremal.statement)
+        known = [entry for entry in found if entry.name not in believed]
+        known += passed_by_spread(self.extremal, self._otherwise, path=True)
+        return tuple(sorted(known, key=lambda entry: -entry.share))
 
     def left_tables(self, points: int = 10) -> tuple[Passed, ...]:
         """Tables that are read beyond their outermost knots along the true path, the worst first.

@@ -24,6 +24,7 @@ from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.joint import Statistics
 from covocp.extremal.mesh_error import finer_steps
 from covocp.extremal.path_limits import NOTED
+from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.problem.builder import Problem
 from covocp.problem.phases import Phases
 from covocp.solution.chances import reached
@@ -81,7 +82,9 @@ def evaluate(
 
     Returns:
         A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`. Of
-        phases a `PhasesSolution`.
+        phases a `PhasesSolution`. Under a truth, costs, `loop`, `covariance()`, chances, X and Xhat by subscript, and
+        what is violated of conditions that contain X are those under it (at the nodes); E by subscript is what the
+        filter of the design computes, the actual one is `loop.E`. Multipliers and costates are the design's.
 
     Raises:
         ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
@@ -346,7 +349,16 @@ def _under(solution: Solution, truth: Given) -> Solution:
         loop=loop,
         stored_optimality=None,
     )
-    return replace(result, chances=reached(result))
+    return replace(result, chances=reached(result), violations=violations_under(result))
+
+
+def violations_under(solution: Solution) -> dict[str, float]:
+    """What a solution misses with the loop that it has: of conditions on X what that does, else what was missed."""
+    extremal, loop = solution.extremal, solution.loop
+    assert loop is not None
+    believed = spread_names(extremal.statement)
+    kept = {name: value for name, value in solution.violations.items() if name not in believed}
+    return kept | {entry.name: entry.by for entry in passed_by_spread(extremal, loop)}
 
 
 def true_statistics(extremal: Extremal, truth: Given) -> Statistics:

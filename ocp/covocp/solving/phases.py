@@ -85,12 +85,14 @@ def solve_phases(
             mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase, statement)
     values = values_of(chain, {} if parameters is None else parameters)
     run = {"guess": guess, "parameters": parameters, **{name: v for name, v in given.items() if name != "refine"}}
+    starts = [guesses]
     best = None if random is not None else best_gains(phases, guesses, _best_solver(asked, run))
     if best is not None:
         asked = graded_for(best, asked)
-        guesses = list(meeting_conditions(phases, best, parameters or {}))
+        near = meeting_conditions(phases, best, parameters or {})
+        starts = [list(near), list(best)] if near is not best else [list(best)]
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
-        outcome = ChainRuns(chain, method, prepare, own, reporter, values, guesses).solve(asked, random)
+        outcome = ChainRuns(chain, method, prepare, own, reporter, values, starts).solve(asked, random)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
             raise interrupted(solution)

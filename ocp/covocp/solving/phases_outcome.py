@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from covocp.extremal.extremal import Outcome
+import numpy as np
+
+from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.links import ChainOutcome, completed, link_residual
 from covocp.extremal.mean_effect import noted
 from covocp.extremal.phase_loops import PhaseLoop, phase_loops
@@ -24,6 +26,8 @@ def phases_solution(chain: Chain, outcome: ChainOutcome, method: str, *, assess:
         method: by which.
         assess: whether the mesh errors of the phases are estimated.
     """
+    extremals = tuple(_as_declared(chain, i, extremal) for i, extremal in enumerate(outcome.extremals))
+    outcome = replace(outcome, extremals=extremals)
     loops: tuple[PhaseLoop | None, ...] = (None,) * len(outcome.extremals)
     if chain.statements[0].loop is not None:
         loops = phase_loops(outcome.extremals, chain.links)
@@ -66,6 +70,19 @@ def phases_solution(chain: Chain, outcome: ChainOutcome, method: str, *, assess:
         stats=dict(outcome.stats),
         links=chain.links,
     )
+
+
+def _as_declared(chain: Chain, i: int, extremal: Extremal) -> Extremal:
+    """An extremal whose statement has the values that were declared, and of what passes between phases what passed.
+
+    Methods run on statements with the values that were solved for; a solution is told from others by the declared ones.
+    """
+    passed = [*(chain.links[i - 1].parameters if i else ()), *(chain.links[i].weights if i < len(chain.links) else ())]
+    values = chain.statements[i].values.copy()
+    values[passed] = extremal.parameters[passed]
+    if np.array_equal(values, extremal.statement.values, equal_nan=True):
+        return extremal
+    return replace(extremal, stated=replace(extremal.statement, values=values))
 
 
 def _of_phase(stats: Mapping[str, Any], i: int) -> dict[str, Any]:

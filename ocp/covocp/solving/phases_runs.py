@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.errors import CovocpError
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Guess
@@ -38,12 +38,16 @@ Made = Callable[[int, Statement, Options, Mesh, Array], Guess | None]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Begun:
-    """Where a method starts: a guess for each phase, parameters with what passes, graded options, statements."""
+    """Where a method starts: a guess for each phase, parameters with what passes, graded options, statements.
+
+    covariances: whether what each phase ends with is a covariance where it should be; else the nearest one is passed.
+    """
 
     chain: Chain
     guesses: Guesses
     values: Arrays
     options: tuple[Options, ...]
+    covariances: bool
 
     __repr__ = short_repr
 
@@ -59,11 +63,15 @@ class ChainRuns:
         own: dict[str, Any],
         reporter: Progress,
         values: Arrays,
-        guesses: list[Any],
+        guesses: list[list[Any]],
     ) -> None:
-        """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed."""
+        """Keep the chain, how the method is made ready, the parameters of each statement, and what was guessed.
+
+        Several guesses are tried one after the other, until the method finds its way.
+        """
         self._chain, self._method, self._prepare, self._own = chain, method, prepare, own
-        self._reporter, self._values, self._guesses = reporter, values, guesses
+        self._reporter, self._values = reporter, values
+        self._guesses, *self._others = guesses
 
     @property
     def statements(self) -> tuple[Statement, ...]:
@@ -83,11 +91,23 @@ class ChainRuns:
             starts: number of random starts and their seed; None: none.
         """
         begun = self._begun(options)
-        found = self._shorter(self._from_starts(begun) if starts is None else self._best_of(begun, *starts))
+        while self._others and not begun.covariances:  # a guess along which the steps are too long for its gains
+            begun = self._otherwise(options)
+        found = self._from_starts(begun) if starts is None else self._best_of(begun, *starts)
+        while self._others and not found.outcome.converged and not self._reporter.stop:
+            failed, found = found.outcome, self._from_starts(self._otherwise(options))
+            both = {**found.outcome.stats, **counted(failed, found.outcome)}
+            found = replace(found, outcome=replace(found.outcome, stats=both))
+        found = self._shorter(found)
         if not self._reporter.stop and found.outcome.converged:
             found = remade(found, self)
         assert isinstance(found.outcome, ChainOutcome)
         return found.outcome
+
+    def _otherwise(self, options: tuple[Options, ...]) -> Begun:
+        """Where the method starts from the next guess, which is the one from now on."""
+        self._guesses, *self._others = self._others
+        return self._begun(options)
 
     def cold(self, options: tuple[Options, ...], least: float) -> Measured:
         """From the phases' own start."""
@@ -239,10 +259,13 @@ class ChainRuns:
         found: list[Guess] = []
         filled: list[Array] = []
         fine: list[Options] = []
+        covariances = True
         for i, (st, own, value) in enumerate(zip(self._chain.statements, options, values, strict=True)):
             if i:
                 link, t = self._chain.links[i - 1], found[-1].trajectory
-                states, matrices = link.values(t.x[-1], t.e[-1], t.duration, filled[-1], value)
+                ends, sound = nearest_covariances(self._chain.statements[i - 1], t.e[-1])
+                covariances = covariances and sound
+                states, matrices = link.values(t.x[-1], ends, t.duration, filled[-1], value)
                 value, st = link.filled(value, matrices), started_at(st, link, states)
             own = graded(st, own, value)
             fine.append(own if own.refine is None else with_layers(st, own, value))
@@ -257,4 +280,21 @@ class ChainRuns:
             guesses=tuple(found),
             values=tuple(filled),
             options=tuple(fine),
+            covariances=covariances,
         )
+
+
+def nearest_covariances(statement: Statement, halves: Array) -> tuple[Array, bool]:
+    """Half-vectors with the nearest covariances in place of what is none, and whether all were some but for roundoff.
+
+    Along a guess whose gain is steep, long steps may leave the covariance of the estimate with negative variances: a
+    method finds its way from there, but no phase can start with them. What a jump makes of a covariance stays as it is.
+    """
+    result, sound = halves.copy(), True
+    for block in statement.matrices:
+        matrix = unpack(halves[block.span], block.size)
+        if not block.covariance or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix).min(initial=0.0) >= 0.0:
+            continue
+        sound = sound and is_semidefinite(matrix[None])
+        result[block.span] = pack(semidefinite_part(matrix))
+    return result, sound

@@ -31,7 +31,8 @@ class Conditions:
 
     `function` takes (state, control, matrices, time, duration, parameters); `names` has one entry for each row.
     `realised` is the same of one run, whose spread is none: the covariance X of the closed loop is zero in it; None
-    where no row contains X. `between` tells the rows that must hold at all times, whatever it takes.
+    where no row contains X. `scattered` is the same of any X, whose half-vector it takes as a last argument; None where
+    `realised` is. `between` tells the rows that must hold at all times, whatever it takes.
     """
 
     function: ca.Function
@@ -40,6 +41,7 @@ class Conditions:
     upper: Array
     uses_matrices: bool
     realised: ca.Function | None = None
+    scattered: ca.Function | None = None
     between: tuple[bool, ...] = ()
 
     __repr__ = short_repr

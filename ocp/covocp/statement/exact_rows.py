@@ -180,7 +180,8 @@ class _Cut:
     def conditions(self, own: Conditions) -> Conditions:
         """Conditions of fewer half-vectors."""
         realised = own.realised and self.of(own.realised, (None,))
-        return replace(own, function=self.of(own.function, (None,)), realised=realised)
+        scattered = own.scattered and self.of(own.scattered, (None,))
+        return replace(own, function=self.of(own.function, (None,)), realised=realised, scattered=scattered)
 
     def _whole(self, half: Any, kind: Any) -> Any:
         """All half-vectors from those that are carried."""

@@ -216,7 +216,8 @@ class Statement:
         data: values over time that are in some of these functions.
         tables: what is looked up in tables along the path, with their outermost knots as limits; None without tables.
         geometry: how the state moves where some of it is no vector.
-        expression: a user's expression -> function of the six inputs.
+        expression: a user's expression -> function of the six inputs; with scattered=True also of the half-vector of
+            the covariance X of the closed loop, where conditions or the cost contain it.
     """
 
     name: str
@@ -256,7 +257,7 @@ class Statement:
     running_uses_matrices: bool
     geometry: Geometry
     symbols: Mapping[str, Any] = field(repr=False)
-    expression: Callable[[Any], ca.Function] = field(repr=False)
+    expression: Callable[..., ca.Function] = field(repr=False)
     matrix_parameters: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     __repr__ = short_repr
