@@ -438,3 +438,25 @@ def test_wrong_readings_are_named():
         law.estimate(memory[:-1])
     with pytest.raises(ProblemError, match="'attitude'"):
         law.initial([1.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: turn_between([1, 0, 0], [1, 0, 0, 0]), "'before'(?s:.)*4 x 1(?s:.)*3 x 1"),
+        (lambda: turn_between([1, 0, 0, 0], ca.SX.sym("q", 3)), "'after'(?s:.)*4 x 1(?s:.)*3 x 1"),
+        (lambda: attitude_seeking.zone_rows(np.eye(3), 3), "'zones'(?s:.)*received: 3"),
+        (lambda: attitude_seeking.zone_rows(np.eye(3), ZONES), r"'zones'(?s:.)*zones_of\(\)"),
+        (lambda: attitude_seeking.zone_rows(np.eye(2), []), "'rotation'(?s:.)*3 x 3(?s:.)*2 x 2"),
+        (lambda: attitude_seeking.zone_rows(1.0, []), "'rotation'(?s:.)*3 x 3(?s:.)*a number"),
+    ],
+)
+def test_what_is_no_attitude_and_no_zone_is_named(call, message):
+    with pytest.raises(ProblemError, match=message):
+        call()
+
+
+def test_turns_of_lists_of_numbers():
+    after = [np.cos(0.15), np.sin(0.15), 0.0, 0.0]
+    vector = ca.evalf(ca.MX(turn_between([1, 0, 0, 0], after))).full().ravel()
+    np.testing.assert_allclose(vector, [0.3, 0, 0], atol=1e-15)

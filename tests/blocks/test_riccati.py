@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -64,6 +66,69 @@ def test_solution_has_no_residual_and_stabilises(seed, size, count, discrete):
     assert np.abs(residual).max() <= 1e-11 * scale
     np.testing.assert_array_equal(S, S.T)
     assert np.linalg.eigvalsh(S)[0] > 0
+
+
+# plants whose unstable modes the input hardly reaches: scipy's start is off by up to a tenth where R is far from Q
+HARD = [
+    ([[-1.7, 0.5, -0.1], [-0.2, 0.6, 1.3], [0.4, 0.4, -2.3]], [[0.6], [-0.3], [1.0]]),
+    ([[-2.8, -2.4, -2.6], [-1.2, 2.9, -3.2], [1.9, 2.5, -0.7]], [[-0.7], [0.5], [1.2]]),
+]
+
+
+def by_doubling(A, B, Q, R):
+    """The stabilising solution by the structure-preserving doubling algorithm, in 60 digits, without eigenvectors."""
+    exact = np.vectorize(Decimal, otypes=[object])
+    with localcontext(prec=60):
+        A, B, S, R = (exact(np.asarray(matrix, dtype=float)) for matrix in (A, B, Q, R))
+        unit, G = exact(np.eye(len(A))), B @ inverse(R) @ B.T
+        for _ in range(60):
+            W = inverse(unit + G @ S)
+            A, G, S, before = A @ W @ A, G + A @ W @ G @ A.T, S + A.T @ S @ W @ A, S
+            if abs(S - before).max() <= abs(S).max() * Decimal("1e-30"):
+                break
+    return S.astype(float)
+
+
+def inverse(matrix):
+    """By elimination with pivots, of a matrix of decimals."""
+    size = len(matrix)
+    rows = np.hstack([matrix, np.vectorize(Decimal, otypes=[object])(np.eye(size))])
+    for j in range(size):
+        pivot = j + int(np.argmax(abs(rows[j:, j])))
+        rows[[j, pivot]] = rows[[pivot, j]]
+        rows[j] = rows[j] / rows[j, j]
+        others = np.arange(size) != j
+        rows[others] = rows[others] - rows[others, j : j + 1] * rows[j]
+    return rows[:, size:]
+
+
+@pytest.mark.parametrize(("A", "B"), HARD)
+@pytest.mark.parametrize("ratio", [1e-8, 1e-4, 1e4, 1e6, 1e8])
+def test_sizes_of_the_weights_far_apart(A, B, ratio):
+    A, B = np.array(A), np.array(B)
+    S = riccati.discrete(A, B, np.eye(3), ratio)
+    truth = by_doubling(A, B, np.eye(3), np.array([[ratio]]))
+    closed = A - B @ np.linalg.solve(ratio + B.T @ truth @ B, B.T @ truth @ A)
+    # what rounding of A'S A leaves in S, by the inverse of the equation's derivative, a Lyapunov equation's operator
+    condition = np.linalg.norm(np.linalg.inv(np.eye(9) - np.kron(closed.T, closed.T)), 2)
+    error = np.finfo(float).eps * condition * np.linalg.norm(A, 2) ** 2 * S.max()
+    np.testing.assert_allclose(S, truth, rtol=0, atol=error)
+    np.testing.assert_allclose(riccati.discrete(A, B, np.eye(3) / ratio, 1.0) * ratio, truth, rtol=0, atol=error)
+    np.testing.assert_allclose(kalman.steady_state(A.T, B.T, np.eye(3), ratio).prior, truth, rtol=0, atol=error)
+
+
+@pytest.mark.parametrize(("A", "B"), HARD)
+@pytest.mark.parametrize("discrete", [False, True])
+def test_a_dear_input_reflects_the_unstable_modes(A, B, discrete):
+    A, B = np.array(A), np.array(B)
+    closed = riccati.lqr(A, B, np.eye(3), 1e8, discrete=discrete).eigenvalues
+    modes = np.linalg.eigvals(A).astype(complex)
+    if discrete:
+        wanted = np.where(np.abs(modes) > 1, 1 / modes.conj(), modes)
+    else:
+        wanted = np.where(modes.real > 0, -modes.conj(), modes)
+    apart = np.abs(closed[:, None] - wanted[None, :])
+    assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-5
 
 
 @pytest.mark.parametrize("a", [-2.0, 0.0, 0.5, 3.0])

@@ -281,3 +281,15 @@ def test_pyplot_shows_the_figure_only_where_its_backend_is_interactive(lag, monk
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", pyplot)
     result = lag.plot("x")
     assert (made == [result]) is shown
+
+
+def test_an_entry_of_a_covariance_between_the_nodes():
+    """As the integrator computes it there, which is what the panel of the whole matrix shows."""
+    solution = co.solve(unknown_lag.problem(), intervals=12, progress=False)
+    x, b = solution.symbols["x"], solution.symbols["b"]
+    found = {key: solution.plot(key) for key in ((x, b), ("x[0]", "b"), ("x", "x"))}
+    for (i, j), key in zip(((0, 1), (0, 1), (0, 0)), found, strict=True):
+        (line,) = found[key].axes[0].lines
+        t = line.get_xdata()
+        assert t.size >= 200
+        np.testing.assert_allclose(line.get_ydata(), solution.at(t)["E"][:, i, j], rtol=1e-12, atol=1e-14)

@@ -203,3 +203,11 @@ def test_wide_legends_have_several_rows(combined, classical):
     box = figure.legends[0].get_window_extent()
     assert box.x0 >= 0
     assert box.x1 <= figure.bbox.x1
+
+
+def test_an_entry_of_the_covariance_of_a_loop_is_that_of_the_whole():
+    solution = co.solve(unknown_lag.steering(), intervals=30, progress=False)
+    whole, pair = values_of(solution.plot("X"), "X[x, b]"), values_of(solution.plot(("x", "b")), "X[x, b]")
+    np.testing.assert_allclose(pair, whole, rtol=1e-14)
+    nodes = np.isin(solution.plot(("x", "b")).axes[0].lines[0].get_xdata(), solution.t)
+    np.testing.assert_allclose(pair[0][nodes], solution.covariance("x", "b")[:, 0, 0], rtol=1e-12)

@@ -50,3 +50,16 @@ def test_a_problem_of_the_same_declarations_is_the_same_problem():
     costs = [co.solve(problem, intervals=20, substeps=1, progress=False).cost for problem in (ocp, again)]
     assert costs[0] == costs[1]
     assert ca.is_equal(again.time, ocp.time)
+
+
+def test_none_is_no_symbol():
+    """Not the first state either, which has no matrix."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u")
+    with pytest.raises(co.ProblemError, match=r"dynamics\(\)(?s:.)*received: None"):
+        ocp.dynamics(None, u)
+    ocp.dynamics(x, u, noise=0.1)
+    with pytest.raises(co.ProblemError, match=r"received: None"):
+        ocp.minimize_expected(running=u**2, terminal_weight={None: 2.0})
+    S = ocp.symmetric("S", 2, initial=ca.DM.eye(2))
+    ocp.dynamics(S, -S)  # the whole matrix still is one

@@ -184,3 +184,16 @@ def test_more_that_is_refused():
     sampled.minimize_expected(running=u**2 + x**2)
     with pytest.raises(co.ProblemError, match="read at instants"):
         co.Solver(sampled, intervals=10).solve(duration=1.0)
+
+
+@pytest.mark.parametrize("given", [None, 3, "x", co.Problem])
+def test_only_a_problem_is_movable(given):
+    with pytest.raises(co.ProblemError, match=r"expected: a Problem(?s:.)*movable\(problem\)"):
+        co.movable(given)
+
+
+def test_no_solution_and_no_phases_are_movable():
+    problem = lag()
+    for given in (co.solve(problem, intervals=10, progress=False), co.Phases([problem, lag()])):
+        with pytest.raises(co.ProblemError, match="expected: a Problem"):
+            co.movable(given)

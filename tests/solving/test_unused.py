@@ -154,3 +154,52 @@ def test_a_decision_has_a_guess_without_a_time():
     d = ocp.decision("d", 20, guess=np.ones(20))
     ocp.minimize(running=u**2 + ca.sumsqr(d - 2))
     assert co.solve(ocp, intervals=30, progress=False).cost == pytest.approx(1.0)
+
+
+def beside(use):
+    """x' = u, and a second control v in what `use` declares, beside the rate and the cost."""
+    ocp = co.Problem(1.0)
+    x, u, v = ocp.state("x", initial=0.0, variance=1.0), ocp.control("u"), ocp.control("v", guess=0.5)
+    ocp.dynamics(x, u, noise=0.1)
+    ocp.measurement("m", x, noise=1.0)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2 + x**2 + E[x, x])
+    use(ocp, x, u, v)
+    return ocp
+
+
+def test_a_control_on_which_nothing_depends():
+    ocp = beside(lambda ocp, x, u, v: None)
+    with pytest.warns(co.CovocpWarning, match="Nothing depends on the control 'v'"):
+        run(ocp)
+    run(ocp)  # it is said once
+    with pytest.warns(co.CovocpWarning, match="Nothing depends on the control 'v'"):
+        co.evaluate(beside(lambda ocp, x, u, v: None), nominal={"u": 0.0, "v": 0.0})
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda ocp, x, u, v: ocp.dynamics(ocp.state("y", initial=0.0, final=1.0), v),
+        lambda ocp, x, u, v: ocp.dynamics(ocp.state("y", initial=0.0, variance=1.0), 0.0, noise=0.1 + v**2),
+        lambda ocp, x, u, v: ocp.measurement("n", x, noise=1.0 + v**2),
+        lambda ocp, x, u, v: ocp.measurement("n", x * (1 + 0.1 * v), noise=1.0),
+        lambda ocp, x, u, v: ocp.subject_to(u - v, lower=0.0, upper=0.0, name="same"),
+    ],
+    ids=["rate", "noise of a rate", "noise of a reading", "reading", "condition"],
+)
+def test_a_control_that_is_used_somewhere_is_meant(use):
+    from covocp.solving.unused import mention_forgotten
+
+    mention_forgotten(beside(use))  # warnings are errors
+
+
+@pytest.mark.parametrize("expected", [False, True])
+def test_a_control_of_the_cost_is_used(expected):
+    ocp = co.Problem(1.0)
+    x, u, v = ocp.state("x", initial=1.0, variance=1.0), ocp.control("u"), ocp.control("v")
+    ocp.dynamics(x, u, noise=0.1)
+    if expected:
+        ocp.measurement("m", x, noise=1.0)
+    (ocp.minimize_expected if expected else ocp.minimize)(running=u**2 + v**2 + x**2)
+    assert run(ocp).converged

@@ -27,6 +27,8 @@ UNREACHABLE = 1e-10
 MARGINAL = 1e-9
 # Largest relative residual of a Riccati equation that counts as solved.
 RESIDUAL = 1e-7
+# Most Newton steps after scipy's solution: where that is off by a tenth, five reach rounding.
+STEPS = 8
 
 
 def continuous(A: Expr, B: Expr, Q: Expr, R: Expr, *, cross: Expr = None) -> Any:
@@ -252,7 +254,7 @@ def stabilising(
     detectable: bool = False,
     words: Words = CONTROL,
 ) -> Array:
-    """The stabilising solution, one Newton step after scipy's; `detectable`: refuse every unstable mode without weight.
+    """The stabilising solution, Newton steps after scipy's; `detectable`: refuse every unstable mode without weight.
 
     Raises:
         ProblemError: a mode that is not reached, or has no weight and is marginal or must be detectable; no solution.
@@ -267,17 +269,22 @@ def stabilising(
     unseen = lost_modes((A - B @ back).T, cost, discrete=discrete, marginal=not detectable)
     if unseen.size:
         raise lost_mode(unseen, *words.see)
+    # In units of R: scipy's pencil, with R beside A and Q, is off by up to a tenth where their sizes are far apart.
+    # A power of two changes no digit of the numbers.
+    unit = 2.0 ** np.round(np.log2(np.linalg.norm(R, 2))) if R.size else 1.0
+    Q, R, N = Q / unit, R / unit, N / unit
     solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
     try:
         start = np.asarray(solve(A, B, Q, R, s=N), dtype=float)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise _unsolved(str(error)) from error
-    solution, stable = _newton(A, B, Q, R, N, symmetrised(start), discrete)
-    residual = np.abs(_residual(A, B, Q, R, N, solution, discrete)).max(initial=0.0)
+    solution, residual = _newton(A, B, Q, R, N, symmetrised(start), discrete)
     scale = max(np.abs(Q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(A).max(initial=0.0))
-    if not stable or not residual <= RESIDUAL * scale:
-        raise _unsolved("the closed loop is not stable" if not stable else f"a residual of {residual:.3g}")
-    return solution
+    if not residual <= RESIDUAL * scale:
+        raise _unsolved(
+            f"a residual of {residual * unit:.3g}" if np.isfinite(residual) else "the closed loop is not stable"
+        )
+    return solution * unit
 
 
 def _unsolved(received: str) -> ProblemError:
@@ -315,14 +322,25 @@ def is_stable(A: Array, *, discrete: bool) -> bool:
     return bool(np.all(np.abs(values) < 1.0) if discrete else np.all(values.real < 0.0))
 
 
-def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, bool]:
-    """One step of Kleinman's iteration (quadratic convergence: the result is exact to rounding); closed loop stable."""
-    K = gain_of(A, B, R, N, S, discrete=discrete)
-    closed = A - B @ K
-    if not is_stable(closed, discrete=discrete):
-        return S, False
-    right = Q + K.T @ R @ K - N @ K - K.T @ N.T
-    return np.asarray(lyapunov(closed.T, symmetrised(right), discrete=discrete)), True
+def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, float]:
+    """Kleinman's iteration until rounding ends its quadratic convergence, and the residual that is left.
+
+    The residual is infinite where the start makes no stable closed loop.
+    """
+    best, least = S, np.inf
+    left = _residual(A, B, Q, R, N, S, discrete)
+    for _ in range(STEPS):
+        closed = A - B @ gain_of(A, B, R, N, S, discrete=discrete)
+        if not is_stable(closed, discrete=discrete):
+            break
+        # S and a correction from the residual, not S anew: a closed loop of large norm rounds much coarser than A
+        S = S + np.asarray(lyapunov(closed.T, symmetrised(left), discrete=discrete))
+        left = _residual(A, B, Q, R, N, S, discrete)
+        size = float(np.abs(left).max(initial=0.0))
+        if not size < least:
+            break
+        best, least = S, size
+    return best, least
 
 
 def _residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> Array:

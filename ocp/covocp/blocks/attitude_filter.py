@@ -21,6 +21,7 @@ from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.differences import independent, is_usable
 from covocp.blocks.quaternions import quaternion_product
 from covocp.blocks.square_root import in_turn_with_surprise, triangular
+from covocp.blocks.values import matrix
 
 Array = NDArray[np.float64]
 
@@ -164,7 +165,12 @@ def joined(parts: Parts) -> Any:
 
 
 def turn_between(before: Expr, after: Expr) -> Any:
-    """phi of e^(-phi^x) = C_after C_before', (2), of two unit quaternions, (3, 1) [rad]."""
+    """phi of e^(-phi^x) = C_after C_before', (2), of two unit quaternions, (3, 1) [rad].
+
+    Raises:
+        ProblemError: one of them has not four entries.
+    """
+    before, after = matrix("before", before, (QUATERNION, 1)), matrix("after", after, (QUATERNION, 1))
     turn = quaternion_product(ca.vertcat(before[0], -before[1:]), after)
     w, v = turn[0], turn[1:]
     square = ca.sumsqr(v)

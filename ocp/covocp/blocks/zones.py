@@ -111,9 +111,16 @@ def zone_rows(rotation: Expr, zones: Sequence[Zone]) -> Rows:
 
     Returns:
         A (m, 3) and beta (m, 1), as SX or arrays.
+
+    Raises:
+        ProblemError: no rotation matrix, or no list of zones.
     """
     symbolic = isinstance(rotation, ca.SX)
-    C = rotation if symbolic else np.asarray(rotation, dtype=float)
+    C: Any = rotation if symbolic else array("rotation", rotation)
+    if C.shape != (3, 3):
+        raise wrong_argument("rotation", "shape 3 x 3", " x ".join(str(size) for size in C.shape) or "a number")
+    if not isinstance(zones, (list, tuple)) or not all(isinstance(entry, Zone) for entry in zones):
+        raise wrong_argument("zones", "a list of zones", f"{zones!r}"[:100], "make them by zone() or zones_of()")
     rows: list[Any] = []
     bounds: list[Any] = []
     for each in zones:

@@ -152,6 +152,13 @@ class Drawn:
             variances = np.einsum("kui,kij,kuj->ku", gain, loop.Xhat, gain)
         return self.between(np.sqrt(np.maximum(variances, 0.0)))
 
+    def block(self, a: Given, b: Given) -> Array:
+        """Covariance of the actual deviations between two symbols at the times, (K, size of a, size of b)."""
+        nodes = self.solution.covariance(a, b)
+        if self.solution.loop is not None or self.covariance is None:
+            return self.between(nodes)
+        return self.sample[self.covariance.name][:, self.rows(a)][:, :, self.rows(b)]
+
     def between(self, values: Array) -> Array:
         """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""
         ends = zip(_ends(self.solution.mesh.instants, values.shape[0]), _ends(self.early, self.t.size), strict=True)

@@ -452,14 +452,14 @@ def _pairs(block: Block) -> list[list[tuple[int, int]]]:
 
 
 def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) -> list[Panel]:
-    """A block of the covariance of the actual deviations, at the nodes."""
+    """A block of the covariance of the actual deviations, between the nodes as the whole matrix has it."""
     curves: list[Curve] = []
     names: tuple[str, ...] = ()
     for d in [d for d in drawn if all(not isinstance(part, str) or d.knows(part) for part in key)] or drawn:
-        values = d.solution.covariance(*key)
+        values = d.block(*key)
         names = tuple(f"{i}, {j}" for i in range(values.shape[1]) for j in range(values.shape[2]))
         flat = values.reshape(values.shape[0], -1)
-        curves += [Curve(t=d.solution.t, y=flat[:, k], order=d.order, entry=k) for k in range(flat.shape[1])]
+        curves += [Curve(t=d.t, y=flat[:, k], order=d.order, entry=k) for k in range(flat.shape[1])]
     closed = any(d.solution.loop is not None for d in drawn)
     matrix = COVARIANCES[0] if closed else next(b.name for b in drawn[0].solution.blocks if b.estimation)
     label = f"{matrix}[{key[0]}, {key[1]}]" + product_unit(list(key), units)

@@ -90,7 +90,7 @@ def find_name(symbol: Given, what: str, declared: list[Any], allowed: tuple[Any,
             continue
         if (
             symbol is own
-            or symbol is getattr(entry, "matrix", None)
+            or symbol is getattr(entry, "matrix", own)
             or (isinstance(symbol, str) and symbol == entry.name)
         ):
             return str(entry.name)

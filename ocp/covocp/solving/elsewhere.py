@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.arguments import is_number
-from covocp.base.checks import check_positive
+from covocp.base.checks import check_kind, check_positive
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
@@ -42,8 +42,9 @@ def movable(problem: Problem) -> Problem:
         A problem of its own; what is declared later in the other one is not in it.
 
     Raises:
-        ProblemError: the statement is wrong.
+        ProblemError: no problem, or its statement is wrong.
     """
+    check_kind(problem, Problem, "movable(problem): give the problem itself, of several phases each one")
     return Problem.of(restartable(problem.declarations, problem.statement()).declarations)
 
 

@@ -28,7 +28,7 @@ def mention_forgotten(problem: Problem) -> None:
     if problem.doubts_told:
         return
     problem.doubts_told = True
-    for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise):
+    for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise, _mention_idle):
         mention(problem.declarations)
 
 
@@ -150,6 +150,32 @@ def _mention_spread_noise(problem: Declarations) -> None:
                 f"rate is another row of it, has white noise of its own. Give a density for each row: noise=[{listed}] "
                 f"where that is not meant, [{', '.join('q' * state.size)}] where it is."
             )
+
+
+def _mention_idle(problem: Declarations) -> None:
+    """Controls on which nothing depends: no method moves them from where they start."""
+    used = {symbol.__hash__() for expression in _written(problem) for symbol in ca.symvar(expression)}
+    idle = [control.name for control in problem.controls if control.symbol.__hash__() not in used]
+    if idle:
+        listed = " and ".join(f"'{name}'" for name in idle)
+        warn_user(
+            f"Nothing depends on the control{'s' if len(idle) > 1 else ''} {listed}: no rate, noise, measurement, cost "
+            "or condition changes with it, and a solution has its starting guess. Use it in one of them, or leave it "
+            "out."
+        )
+
+
+def _written(problem: Declarations) -> list[ca.MX]:
+    """All expressions of a problem."""
+    entries: list[tuple[Any, ...]] = [tuple(problem.cost or ())]
+    entries += [(entry.rate, entry.noise) for entry in problem.rates.values()]
+    entries += [(entry.expression, entry.noise, entry.information) for entry in problem.measurements]
+    entries += [(entry.expression,) for entry in problem.constraints]
+    entries += [(entry.expression,) for entry in problem.chances]
+    if problem.expected is not None:
+        expected = problem.expected
+        entries += [(expected.running, expected.terminal, expected.terminal_weight, expected.control_weight)]
+    return [value for entry in entries for value in entry if isinstance(value, ca.MX)]
 
 
 def _is_another(rate: Given, symbol: Given, row: int) -> bool:
