@@ -306,6 +306,8 @@ def test_chances_under_another_truth_are_those_of_its_deviations():
         expected = float(np.min(norm.cdf((0.8 - phase["x"]) / spread)))
         assert phase.chances[0].reached == pytest.approx(expected, abs=1e-6)
         assert not phase.chances[0].met
+        assert any("wall" in name for name in phase.violations)
+    assert found.violations == {f"{p.name}: {name}": by for p in found.phases for name, by in p.violations.items()}
 
 
 def test_a_free_duration_at_its_bound_is_held_by_it():

@@ -14,7 +14,7 @@ from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
 from covocp.solution.chances import chance_section
 from covocp.solution.instants import instant_section
-from covocp.solution.origin import Classical
+from covocp.solution.origin import Classical, Origin
 from covocp.statement.statement import Block, Role, entry_names, error_names
 
 if TYPE_CHECKING:
@@ -407,7 +407,8 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
 
 def _between_nodes(solution: Solution) -> Section:
     """What happens to limits where nobody asked: a sentence, empty where they hold."""
-    if solution.statement is None or not solution.converged:
+    other = solution.origin is Origin.OTHER_TRUTH  # what is passed then is among the violations
+    if solution.statement is None or not solution.converged or other:
         return []
     found = [entry for entry in solution.passed_limits() if entry.share > NOTED]
     if not found:

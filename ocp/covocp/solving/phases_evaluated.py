@@ -28,7 +28,15 @@ from covocp.problem.phases import Phases
 from covocp.solution.chances import reached
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
-from covocp.solving.evaluation import SAME, check_same, first_options, run_along, statistics_along, told
+from covocp.solving.evaluation import (
+    SAME,
+    check_same,
+    first_options,
+    run_along,
+    statistics_along,
+    told,
+    violations_under,
+)
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.statement.chain import Chain
@@ -217,9 +225,12 @@ def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
             stored_optimality=None,
             within=replace(phase.within, deviations=closed.start, handed=0.0),
         )
-        phases.append(replace(evaluated, chances=reached(evaluated)))
+        phases.append(replace(evaluated, chances=reached(evaluated), violations=violations_under(evaluated)))
     message = "evaluated under other statistics than the design's"
-    return replace(solution, method=METHOD, message=message, phases=tuple(phases))
+    missed = {f"{phase.name}: {name}": by for phase in phases for name, by in phase.violations.items()}
+    named = tuple(f"{phase.name}: " for phase in phases)
+    between = {name: by for name, by in solution.violations.items() if not name.startswith(named)}
+    return replace(solution, method=METHOD, message=message, phases=tuple(phases), violations=missed | between)
 
 
 def _true_chain(solution: PhasesSolution, truth: Given) -> ChainStatistics:
