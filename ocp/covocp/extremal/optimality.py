@@ -219,12 +219,8 @@ def identities(
     smallest_eigenvalue: float,
     loop: ClosedLoop | None,
     cost_identity: float | None,
-    other_truth: bool = False,
 ) -> Optimality:
-    """What holds along a nominal that was not chosen for this cost: no condition of optimality does.
-
-    Under other statistics than the design's estimate and error are correlated, and should be.
-    """
+    """What holds along a nominal that was not chosen for this cost: no condition of optimality does."""
     return Optimality(
         stationarity=None,
         control_slope=None,
@@ -237,7 +233,7 @@ def identities(
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=None,
         cost_identity=cost_identity,
-        **(_loop_identities(loop) | ({"cross_covariance": None} if other_truth else {})),
+        **_loop_identities(loop),
     )
 
 

@@ -53,7 +53,7 @@ RESIDUALS = {
     "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
     "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
     "cost_identity": "expected cost: as optimised against from the covariances (relative)",
-    "cross_covariance": "correlation of the estimate and its error, zero in theory",
+    "cross_covariance": "correlation of the estimate and its error, zero by the statistics of the design",
     "conservation": "variances E + Xhat that no control changes: error (relative)",
     "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
 }
@@ -401,6 +401,8 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
         return "not assessed"
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
+    if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
+        return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
     return words if solution.converged and abs(value) > level else ""
 

@@ -243,7 +243,7 @@ class Solution:
             return self.stored_optimality
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
-            return identities(self.extremal, *known, other_truth=self.origin is Origin.OTHER_TRUTH)
+            return identities(self.extremal, *known)
         return assess(self.extremal, self.costates, *known, self.within)
 
     @property
