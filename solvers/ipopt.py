@@ -89,7 +89,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh and formulation.
-        parameters: values that the mesh is made for; None: the declared ones.
+        parameters: values (np,) that the mesh is made for; None: the declared ones.
         tolerance: of Ipopt, on the scaled optimality conditions; None: 1e-7.
         max_iterations: of Ipopt; None: 1000.
         hessian: of Ipopt: "auto" (limited-memory where matrices are eliminated, else exact), "exact" or

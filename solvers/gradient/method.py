@@ -104,7 +104,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh; `segments` and `covariances` mean nothing here, and inequalities are met at the nodes only.
-        parameters: values that the mesh is made for; None: the declared ones.
+        parameters: values (np,) that the mesh is made for; None: the declared ones.
         variant: "gradient", or "chord": solve H_u(x, E, p, P, u_c) = 0 along the present x, E, p, P and step towards
             u_c [4.2-10].
         weight: W: "adaptive" (w H_uu, w from predicted and actual changes), "curvature" (H_uu, fixed factor), or a

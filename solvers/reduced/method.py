@@ -56,7 +56,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh; matrices are eliminated.
-        parameters: values that the mesh is made for; None: the declared ones.
+        parameters: values (np,) that the mesh is made for; None: the declared ones.
         tolerance: see above.
         max_iterations: of one run.
 

@@ -48,7 +48,7 @@ def prepare(
     Args:
         statement: the problem.
         options: mesh and formulation.
-        parameters: values that the mesh is made for; None: the declared ones.
+        parameters: values (np,) that the mesh is made for; None: the declared ones.
         tolerance: of the method that solves; None: its own.
         max_iterations: of the method that solves; None: its own.
 

@@ -23,7 +23,7 @@ def made_ready(method: str, statement: Statement, options: Options, parameters: 
         method: its name.
         statement: the problem.
         options: of the mesh.
-        parameters: values that the mesh is made for.
+        parameters: values (np,) that the mesh is made for.
         own: options of the method.
 
     Raises:

@@ -21,7 +21,7 @@ def regraded(statement: Statement, options: Options, present: Options, parameter
         statement: whose covariances and gains the mesh is graded for.
         options: before they were graded.
         present: of the present mesh.
-        parameters: their values.
+        parameters: their values, (np,).
     """
     if options.grid is not None:
         return None
@@ -36,7 +36,7 @@ def suits(statement: Statement, options: Options, mesh: Mesh, parameters: Array)
         statement: the problem.
         options: that the mesh was chosen by at first.
         mesh: its present steps may be shorter.
-        parameters: their values.
+        parameters: their values, (np,).
 
     Raises:
         ProblemError: steps that the user gave diverge for these values.

@@ -100,7 +100,7 @@ def fits(statement: Statement, mesh: Mesh, parameters: Array) -> bool:
     Args:
         statement: the problem.
         mesh: of it.
-        parameters: their values.
+        parameters: their values, (np,).
 
     Returns:
         False also where a quick look does not tell: implicit steps, matrices in explicit ones, a start that is guessed.
