@@ -28,7 +28,7 @@ plain = [name for name in ("models", "solvers") if not Path("ocp", "covocp", nam
 mapped = [f"covocp.{name}.{inner}" for name in plain for inner in find_packages(name)]
 passage = Extension(
     "covocp.passage._passage",
-    ["ocp/covocp/passage/passage.c"],
+    ["ocp/covocp/passage/passage.c", "ocp/covocp/passage/newer.c"],
     depends=sorted(str(path) for path in Path("ocp", "covocp", "passage").glob("*.h")),
     py_limited_api=True,
     optional=True,  # without a compiler: `covocp.build_info()` says so

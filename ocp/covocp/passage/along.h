@@ -1,6 +1,6 @@
 /* Tangents of the passage, and of its slopes. */
 /* X' M = B solved in place, B (n x n); X' = P' L U. */
-INLINE void divide_transposed(const double *RESTRICT factor, const double *RESTRICT swaps, int n, double *RESTRICT B) {
+static void divide_transposed(const double *RESTRICT factor, const double *RESTRICT swaps, int n, double *RESTRICT B) {
     for (int k = 0; k < n; ++k) exchange(B, n, k, (int)swaps[k]);
     for (int i = 1; i < n; ++i) add_rows(B + i * n, -1.0, factor + i * n, 1, B, n, i, n);
     for (int i = n - 1; i >= 0; --i) {
@@ -12,7 +12,7 @@ INLINE void divide_transposed(const double *RESTRICT factor, const double *RESTR
 }
 
 /* product += share H Y of a matrix H by its nonzeros, Y (2n x n). */
-INLINE void add_sparse(
+static void add_sparse(
     const Passage *p, int n, double share, const double *RESTRICT h, const double *RESTRICT Y, double *RESTRICT product
 ) {
     for (int q = 0; q < p->nnz; ++q) {
@@ -24,14 +24,14 @@ INLINE void add_sparse(
 }
 
 /* [top; E], top the identity or zero. */
-INLINE void stack(int n, int identity, const double *RESTRICT E, double *RESTRICT Z) {
+static void stack(int n, int identity, const double *RESTRICT E, double *RESTRICT Z) {
     memset(Z, 0, sizeof(double) * n * n);
     for (int i = 0; identity && i < n; ++i) Z[i * n + i] = 1.0;
     memcpy(Z + n * n, E, sizeof(double) * n * n);
 }
 
 /* The tangent of one step: dE becomes that after it; those of the stages and of X are kept. */
-INLINE void tangent_step(
+static void tangent_step(
     Kept *kept, int n, int k, const double *E, const double *next, const double *d1, const double *d2,
     double *RESTRICT dE, double *RESTRICT spare
 ) {
@@ -74,7 +74,7 @@ INLINE void tangent_step(
 }
 
 /* The tangent of what reading j does: dE becomes that after it; those of K, A and E+ are kept. */
-INLINE void tangent_reading(Kept *kept, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
+static void tangent_reading(Kept *kept, int n, int j, const double *E, const double *d_told, double *RESTRICT dE) {
     const Passage *p = &kept->p;
     const int r = p->r;
     const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
@@ -119,7 +119,7 @@ static int same(double **kept, const double *given, size_t count) {
 }
 
 /* Tangents along the passage, of the half-vectors after each step too; those along the last direction are known. */
-INLINE void tangents(
+static void tangents(
     Kept *kept, int n, const double *d_first, const double *d1, const double *d2, const double *d_told,
     const double *d_kicks
 ) {
@@ -161,7 +161,7 @@ INLINE void tangents(
 }
 
 /* How the slopes at reading j move: P and dP become those before it. */
-INLINE void back_reading_tangent(
+static void back_reading_tangent(
     const Kept *kept, int n, int j, double *RESTRICT P, double *RESTRICT dP, double *RESTRICT spare, double *d_by_told
 ) {
     const Passage *p = &kept->p;
@@ -194,7 +194,7 @@ INLINE void back_reading_tangent(
 }
 
 /* How the slopes of `back` move along the tangents. */
-INLINE void back_tangents(
+static void back_tangents(
     const Kept *kept, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
     double *d_by_told, double *d_by_kicks
 ) {

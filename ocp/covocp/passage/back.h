@@ -1,6 +1,6 @@
 /* Slopes, from the last step to the first. */
 /* M <- X^-1 M, M (n x r) row by row; X' = P' L U. */
-INLINE void divide(const double *RESTRICT factor, const double *RESTRICT swaps, int n, int r, double *RESTRICT M) {
+static void divide(const double *RESTRICT factor, const double *RESTRICT swaps, int n, int r, double *RESTRICT M) {
     for (int i = 0; i < n; ++i) {
         const double inverse = 1.0 / factor[i * n + i];
         double *RESTRICT own = M + i * r;
@@ -55,7 +55,7 @@ INLINE void add_seed(int n, const double *RESTRICT seed, double *RESTRICT P) {
 }
 
 /* X^-1 P X^-T, symmetric. */
-INLINE void congruent(const Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
+static void congruent(const Passage *p, int n, int k, double *RESTRICT P, double *RESTRICT spare) {
     const double *factor = p->factor + (size_t)k * n * n;
     const double *swaps = p->swaps + (size_t)k * n;
     divide(factor, swaps, n, n, P);
@@ -72,7 +72,7 @@ typedef struct {
     double *P, *M, *C;
 } Slopes;
 
-INLINE void write_out(Slopes *s, int n, double *RESTRICT P) {
+static void write_out(Slopes *s, int n, double *RESTRICT P) {
     const int r = s->few;
     for (int i = 0; i < n; ++i)
         for (int j = 0; j <= i; ++j) {
@@ -84,7 +84,7 @@ INLINE void write_out(Slopes *s, int n, double *RESTRICT P) {
 }
 
 /* The slopes of one step's result join those of what comes after; `rows`: n to work in. */
-INLINE void join(Slopes *s, int n, int *RESTRICT rows, const double *RESTRICT seed) {
+static void join(Slopes *s, int n, int *RESTRICT rows, const double *RESTRICT seed) {
     const int half = n * (n + 1) / 2;
     int asked = 0;
     for (int t = 0; t < half && !asked; ++t) asked = seed[t] != 0.0;
@@ -112,7 +112,7 @@ INLINE void join(Slopes *s, int n, int *RESTRICT rows, const double *RESTRICT se
     add_seed(n, seed, s->P);
 }
 
-INLINE void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRICT half) {
+static void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRICT half) {
     double *P = s->P;
     if (!s->any) {
         memset(half, 0, sizeof(double) * n * (n + 1) / 2);
@@ -142,7 +142,7 @@ INLINE void back_few(const Passage *p, int n, int r, int k, Slopes *s, double *R
 }
 
 /* The same with all of P. */
-INLINE void back_all(const Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
+static void back_all(const Passage *p, int n, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
     congruent(p, n, k, s->P, spare);
     for (int stage = 0; stage < 2; ++stage) {
         const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n;
@@ -153,13 +153,13 @@ INLINE void back_all(const Passage *p, int n, int k, Slopes *s, double *RESTRICT
 }
 
 /* Half-vector of slopes by a symmetric (r x r) matrix: both places move with one entry. */
-INLINE void pack_noise(const double *RESTRICT slope, int r, double *RESTRICT half) {
+static void pack_noise(const double *RESTRICT slope, int r, double *RESTRICT half) {
     for (int j = 0, t = 0; j < r; ++j)
         for (int i = j; i < r; ++i, ++t) half[t] = i == j ? slope[i * r + j] : slope[i * r + j] + slope[j * r + i];
 }
 
 /* Slopes before a reading and by what tells of it: few columns, or all of P. */
-INLINE void back_reading(const Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
+static void back_reading(const Passage *p, int n, int j, Slopes *s, double *RESTRICT spare, double *by_told) {
     const int r = p->r, few = s->few;
     const size_t square = (size_t)n * n, tall = (size_t)r * n;
     const double *K = p->gain + j * tall, *A = p->keep + j * square;
@@ -182,7 +182,7 @@ INLINE void back_reading(const Passage *p, int n, int j, Slopes *s, double *REST
     product(spare, A, n, n, n, s->P);
 }
 
-INLINE void back(
+static void back(
     const Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
     double *by_kicks
 ) {

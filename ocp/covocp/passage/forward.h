@@ -3,7 +3,7 @@
  *
  * p->sizes: what each entry of the diagonal is summed from.
  */
-INLINE void assemble(const Passage *p, int n, int k, const double *RESTRICT E, int w, double *RESTRICT a) {
+static void assemble(const Passage *p, int n, int k, const double *RESTRICT E, int w, double *RESTRICT a) {
     const int m = 2 * n, nnz = p->nnz, transition = w == 2 * m;
     const double *RESTRICT h1 = p->h1 + (size_t)k * nnz, *RESTRICT h2 = p->h2 + (size_t)k * nnz;
     double *RESTRICT sizes = p->sizes;
@@ -31,7 +31,7 @@ INLINE void assemble(const Passage *p, int n, int k, const double *RESTRICT E, i
 }
 
 /* The system of step k solved in a (2n x w): for its first stage, or for other right sides; with exchanges if need be. */
-INLINE void solve_full(
+static void solve_full(
     const Passage *p, int n, int k, const double *RESTRICT E, int w, const double *right, double *RESTRICT a
 ) {
     const int m = 2 * n, columns = w - m;
@@ -46,7 +46,7 @@ INLINE void solve_full(
 }
 
 /* V = ((I - g H1) Y1 - Z0)/a, of some columns. */
-INLINE void change(
+static void change(
     const Passage *p, int n, int k, int columns, const double *RESTRICT Y1, const double *RESTRICT Z0, double *RESTRICT V
 ) {
     const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz;
@@ -64,7 +64,7 @@ INLINE void change(
 }
 
 /* D [I; E] of a (2n x 2n) matrix. */
-INLINE void applied(const double *RESTRICT D, const double *RESTRICT E, int n, double *RESTRICT product) {
+static void applied(const double *RESTRICT D, const double *RESTRICT E, int n, double *RESTRICT product) {
     for (int i = 0; i < 2 * n; ++i) {
         double *RESTRICT own = product + i * n;
         memcpy(own, D + i * 2 * n, sizeof(double) * n);
@@ -90,7 +90,7 @@ static int measures_much(const Passage *p, int k, const double *E) {
  * [I; E] goes through the step as it is. Where much is measured the transition D itself is made, from which E's rounding
  * is apart: the errors of D [I; E] stay in proportion to what they come from.
  */
-INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
+static void step(Passage *p, int n, int k, double *RESTRICT E) {
     const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
     double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
     const size_t place = p->lean ? 0 : (size_t)k;
@@ -125,7 +125,7 @@ INLINE void step(Passage *p, int n, int k, double *RESTRICT E) {
 static double *aside(const Passage *p) { return p->work + 17 * (size_t)p->n * p->n; }
 
 /* What reading j does: E (n x n) becomes the one after it; what slopes need is kept. */
-INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
+static void reading(Passage *p, int n, int j, double *RESTRICT E) {
     const int r = p->r, w = 2 * r + n;
     const size_t square = (size_t)n * n, tall = (size_t)r * n, wide = (size_t)r * r;
     const double *M = p->told + j * telling(p), *half = M + tall;
@@ -156,7 +156,7 @@ INLINE void reading(Passage *p, int n, int j, double *RESTRICT E) {
 }
 
 /* The passage from the first half-vector on, at p->h1, p->h2, p->told; kicks are added to what passes, NULL: nothing. */
-INLINE void passes(Passage *p, int n, const double *first, const double *kicks) {
+static void passes(Passage *p, int n, const double *first, const double *kicks) {
     const size_t half = (size_t)n * (n + 1) / 2;
     double *E = p->work + 14 * n * n;
     spread(first, n, E);

@@ -12,7 +12,7 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 6
+VERSION = 7
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -29,6 +29,9 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }
 
+# What the library has twice, the second time for newer processors (newer.c).
+_TWICE = ("passage_forward", "passage_reverse", "passage_tangent", "transitions", "passed_back")
+
 
 @lru_cache(maxsize=1)
 def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
@@ -38,8 +41,9 @@ def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
         return None, "it was not built: the installation found no C compiler"
     try:
         library = ctypes.CDLL(found.origin)
-        functions = {name: getattr(library, name) for name in _SIGNATURES}
         version = _version(library)
+        newer = _TWICE if version == VERSION and library.passage_newer() else ()
+        functions = {name: getattr(library, f"{name}_newer" if name in newer else name) for name in _SIGNATURES}
     except (OSError, AttributeError) as error:
         return None, f"it cannot be loaded: {error}"
     if version != VERSION:

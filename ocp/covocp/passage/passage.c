@@ -6,78 +6,70 @@
 #define Py_LIMITED_API 0x030b0000
 #include <Python.h>
 
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
+#include "library.h"
 
-/* One file for all machines: where the loader can choose, there is a second version for newer processors. */
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define VERSIONS __attribute__((target_clones("arch=x86-64-v3", "default")))
-#else
-#define VERSIONS
-#endif
-
-#include "memory.h"
-#include "rows.h"
-#include "sparse.h"
-#include "forward.h"
-#include "back.h"
+#define NAME(function) function
+#include "calls.h"
+#include "places.h"
 #include "written.h"
-#include "kept.h"
-#include "along.h"
-#include "transitions.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 6; }
+EXPORT int passage_version(void) { return 7; }
 
-/* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
-EXPORT VERSIONS void passage_forward(
-    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
-    double *after
-) {
-    const Passage *p = &k->p;
-    run(k, p->n, first, h1, h2, told, kicks);
-    if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
-}
-
-/* Slopes of seed . after by the arguments; those that are NULL are left out. */
-EXPORT VERSIONS void passage_reverse(
-    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
-    const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told, double *by_kicks
-) {
-    run(k, k->p.n, first, h1, h2, told, kicks);
-    back(&k->p, k->p.n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
-}
-
-/* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
- *
- * Results that are NULL are left out; seed is NULL where no slopes are wanted, tangents of kicks and seeds where they
- * are zero.
- */
-EXPORT VERSIONS int passage_tangent(
-    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
-    const double *seed, const double *d_first, const double *d_h1, const double *d_h2, const double *d_told,
-    const double *d_kicks, const double *d_seed, double *d_after, double *d_by_first, double *d_by_h1,
-    double *d_by_h2, double *d_by_told, double *d_by_kicks
-) {
-    const Passage *p = &k->p;
-    const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
-    const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->count, d = sizeof(double);
-    if (!k->moved) k->moved = room((size_t)p->moves * 5 * square, d);
-    if (!k->turned) k->turned = room((size_t)p->reads * turned, d);
-    if (!k->direction) k->direction = calloc(numbers(p), d); /* compared before it is first written */
-    if (!k->shifted) k->shifted = room(all, d);
-    if (!k->moved || !k->turned || !k->direction || !k->shifted) return 1;
-    run(k, p->n, first, h1, h2, told, kicks);
-    tangents(k, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
-    if (d_after) memcpy(d_after, k->shifted, d * all);
-    if (seed) back_tangents(k, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
+/* Whether this processor can take the functions whose names end in _newer. */
+EXPORT int passage_newer(void) {
+#if NEWER
+    __builtin_cpu_init();
+    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#else
     return 0;
+#endif
 }
 
-/* What exported code computes, by the same operations: without the version for newer processors. */
+EXPORT void passage_free(Kept *k) {
+    if (!k) return;
+    void *owned[] = {k->whole, k->reals, k->moved, k->turned, k->direction, k->shifted};
+    for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
+    free(k);
+}
+
+/* A passage of a shape of `length` numbers; NULL where there is no memory. `lean`: for values alone. */
+EXPORT Kept *passage_new(const int *shape, int length, int lean) {
+    Kept *k = calloc(1, sizeof *k);
+    if (!k) return NULL;
+    k->whole = room((size_t)length + 2 * shape[0], sizeof(int));
+    if (k->whole) {
+        memcpy(k->whole, shape, sizeof(int) * length);
+        described(&k->p, k->whole);
+        k->p.chosen = k->whole + length;
+        k->p.lean = lean;
+        k->reals = room(keeps(&k->p, NULL) + works(&k->p, NULL) + numbers(&k->p), sizeof(double));
+    }
+    if (!k->reals) {
+        passage_free(k);
+        return NULL;
+    }
+    Passage *p = &k->p;
+    const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = (size_t)p->nnz * p->moves;
+    double *at = k->reals + keeps(p, k->reals);
+    at += works(p, at);
+    k->first = at, k->h1 = k->first + half, k->h2 = k->h1 + entries;
+    k->told = k->h2 + entries, k->kicks = k->told + telling(p) * p->reads;
+    p->h1 = k->h1, p->h2 = k->h2, p->told = k->told;
+    return k;
+}
+
+/* Bytes of such a passage, with its tangents unless it is for values alone. */
+EXPORT size_t passage_bytes(const int *shape, int lean) {
+    Passage p;
+    described(&p, shape);
+    p.lean = lean;
+    const size_t n = p.n, square = n * n, own = keeps(&p, NULL) + works(&p, NULL) + numbers(&p);
+    const size_t moved = 5 * square * p.moves + (p.r * n + 2 * square) * p.reads;
+    return sizeof(double) * (own + (lean ? 0 : moved + numbers(&p) + n * (n + 1) / 2 * p.count));
+}
+
+/* What exported code computes, by the same operations: not those for newer processors. */
 EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }
 
 EXPORT void exported_forward(

@@ -105,7 +105,7 @@ enum { PANEL = 8 };
 
 /* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL), the
  * others solved. */
-INLINE void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) {
+static void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) {
     for (int k = 0; k < m; k += PANEL) {
         const int end = k + PANEL < m ? k + PANEL : m;
         panel(a, m, w, k, end, swaps);
@@ -124,7 +124,7 @@ static const double STEADY = 0.03;
  * Which rows are exchanged depends on their units; whether a pivot is good does not where the matrix is that of the
  * identity and what moves entries of one unit to those of another.
  */
-INLINE int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT sizes) {
+static int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT sizes) {
     for (int k = 0; k < m; k += PANEL) {
         const int end = k + PANEL < m ? k + PANEL : m;
         for (int c = k; c < end; ++c) {
@@ -156,7 +156,7 @@ INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) 
 }
 
 /* A B, (rows x inner) (inner x columns). */
-INLINE void product(
+static void product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
@@ -188,7 +188,7 @@ INLINE void product_turned(
 }
 
 /* A' B, (inner x rows)' (inner x columns). */
-INLINE void turned_product(
+static void turned_product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);

@@ -45,7 +45,7 @@ INLINE double written_row(const Passage *p, int k, int i, double *RESTRICT row) 
 }
 
 /* B (2n x columns) becomes the solution of the system of step k with it; 0 where a pivot is not good: B is lost then. */
-INLINE int solve_sparse(const Passage *p, int n, int k, int columns, double *RESTRICT B) {
+static int solve_sparse(const Passage *p, int n, int k, int columns, double *RESTRICT B) {
     const int m = 2 * n;
     double *RESTRICT row = p->values, *RESTRICT inverses = row + m, *RESTRICT shares = inverses + m, *RESTRICT upper = shares + m;
     int *RESTRICT rows = p->chosen;
@@ -76,7 +76,7 @@ INLINE int solve_sparse(const Passage *p, int n, int k, int columns, double *RES
 }
 
 /* The first stage of step k, (I - g H2) [I; E] or all columns of I - g H2 on the right; 0 as above. */
-INLINE int sparse_stage(const Passage *p, int n, int k, const double *RESTRICT E, int columns, double *RESTRICT stage) {
+static int sparse_stage(const Passage *p, int n, int k, const double *RESTRICT E, int columns, double *RESTRICT stage) {
     const double *RESTRICT h2 = p->h2 + (size_t)k * p->nnz;
     const int m = 2 * n, all = columns == m;
     memset(stage, 0, sizeof(double) * m * columns);

@@ -13,7 +13,7 @@ typedef struct {
 } Steps;
 
 /* K = A [D; I], I at the places of an interval's rest; the first `active` of `wide` columns. */
-INLINE void slopes_of(
+static void slopes_of(
     const Steps *s, const double *RESTRICT A, const int *places, const double *D, int active, int wide,
     double *RESTRICT K
 ) {
@@ -32,7 +32,7 @@ INLINE void slopes_of(
 }
 
 /* One step: D moves; K and moved are spare. */
-INLINE void carry(
+static void carry(
     const Steps *s, const double *A, const int *places, int active, int wide, double *RESTRICT D, double *RESTRICT K,
     double *RESTRICT moved, double *RESTRICT sum
 ) {
@@ -57,7 +57,7 @@ INLINE void carry(
  * of D that an interval and those before it reach. slopes: nonzeros of A, of each stage of each step. results: D of each
  * segment, column by column, as wide as the last of its intervals reaches. Nonzero without memory.
  */
-EXPORT VERSIONS int transitions(
+EXPORT int NAME(transitions)(
     int rows, int nnz, const int *row, const int *col, int rest, int steps, int segments, const int *lengths,
     const int *places, const int *active, const double *slopes, double *results
 ) {
@@ -91,7 +91,7 @@ EXPORT VERSIONS int transitions(
  *
  * by_rate: of each k_i and of the rate of the cost; by_place: of where it is taken.
  */
-INLINE void carry_back(
+static void carry_back(
     const Steps *s, const double *A, const int *places, double cost, double *RESTRICT slope, double *RESTRICT by_rate,
     double *RESTRICT by_place, double *RESTRICT rest
 ) {
@@ -121,7 +121,7 @@ INLINE void carry_back(
  * As `transitions`; by_states: its slopes by the states after each step; by_costs: by the running cost of each interval.
  * results: of each segment, as wide as the last of its intervals reaches.
  */
-EXPORT VERSIONS int passed_back(
+EXPORT int NAME(passed_back)(
     int rows, int nnz, const int *row, const int *col, int rest, int steps, int segments, const int *lengths,
     const int *places, const int *active, const double *slopes, const double *by_states, const double *by_costs,
     double *results

@@ -26,7 +26,7 @@ from covocp.passage.shape import Pattern, shape
 from covocp.passage.sweep import Told, entries
 
 # What the bodies call, in the order in which C must see it.
-SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "back.h", "written.h")
+SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "back.h", "places.h", "written.h")
 WHAT = ("forward", "slopes")
 WIDTH = 24  # numbers of a line
 Form = Literal["evaluated", "written"]

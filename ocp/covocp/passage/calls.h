@@ -1,0 +1,54 @@
+/* What computes, under names that the file including it gives: NAME(passage_forward), ... */
+#include "memory.h"
+#include "rows.h"
+#include "sparse.h"
+#include "forward.h"
+#include "back.h"
+#include "kept.h"
+#include "along.h"
+#include "transitions.h"
+
+/* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
+EXPORT void NAME(passage_forward)(
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    double *after
+) {
+    const Passage *p = &k->p;
+    run(k, p->n, first, h1, h2, told, kicks);
+    if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
+}
+
+/* Slopes of seed . after by the arguments; those that are NULL are left out. */
+EXPORT void NAME(passage_reverse)(
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told, double *by_kicks
+) {
+    run(k, k->p.n, first, h1, h2, told, kicks);
+    back(&k->p, k->p.n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+}
+
+/* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
+ *
+ * Results that are NULL are left out; seed is NULL where no slopes are wanted, tangents of kicks and seeds where they
+ * are zero.
+ */
+EXPORT int NAME(passage_tangent)(
+    Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
+    const double *seed, const double *d_first, const double *d_h1, const double *d_h2, const double *d_told,
+    const double *d_kicks, const double *d_seed, double *d_after, double *d_by_first, double *d_by_h1,
+    double *d_by_h2, double *d_by_told, double *d_by_kicks
+) {
+    const Passage *p = &k->p;
+    const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
+    const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->count, d = sizeof(double);
+    if (!k->moved) k->moved = room((size_t)p->moves * 5 * square, d);
+    if (!k->turned) k->turned = room((size_t)p->reads * turned, d);
+    if (!k->direction) k->direction = calloc(numbers(p), d); /* compared before it is first written */
+    if (!k->shifted) k->shifted = room(all, d);
+    if (!k->moved || !k->turned || !k->direction || !k->shifted) return 1;
+    run(k, p->n, first, h1, h2, told, kicks);
+    tangents(k, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
+    if (d_after) memcpy(d_after, k->shifted, d * all);
+    if (seed) back_tangents(k, p->n, seed, d_seed, d_by_first, d_by_h1, d_by_h2, d_by_told, d_by_kicks);
+    return 0;
+}

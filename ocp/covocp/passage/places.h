@@ -1,0 +1,44 @@
+/* What tells a passage, and where its numbers lie in memory of the caller. */
+/* Tells a passage its shape. */
+static void described(Passage *p, const int *shape) {
+    const int filled = shape[4], m = 2 * shape[0];
+    memset(p, 0, sizeof *p);
+    p->n = shape[0], p->nnz = shape[1], p->count = shape[2], p->r = shape[3];
+    p->place = shape + 5;
+    for (int k = 0; k < p->count; ++k) p->place[k] < 0 ? ++p->reads : ++p->moves;
+    p->row = p->place + p->count, p->col = p->row + p->nnz;
+    p->begin = p->col + p->nnz, p->across = p->begin + m + 1, p->which = p->across + p->nnz;
+    if (!filled) return;
+    p->order = p->which + p->nnz, p->rank = p->order + m;
+    p->left = p->rank + m, p->right = p->left + m + 1;
+    p->before = p->right + m + 1, p->facing = p->before + p->right[m], p->behind = p->facing + p->right[m];
+}
+
+/* Gives a place to one array; `memory` NULL: counts only. */
+static double *placed(double *memory, size_t *used, size_t count) {
+    double *place = memory ? memory + *used : NULL;
+    *used += count;
+    return place;
+}
+
+/* Places for what is kept of the steps, from `memory` on; their number. */
+static size_t keeps(Passage *p, double *memory) {
+    const size_t n = p->n, square = n * n, steps = p->lean && p->moves ? 1 : (size_t)p->moves, reads = p->reads;
+    size_t used = 0;
+    p->after = placed(memory, &used, n * (n + 1) / 2 * p->count);
+    p->stage1 = placed(memory, &used, steps * 2 * square), p->stage2 = placed(memory, &used, steps * 2 * square);
+    p->factor = placed(memory, &used, steps * square), p->swaps = placed(memory, &used, steps * n);
+    p->gain = placed(memory, &used, reads * p->r * n), p->keep = placed(memory, &used, reads * square);
+    p->inverse = placed(memory, &used, reads * p->r * p->r), p->reached = placed(memory, &used, reads * square);
+    return used;
+}
+
+/* Places to work in, from `memory` on; their number. */
+static size_t works(Passage *p, double *memory) {
+    const size_t n = p->n, r = p->r, filled = p->order ? (size_t)p->right[2 * n] : 0;
+    size_t used = 0;
+    p->work = placed(memory, &used, 17 * n * n + 4 * (r * r + r * n));
+    p->sizes = placed(memory, &used, 2 * n);
+    p->values = placed(memory, &used, p->order ? 6 * n + filled : 0);
+    return used;
+}
