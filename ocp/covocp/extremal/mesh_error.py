@@ -14,7 +14,7 @@ from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_end, refined_run
-from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
 from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -33,6 +33,11 @@ LONG_STEPS = 1e-2
 ALONG, OPTIMISED = 1e-4, 2e-3
 # Order of the steps, by how much they are divided at a time at most, and how many there may be in an interval.
 ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
+# What steps that are far too long say is too much: before a run they are looked at again from so many times as many on.
+LOOKED_AGAIN = 3.0
+# By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
+# less than it will be unless the steps are far too long there.
+MARGIN, BEFORE = 1.5, 2.0
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
@@ -138,15 +143,29 @@ def finer_steps(
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
-    mesh = extremal.mesh
+    return _divided(extremal, options, allowed, running)
+
+
+def _divided(
+    extremal: Extremal,
+    options: Options,
+    allowed: float,
+    running: float | None = None,
+    most: float = MOST_TIMES,
+    margin: float = MARGIN,
+) -> Options | None:
+    """`finer_steps`, of at most so many times as many, for so many times less change."""
+    statement, mesh = extremal.statement, extremal.mesh
     times = node_error(extremal) / allowed
-    if extremal.statement.fed and running is not None:
+    if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
     if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
         return None
     order = 2 if mesh.step == "strang" else ORDER
-    factor = int(np.clip(np.ceil(times ** (1 / order)), 2, MOST_TIMES))
-    substeps = min(factor, MOST_SUBSTEPS // mesh.substeps) * mesh.substeps
+    unit = step_unit(statement, mesh)
+    wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
+    fewest = mesh.substeps // unit + 1
+    substeps = min(max(int(np.ceil(wanted / unit)), fewest), MOST_SUBSTEPS // unit) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
@@ -164,12 +183,24 @@ def steps_along(
         parameters: of the statement.
         options: of the mesh.
         allowed: largest change, relative to the range of each entry.
+
+    Returns:
+        None where the steps are short enough, or cannot be shorter.
     """
-    own = refined_run(statement, mesh, guess, parameters, parts=1)
-    trajectory = replace(guess, x=own.states, e=own.matrices)
-    multipliers = Multipliers.zero(statement, mesh)
-    along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=multipliers)
-    return finer_steps(along, options, allowed)
+    found, margin = None, 1.0
+    allowed /= BEFORE
+    while True:
+        own = refined_run(statement, mesh, guess, parameters, parts=1)
+        trajectory = replace(guess, x=own.states, e=own.matrices)
+        without = Multipliers.zero(statement, mesh)
+        along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=without)
+        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin)
+        if finer is None:
+            return found
+        found, times = finer, int(finer.substeps) / mesh.substeps
+        if times < LOOKED_AGAIN or int(finer.substeps) >= MOST_SUBSTEPS // 2:
+            return found
+        options, mesh, margin = finer, replace(mesh, substeps=int(finer.substeps)), 1.0 / BEFORE
 
 
 def _moved(jumps: Array, x: Array) -> float:

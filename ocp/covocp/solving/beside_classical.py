@@ -47,7 +47,7 @@ def is_worse(solution: Solution, classical: float) -> bool:
 def left_open(solution: Solution, classical: float) -> bool:
     """Whether a combined design costs more than the classical one on shorter steps, by what these may explain."""
     excess = solution.cost - classical
-    return is_worse(solution, classical) and bool(excess <= (WORSE + STEPS * solution.mesh_error) * abs(classical))
+    return bool(WORSE * abs(classical) < excess <= (WORSE + STEPS * solution.mesh_error) * abs(classical))
 
 
 def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:

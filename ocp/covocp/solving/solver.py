@@ -57,7 +57,7 @@ from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
 from covocp.transcription.instants import with_instants
-from covocp.transcription.mesh import INTERVALS, Mesh, Options, with_substeps
+from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_substeps
 from covocp.transcription.starts import own_start
 
 # Arguments of `solve` beside the options of mesh and method.
@@ -513,10 +513,10 @@ class Solver:
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""
         own = self._prepared.mesh
-        times, rest = divmod(mesh.substeps, own.substeps)
         alike = mesh.step == own.step and np.array_equal(mesh.nodes, own.nodes)
-        if self._own_steps and alike and times > 1 and not rest:
-            options = with_substeps(self._options, own, mesh.substeps)
+        if self._own_steps and alike and mesh.substeps > own.substeps:
+            groups = -(-mesh.substeps // step_unit(self.statement, own))
+            options = with_substeps(self._options, own, groups * step_unit(self.statement, own))
             self._keep(options, self._ready(options))
 
     def _keep(self, options: Options, prepared: Prepared) -> None:

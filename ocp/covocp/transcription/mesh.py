@@ -346,6 +346,11 @@ def segment_lengths(intervals: int, count: int) -> tuple[int, ...]:
     return (short + 1,) * longer + (short,) * (count - longer)
 
 
+def step_unit(statement: Statement, mesh: Mesh) -> int:
+    """Of which the substeps of a mesh are a multiple: limits inside, and pairs for Simpson's rule."""
+    return mesh.points * (2 if statement.running_uses_matrices else 1)
+
+
 def with_substeps(options: Options, mesh: Mesh, substeps: int) -> Options:
     """Options of a mesh with other integration steps of its kind, and limits imposed where they are."""
     step: Any = "rodas" if mesh.step == "rodas" else "rk4"
