@@ -139,12 +139,15 @@ class Runs:
         or the best.
         """
         done = [self._judged(nlp, first, parameters)]
+        begun: tuple[Any, ...] = ()
         while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS:
             best = _best(done)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
             nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
-            if self._open and done[-1] is best and nlp is best.nlp:  # the same run would end where it begins
+            before, begun = begun, (id(best), done[-1] is best)
+            # the run would end where it begins, or as the last one did, which began there too
+            if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
                 self._tighten(best.residuals)
             point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
             done.append(self._judged(nlp, point, parameters, again=True))

@@ -14,6 +14,7 @@ from problems import LAG_COSTS, LAG_EIGENVALUE, lag, order, solve
 import covocp as co
 from covocp.base.krylov import krylov
 from covocp.extremal.curvature import smallest_curvature
+from covocp.extremal.optimality import _stationarity
 from covocp.models import brachistochrone, bryson_denham, free_time_integrator, mass_chain, noisy_integrator
 
 FORMULATIONS = ("eliminated", "states")
@@ -57,6 +58,48 @@ def test_control_error_estimates_the_error_of_the_control(control, intervals):
     solution = solve(noisy_integrator.problem(0.0, 1.0), control=control, intervals=intervals, tolerance=1e-11)
     truth = (solution.cost - 59 / 90) / (59 / 90)
     assert solution.optimality.control_error == pytest.approx(truth, rel=0.1)
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-4, 1e-5])
+def test_costates_behind_accurate_sensors_are_compared_where_explicit_steps_reach(noise):
+    """Differences had been 6e159, and 0 where they overflowed; the costates are right, see the last assertion."""
+
+    def behind(noise, start):
+        ocp = co.Problem(10.0)
+        x = ocp.state("x", initial=start, final=1.0, variance=1.0)
+        b = ocp.unknown("b", mean=1.0, variance=5.0)
+        u = ocp.control("u")
+        ocp.dynamics(x, -b * x + u, noise=1.0)
+        ocp.measurement("position", x, noise=noise)
+        ocp.minimize(running=0.5 * u**2, terminal=10 * ocp.estimation_covariance()[b, b])
+        return ocp
+
+    solution = solve(behind(noise, 0.0), intervals=100)
+    assert 1e-9 < solution.optimality.costate_difference < 0.1
+    ahead, back = (solve(behind(noise, s), intervals=100, guess=solution, tolerance=1e-10).cost for s in (1e-3, -1e-3))
+    assert solution.costate("x")[0] == pytest.approx((ahead - back) / 2e-3, rel=1e-4)
+
+
+def test_costates_that_explicit_steps_do_not_reach_are_not_compared():
+    """All the way each interval is 1e5 times as long as the covariance lives."""
+    ocp = co.Problem(10.0)
+    x = ocp.state("x", initial=1.0, variance=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=1.0)
+    ocp.measurement("position", x, noise=1e-12)
+    ocp.minimize(running=u**2 + x**2 + ocp.estimation_covariance()[x, x])
+    with pytest.warns(co.CovocpWarning, match="The mesh is too coarse"):
+        solution = solve(ocp, intervals=10)
+    assert solution.optimality.costate_difference is None
+
+
+def test_stationarity_does_not_grow_with_an_interval_that_is_short():
+    """A control that acts for 1e-5 of the time has its slope from rounding of the cost, divided by that time."""
+    extremal = solve(lag().problem, grid=[0.0, *(0.02 * np.arange(1, 50)), 1.0 - 1e-9, 1.0]).extremal
+    left = np.zeros((52, 1))
+    left[-1] = 1e-9
+    units = extremal.trajectory.duration / 51
+    assert _stationarity(extremal, left, 1.0, 0.0) == pytest.approx(1e-9 / units, rel=0.1)
 
 
 def test_residuals_shrink_with_the_mesh():

@@ -257,3 +257,30 @@ def test_starts_that_move_a_little_do_not_spoil_what_was_learnt():
         assert plan.stats["iterations"] <= 12
         cost = other.solve(initial=start, progress=False, assess=False).cost
         assert plan.cost == pytest.approx(cost, rel=1e-9)
+
+
+def steady():
+    """A loop whose last steps change the cost by its rounding, from which a smaller tolerance still goes on."""
+    ocp = co.Problem(6.0)
+    x = ocp.state(
+        "x", 3, initial=[1.5, 1.1, 2.0], variance=[[0.02, -0.02, -0.03], [-0.02, 0.13, 0.02], [-0.03, 0.02, 0.09]]
+    )
+    u = ocp.control("u")
+    drift = ca.DM([[-1.0, 1.5, 0.2], [0.5, -0.1, 0.0], [-0.2, -1.3, -1.2]])
+    pushed = ca.DM([1.1, 0.5, -0.1])
+    noise = np.array([[0.48, 0.13, -0.14], [0.13, 0.06, -0.03], [-0.14, -0.03, 0.29]])
+    ocp.dynamics(x, drift @ x + pushed * (u + 0.5 * ca.sin(x[0])), noise=noise)
+    seen = ca.DM([[1.4, -1.5, 0.1], [-0.7, 0.3, -2.0], [0.7, 0.2, -1.1]]) @ x + 0.4 * x[0] ** 2
+    accuracy = np.array([[16.0, 22.0, -4.0], [22.0, 50.0, -7.0], [-4.0, -7.0, 13.0]])
+    ocp.measurement("sensors", seen, noise=1e-4 * accuracy * (1 + 0.04 * x[0] ** 2))
+    ocp.subject_to(x[0], equals=0.3, at="final")
+    ocp.minimize_expected(running=0.5 * u**2 + 0.2 * ca.sumsqr(x), terminal=2 * ca.sumsqr(x), terminal_weight={x: 1.0})
+    return ocp
+
+
+def test_rounds_that_begin_where_the_last_one_did_ask_for_more():
+    """They had been the same run five times, and "the tolerance was met in the scales of the start" the end."""
+    one, other = (co.solve(steady(), method, intervals=100, progress=False) for method in ("reduced", "ipopt"))
+    assert one.converged
+    assert one.cost == pytest.approx(other.cost, rel=1e-8)
+    assert one.optimality.stationarity < 1e-5

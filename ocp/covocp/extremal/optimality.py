@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array, stacked, standard_deviations
+from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
+from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.control_error import absolute_cost, estimate_control_error
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
@@ -26,10 +27,8 @@ from covocp.extremal.mesh_error import node_error
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import model_symbols
-from covocp.transcription.mesh import LARGEST_SUBSTEPS, STIFFNESS_PER_STEP
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
-from covocp.transcription.stiffness import state_jacobian
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
@@ -47,16 +46,17 @@ class Optimality:
 
     Attributes:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
-            neighbourhood of a node), bounds' multipliers included; relative to the largest sum of the
-            absolute terms of H_u (or |H_uu| |u|, where more); or, where that is less, to the slope that changes the
-            cost by a tenth if the controls change by their magnitudes all the time: what is zero has no terms.
+            neighbourhood of a node, at least the mean one), bounds' multipliers included; relative to the largest sum
+            of the absolute terms of H_u (or |H_uu| |u|, where more); or, where that is less, the change of the cost if
+            all controls change by their magnitudes, relative to a tenth of it: what is zero has no terms.
         complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
             cost: a multiplier of a bound that is not active makes a slope look like none.
         control_slope: root mean square of H_u at the nodes with free controls, None where a condition along the path
             reaches its limit; of the order of the square of the
             interval for piecewise-linear controls; same normalisation.
         costate_difference: largest difference between the costates of the multipliers and those integrated backward,
-            relative to the largest costate of each kind.
+            relative to the largest costate of each kind: back to the last interval that would take too many explicit
+            steps (a large prior, an accurate sensor), None where that is the last of all.
         hamiltonian_variation: (largest - smallest H) / (largest sum of the absolute terms of H); None where the problem
             depends on time explicitly.
         transversality: k_T + H(T) with all multipliers, relative to the largest terms of H; None for a fixed duration.
@@ -134,10 +134,7 @@ def assess(
     slope, curvature, values, size = _at_nodes(extremal, costates)
     _, slopes, _ = discrete_costates(extremal)
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
-    weights = quadrature_weights(extremal.mesh)[:, None] * extremal.trajectory.duration
-    residual = (
-        (slopes + _limit_slopes(extremal) + extremal.multipliers.controls) / weights if st.nu else np.zeros((1, 1))
-    )
+    left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     control_slope, control_error = (None, None) if _path_acts(extremal) else (0.0, 0.0)
     if st.nu and free is not None and control_slope is not None:
@@ -150,7 +147,7 @@ def assess(
         bounded = ~whole & ~(beside[:-1] | beside[1:])
         control_error = estimate_control_error(extremal, (whole, bounded), others)
     return Optimality(
-        stationarity=_stationarity(extremal, residual, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
+        stationarity=_stationarity(extremal, left, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
@@ -167,15 +164,16 @@ def assess(
     )
 
 
-def _stationarity(extremal: Extremal, residual: Array, scale: float, others: float) -> float:
-    """The largest slope of the Lagrangian in units of the terms of H_u, or of the cost."""
-    value = float(np.abs(residual).max(initial=0.0)) / scale
+def _stationarity(extremal: Extremal, slopes: Array, scale: float, others: float) -> float:
+    """The largest slope of the Lagrangian per unit of time in units of the terms of H_u, or all of them in the cost."""
+    shares = quadrature_weights(extremal.mesh)[:, None]
+    times = np.maximum(shares, shares.mean()) * extremal.trajectory.duration  # what acts for less time is not seen
+    value = float((np.abs(slopes) / times).max(initial=0.0)) / scale
     if not LARGE_SLOPE < value < np.inf:
         return value
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
-    changed = np.abs(residual).max(axis=0) * units * extremal.trajectory.duration
-    cost = VANISHING * (absolute_cost(extremal) + others)
-    return min(value, float(changed.max()) / max(cost, np.finfo(float).tiny))
+    changed = float((np.abs(slopes) * units).sum())
+    return min(value, changed / max(VANISHING * (absolute_cost(extremal) + others), np.finfo(float).tiny))
 
 
 def _path_acts(extremal: Extremal) -> bool:
@@ -301,33 +299,21 @@ def _limit_slopes(extremal: Extremal) -> Array:
 
 
 def _costate_difference(extremal: Extremal, costates: Costates) -> float | None:
-    """Largest relative difference to the costates that are integrated backward; None where that would take too long."""
-    pairs = _explicit_pairs(extremal)
-    if pairs is None:
+    """Largest relative difference to the costates that are integrated backward, where explicit steps reach."""
+    pairs, first = explicit_pairs(extremal)
+    if first == extremal.mesh.intervals:
         return None
-    other = integrated_costates(extremal, pairs)
-    largest = 0.0
-    for one, two in ((costates.state, other.state), (costates.matrices, other.matrices)):
-        size = np.abs(one).max(initial=0.0)
-        if size > 0:
-            largest = max(largest, float(np.abs(one - two).max() / size))
-    return largest
-
-
-def _explicit_pairs(extremal: Extremal) -> int | None:
-    """Explicit steps an interval for the adjoint equations; None where a stiff nominal would need too many."""
-    st, mesh, n = extremal.statement, extremal.mesh, extremal.mesh.intervals
-    if mesh.step != "rodas":
-        return max(1, mesh.substeps)
-    matrices = stacked(state_jacobian(st).map(n + 1)(*extremal.columns()), n + 1)
-    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=1)
-    needed = float((np.maximum(rates[1:], rates[:-1]) * np.diff(extremal.time)).max()) / STIFFNESS_PER_STEP
-    return int(np.ceil(needed)) if needed <= LARGEST_SUBSTEPS else None
+    with np.errstate(over="ignore", invalid="ignore"):
+        other = integrated_costates(extremal, pairs)
+        both = ((costates.state, other.state), (costates.matrices, other.matrices))
+        differences = [np.abs(one - two)[first:].max() / np.abs(one).max() for one, two in both if one.any()]
+    largest = float(np.max(differences, initial=0.0))
+    return largest if np.isfinite(largest) else None
 
 
 def _variation(extremal: Extremal, values: Array) -> float:
     """Variation of H relative to its terms; where something is read or holds at an instant it may jump."""
-    largest = max(float(np.ptp(values[part, 0])) for part in stretches(extremal))
+    largest = float(np.max([np.ptp(values[part, 0]) for part in stretches(extremal)]))
     return largest / max(float(values[:, 1].max()), np.finfo(float).tiny)
 
 

@@ -61,7 +61,7 @@ RESIDUALS = {
 
 # Where to begin to worry about a residual, and what a large one means.
 WORRIES: dict[str, tuple[float, str]] = {
-    "stationarity": (1e-4, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
+    "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
     "costate_difference": (
         1e-2,
         "large: the costates change within an interval (a constraint takes hold, a stiff start or end); costs and "
