@@ -32,7 +32,7 @@ from covocp.transcription.nlp import QUIET
 from covocp.transcription.pieces import is_separable
 from covocp.transcription.program import Arrays, Program, Trajectories, alone, joined
 from covocp.transcription.scales import choose_scales, evened
-from covocp.transcription.shooting import Passage
+from covocp.transcription.sequences import Passage
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 

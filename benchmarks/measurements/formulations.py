@@ -1,7 +1,7 @@
 """Where the border between the two formulations lies: eliminated matrices against half-vector states, first solves.
 
 Each problem is solved by both formulations, in random order, with everything else at its default; the medians of five
-go into docs/formulations.md. `transcription/mesh.py` takes its rule from this table.
+go into docs/formulations.md. `transcription/choosing.py` takes its rule from this table.
 """
 
 from __future__ import annotations

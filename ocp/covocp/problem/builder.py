@@ -9,53 +9,34 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import checked, text, truth
-from covocp.base.checks import (
-    as_number,
-    bound_columns,
-    caller,
-    check_kind,
-    check_positive,
-    column,
-    density_matrix,
-)
+from covocp.base.checks import as_number, caller, check_kind, check_positive
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.attitude import Attitude, with_attitude
-from covocp.problem.boundary_values import end_value
 from covocp.problem.chances import with_chance, with_chance_conditions
-from covocp.problem.checks import (
-    as_expression,
-    check_name,
-    check_size,
-    column_expression,
-    scale_column,
-)
+from covocp.problem.checks import as_expression, check_name, check_size, column_expression
 from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.constraints import with_constraint
 from covocp.problem.data import data_over_time
 from covocp.problem.decisions import with_constant
-from covocp.problem.declarations import (
-    Chance,
-    Control,
-    Declarations,
-    Free,
-    Gain,
-    Guess,
-    Measurement,
-    Parameter,
-    Place,
-    State,
-    Unknown,
-    plain_matrix,
-)
+from covocp.problem.declarations import Chance, Declarations, Free, Gain, Guess, Measurement, Place
 from covocp.problem.description import sections
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
 from covocp.problem.instants import sampled_at
 from covocp.problem.integrals import with_integral
+from covocp.problem.matrices import plain_matrix
 from covocp.problem.measurement_information import stated_noise
 from covocp.problem.rates import with_rate
+from covocp.problem.symbols import (
+    control_vector,
+    in_its_shape,
+    known_parameter,
+    new_symbol,
+    unknown_constant,
+    vector_state,
+)
 from covocp.statement.statement import Statement
 
 Entry = TypeVar("Entry")
@@ -195,18 +176,8 @@ class Problem:
             ProblemError: name used twice, shapes that do not fit, bounds crossed, values outside the bounds, NaN or
                 inf in data, variance not positive semidefinite.
         """
-        size = self._declare(name, shape)
-        low, high = bound_columns(name, lower, upper, size)
-        entry = State(
-            **_symbol(name, size, unit),
-            initial=end_value(name, "initial", initial, low, high),
-            final=end_value(name, "final", final, low, high),
-            lower=low,
-            upper=high,
-            guess=guess,
-            scale=scale_column(name, scale, size),
-            variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
-        )
+        own = new_symbol(name, self._declare(name, shape), unit)
+        entry = vector_state(own, (initial, final), (lower, upper), guess, scale, variance)
         return self._add("states", entry).symbol
 
     def attitude(
@@ -263,13 +234,8 @@ class Problem:
         Raises:
             ProblemError: name used twice, NaN or inf, variance not positive semidefinite or of the wrong size.
         """
-        size = self._declare(name, int(np.size(as_number(name, "mean", mean))))
-        entry = Unknown(
-            **_symbol(name, size, unit),
-            mean=column(name, "mean", mean, size),
-            variance=density_matrix(name, "variance", variance, size),
-        )
-        return self._add("unknowns", entry).symbol
+        own = new_symbol(name, self._declare(name, int(np.size(as_number(name, "mean", mean)))), unit)
+        return self._add("unknowns", unknown_constant(own, mean, variance)).symbol
 
     @checked(unit=text)
     def parameter(self, name: str, value: Given, *, unit: str = "") -> ca.MX:
@@ -287,15 +253,8 @@ class Problem:
             ProblemError: name used twice, NaN or inf.
         """
         numbers = as_number(name, "value", value)
-        size = self._declare(name, int(np.size(numbers)))
-        if numbers.ndim != 2 or 1 in numbers.shape:
-            entry = Parameter(**_symbol(name, size, unit), value=column(name, "value", value, size))
-            return self._add("parameters", entry).symbol
-        stacked = column(name, "value", numbers.ravel(order="F"), size)
-        entry = self._add("parameters", Parameter(**_symbol(name, size, unit), value=stacked, columns=numbers.shape[1]))
-        matrix: Any = ca.reshape(entry.symbol, *numbers.shape)
-        matrix._stands_for = name  # as a key of new values
-        return cast(ca.MX, matrix)
+        own = new_symbol(name, self._declare(name, int(np.size(numbers))), unit)
+        return in_its_shape(self._add("parameters", known_parameter(own, value, numbers)))
 
     @checked(unit=text)
     def decision(
@@ -325,7 +284,7 @@ class Problem:
             ProblemError: name used twice, bounds crossed, a guess outside of them, NaN or inf; when the problem is
                 built: nothing depends on it, the cost falls with it without end.
         """
-        own = _symbol(name, self._declare(name, shape), unit)
+        own = new_symbol(name, self._declare(name, shape), unit)
         self._change(with_constant(self._declarations, own, lower, upper, guess))
         return cast(ca.MX, own["symbol"])
 
@@ -368,16 +327,8 @@ class Problem:
         Raises:
             ProblemError: name used twice, shapes that do not fit, bounds crossed.
         """
-        size = self._declare(name, shape)
-        low, high = bound_columns(name, lower, upper, size)
-        entry = Control(
-            **_symbol(name, size, unit),
-            lower=low,
-            upper=high,
-            guess=guess,
-            scale=scale_column(name, scale, size),
-        )
-        return self._add("controls", entry).symbol
+        own = new_symbol(name, self._declare(name, shape), unit)
+        return self._add("controls", control_vector(own, (lower, upper), guess, scale)).symbol
 
     @checked(unit=text)
     def symmetric(
@@ -679,8 +630,3 @@ class Problem:
         """Other declarations from now on: another statement, and other doubts about it."""
         self._declarations, self._statement, self.doubts_told = declarations, None, False
         self._expanded = None
-
-
-def _symbol(name: str, size: int, unit: str) -> dict[str, Any]:
-    """What every symbol has."""
-    return {"name": name, "symbol": ca.MX.sym(name, size), "size": size, "where": caller(), "unit": unit}

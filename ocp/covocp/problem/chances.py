@@ -29,10 +29,11 @@ from covocp.base.normal import quantile, two_sided
 from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
 from covocp.problem.closed_loop_covariance import LARGEST_ROUNDING, SMALLEST_VARIANCE, SPREAD, with_closed_loop
 from covocp.problem.constraints import check_place
-from covocp.problem.declarations import Chance, Constraint, Declarations, Dynamics, declare_matrix
+from covocp.problem.declarations import Chance, Constraint, Declarations, Dynamics
 from covocp.problem.estimation_covariance import with_estimation
 from covocp.problem.expansion import augmented_drift, augmented_slope, slope_by
 from covocp.problem.integrals import integrals_of
+from covocp.problem.matrices import declare_matrix
 from covocp.problem.rates import process_noise
 
 # Probabilities are between these, with two limits not less than the last: numbers next to one have few digits left.

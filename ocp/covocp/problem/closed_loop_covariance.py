@@ -24,8 +24,9 @@ from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import half_indices, half_length, pack_symbolic, unpack_symbolic
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
-from covocp.problem.declarations import Control, Declarations, Expansion, Expected, Gain, Spread, State, Unknown
+from covocp.problem.declarations import Control, Declarations, Expansion, Expected, Gain, State, Unknown
 from covocp.problem.estimation_covariance import block_between, with_estimation
+from covocp.problem.matrices import Spread
 from covocp.statement.statement import error_names, error_size
 
 SPREAD = "X"

@@ -11,7 +11,8 @@ from covocp.base.checks import bound_columns, check_inside, column
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
-from covocp.problem.declarations import Declarations, Dynamics, Matrix, State
+from covocp.problem.declarations import Declarations, Dynamics, State
+from covocp.problem.matrices import Matrix
 
 
 def with_constant(own: Declarations, symbol: dict[str, Any], lower: Given, upper: Given, guess: Given) -> Declarations:

@@ -12,7 +12,8 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.checks import check_name
-from covocp.problem.declarations import Control, Declarations, Matrix, State, Unknown, declare_matrix
+from covocp.problem.declarations import Control, Declarations, State, Unknown
+from covocp.problem.matrices import Matrix, declare_matrix
 from covocp.problem.tangents import tangent_slope
 from covocp.statement.statement import error_names, error_size
 

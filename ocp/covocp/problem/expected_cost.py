@@ -50,20 +50,12 @@ from covocp.problem.closed_loop_covariance import (
     with_weights,
 )
 from covocp.problem.decisions import with_constant
-from covocp.problem.declarations import (
-    Backward,
-    Control,
-    Declarations,
-    Dynamics,
-    Expansion,
-    Expected,
-    Gain,
-    declare_matrix,
-)
+from covocp.problem.declarations import Control, Declarations, Dynamics, Expansion, Expected, Gain
 from covocp.problem.estimation_covariance import with_estimation
 from covocp.problem.expansion import expand, measurement_slope
 from covocp.problem.freeze import freeze
 from covocp.problem.integrals import check_expected
+from covocp.problem.matrices import Backward, declare_matrix
 from covocp.problem.measurement_information import inverse_density
 from covocp.problem.samples import ESTIMATE as ESTIMATE
 from covocp.statement.names import name_of, split_entry

@@ -18,10 +18,11 @@ from covocp.problem.chances import check_uncertain, uncertainties
 from covocp.problem.checks import check_dynamics
 from covocp.problem.data import used_data
 from covocp.problem.decisions import check_decisions
-from covocp.problem.declarations import Declarations, Matrix, Spread
+from covocp.problem.declarations import Declarations
 from covocp.problem.ends import boundary, tied_values, with_end_conditions
 from covocp.problem.inequalities import conditions_at, conditions_inside, row_names
 from covocp.problem.integrals import check_integrals
+from covocp.problem.matrices import Matrix, Spread
 from covocp.problem.measurement_information import check_readings, inverse_density
 from covocp.problem.rates import process_noise
 from covocp.problem.samples import measured_blocks, samples

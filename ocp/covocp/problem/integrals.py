@@ -11,7 +11,8 @@ from covocp.base.checks import caller, shape_error
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.problem.checks import check_name, column_expression
-from covocp.problem.declarations import Declarations, Dynamics, Matrix, State, declare_matrix
+from covocp.problem.declarations import Declarations, Dynamics, State
+from covocp.problem.matrices import Matrix, declare_matrix
 
 
 def integrals_of(problem: Declarations) -> list[State | Matrix]:

@@ -10,7 +10,8 @@ import casadi as ca
 from covocp.base.checks import check_density, density_matrix
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
-from covocp.problem.declarations import Matrix, Measurement
+from covocp.problem.declarations import Measurement
+from covocp.problem.matrices import Matrix
 
 # The density that stands for no information is the inverse of this: a sensor of such noise tells nothing in double
 # precision, and squares of it are still numbers.

@@ -14,9 +14,10 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, pack_symbolic
 from covocp.problem.decisions import decisions_of, matters
-from covocp.problem.declarations import Declarations, Matrix, Parameter
+from covocp.problem.declarations import Declarations, Parameter
 from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.freeze import freeze
+from covocp.problem.matrices import Matrix
 from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import WEIGHT, deviations, in_phase, tangent, with_feedback
 from covocp.statement.chain import Chain, Link

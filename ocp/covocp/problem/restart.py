@@ -16,8 +16,9 @@ from covocp.base.matrices import Array, pack
 from covocp.base.short_repr import short_repr
 from covocp.problem.attitude import as_quaternion
 from covocp.problem.checks import find_name
-from covocp.problem.declarations import Declarations, Matrix, Parameter, State
+from covocp.problem.declarations import Declarations, Parameter, State
 from covocp.problem.estimation_covariance import with_estimation
+from covocp.problem.matrices import Matrix
 from covocp.statement.statement import Statement
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,14 +11,14 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import checked, one_of
-from covocp.base.checks import as_number, is_whole
+from covocp.base.checks import is_whole
 from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import Array, is_semidefinite, read_only, smallest_eigenvalue, unpack, unpack_costate
+from covocp.base.matrices import Array, read_only, smallest_eigenvalue
 from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
-from covocp.extremal.closed_loop import COVARIANCES, ClosedLoop, close_loop
+from covocp.extremal.closed_loop import ClosedLoop, close_loop
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import Dense, dense_output
 from covocp.extremal.extremal import Extremal, Outcome
@@ -31,25 +30,24 @@ from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.phase_loops import PhaseLoop
-from covocp.extremal.spread_limits import passed_by_spread, scattered, spread_names
+from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.solution.chances import Reached, reached
+from covocp.solution.costs import identity_of_costs, split_cost
+from covocp.solution.covariances import all_covariances, are_semidefinite, covariance_between
+from covocp.solution.duals import costate_of, multiplier_of
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
+from covocp.solution.reading import by_name, expression_values, name_in, other_loop, times_within
 from covocp.solution.sample import Sample
 from covocp.statement.conditions import Conditions
-from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
-from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
-from covocp.statement.time_data import TimeData
+from covocp.statement.names import block_of, entry_values, unknown_name
+from covocp.statement.statement import Block, Statement, entry_names
 from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
 if TYPE_CHECKING:
     import matplotlib.figure
-
-# Share of the largest eigenvalue of X up to which the covariance of the estimate is known where it is a variable of
-# the program: after few readings it is singular, before them zero.
-ITERATED = 1e-9
 
 
 @methods_one_at_a_time
@@ -133,7 +131,7 @@ class Solution:
             method=str(outcome.stats.get("method", method)),
             converged=outcome.converged,
             message=outcome.message,
-            cost_terms=_split_cost(outcome.cost_terms, loop, 0.0 if closed is None else closed.handed),
+            cost_terms=split_cost(outcome.cost_terms, loop, 0.0 if closed is None else closed.handed),
             extremal=extremal,
             rates=rates,
             end_rates=end_rates,
@@ -196,11 +194,6 @@ class Solution:
         return origin_of(self.method, self.stats)
 
     @property
-    def _otherwise(self) -> ClosedLoop | None:
-        """The loop under other statistics than the design's, of which the matrices are; None: there are no others."""
-        return self.loop if self.origin is Origin.OTHER_TRUTH else None
-
-    @property
     def status(self) -> str:
         """How the run ended, in words."""
         return self.message if self.converged else f"NOT CONVERGED: {self.message}"
@@ -220,11 +213,6 @@ class Solution:
         """Gains at the nodes over the augmented state: "K" of the filter (K, n, m), "C" of the feedback (K, nu, n)."""
         gains = {} if self.filter_gain is None else {"K": self.filter_gain}
         return gains if self.loop is None else {**gains, "C": self.loop.gain}
-
-    @property
-    def _data(self) -> tuple[TimeData, ...]:
-        """What is given over time and used; () for a solution read from a file."""
-        return self.statement.data if self.statement is not None else ()
 
     @property
     def symbols(self) -> Mapping[str, Any]:
@@ -252,10 +240,7 @@ class Solution:
 
         None without a closed loop, and where the cost is the latter one: under other statistics than the design's.
         """
-        if self.loop is None or self.cost_terms.keys() == self.loop.cost.keys():
-            return None
-        own = self.loop.expected_cost
-        return abs(self.cost - own) / max(abs(own), float(np.finfo(float).tiny))
+        return identity_of_costs(self)
 
     @cached
     def mean_effect(self) -> MeanEffect | None:
@@ -267,21 +252,12 @@ class Solution:
     @cached
     def smallest_eigenvalue(self) -> float:
         """Smallest eigenvalue of the covariances at all nodes; inf without covariances."""
-        return min((smallest_eigenvalue(matrix) for matrix in self._all_covariances()), default=np.inf)
+        return min((smallest_eigenvalue(matrix) for matrix in all_covariances(self)), default=np.inf)
 
     @cached
     def semidefinite(self) -> bool:
         """Whether all covariances are positive semidefinite up to roundoff at all nodes."""
-        if self.loop is None or self.mesh.eliminated:
-            return all(map(is_semidefinite, self._all_covariances()))
-        estimates = [self.values.get(ESTIMATE), self.loop.Xhat]
-        others = [matrix for matrix in self._all_covariances() if all(matrix is not own for own in estimates)]
-        iterated = [np.concatenate([own, self.loop.X]) for own in estimates if own is not None]
-        return all(map(is_semidefinite, others)) and all(is_semidefinite(own, ITERATED) for own in iterated)
-
-    def _all_covariances(self) -> list[Array]:
-        loop = [] if self.loop is None else [self.loop.Xhat, self.loop.X]
-        return [self.values[b.name] for b in self.blocks if b.kind == "matrix" and b.covariance] + loop
+        return are_semidefinite(self)
 
     def block(self, name: str) -> Block:
         """Where a name, or that of an entry of a vector, lies."""
@@ -290,40 +266,18 @@ class Solution:
             raise unknown_name(name, tuple(b.name for b in self.blocks))
         return found
 
-    def _name(self, key: Given, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
-        """Name of a symbol, a name or an entry among some blocks; None: among all values."""
-        names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
-        sizes = sizes_of(self.blocks if blocks is None else blocks)
-        if blocks is None:
-            sizes |= {entry.name: entry.values.shape[1] for entry in self._data}
-        return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes)
-
     @cached
     def values(self) -> Mapping[str, Array]:
         """Values of all symbols at the nodes by name; read-only."""
-        found = self._assemble(self.t, self.trajectory.x, self.controls, self.trajectory.e)
-        if self._otherwise is not None and ESTIMATE in found:
-            found[ESTIMATE] = self._otherwise.Xhat
+        found = by_name(self, self.t, self.trajectory.x, self.controls, self.trajectory.e)
+        if (other := other_loop(self)) is not None and ESTIMATE in found:
+            found[ESTIMATE] = other.Xhat
         return read_only(found)
 
     @property
     def controls(self) -> Array:
         """Controls at all K nodes; a constant control holds its last value at the last node."""
         return self.extremal.controls
-
-    def _assemble(self, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
-        """Values by name at some times; x (K, nx), u (K, nu), e (K, ne)."""
-        sources = {"state": x, "control": u}
-        result: dict[str, Array] = {"time": t, "duration": np.full(t.shape, self.duration)}
-        for b in self.blocks:
-            if b.kind == "matrix":
-                result[b.name] = unpack(e[:, b.span], b.size)
-                continue
-            values = sources[b.kind][:, b.span] if b.kind in sources else np.tile(self.parameters[b.span], (t.size, 1))
-            if b.tangent:  # of unit length, which interpolation keeps up to its error
-                values = values / np.linalg.norm(values, axis=1, keepdims=True)
-            result[b.name] = values[:, 0] if b.size == 1 else values
-        return result | {entry.name: entry.at(t) for entry in self._data}
 
     def __contains__(self, key: object) -> bool:
         """Whether there is such a symbol, name, entry or expression."""
@@ -335,23 +289,11 @@ class Solution:
         Raises:
             ProblemError: where the name is unknown, or the expression contains a symbol of another problem.
         """
-        found = self._name(key, missing_ok=isinstance(key, ca.MX))
-        if found:
-            values, own = entry_values(self.values, found), block_of(found, self.blocks)
-            return values if own is None or own.role == "moving" else np.squeeze(values[-1])
-        statement = self.extremal.statement
-        try:
-            function = statement.expression(key, scattered=self._otherwise is not None)
-        except RuntimeError as error:
-            raise unknown_name(key, tuple(self.values)) from error
-        count = self.mesh.nodes.size
-        columns = self.extremal.columns()
-        if self._otherwise is not None and function.n_in() > len(columns):
-            columns = (*columns, scattered(self._otherwise).T)
-        value = np.asarray(function.map(count)(*columns).full())
-        rows, columns = key.shape
-        shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
-        return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
+        found = name_in(self, key, missing_ok=isinstance(key, ca.MX))
+        if not found:
+            return expression_values(self, key)
+        values, own = entry_values(self.values, found), block_of(found, self.blocks)
+        return values if own is None or own.role == "moving" else np.squeeze(values[-1])
 
     @checked(side=one_of("after", "before"))
     def at(self, t: Given, side: str = "after") -> Sample:
@@ -371,21 +313,13 @@ class Solution:
         Raises:
             ProblemError: where a time lies outside, or is not a number.
         """
-        times = np.atleast_1d(as_number("at", "times", t))
-        margin = 1e-9 * self.duration
-        if times.ndim != 1 or not ((times >= -margin) & (times <= self.duration + margin)).all():
-            raise ProblemError(
-                "A solution has no values there.",
-                expected=f"a time or a row of times within [0, {self.duration:g}] s",
-                received=str(t)[:100],
-                remedy="stay within the duration of the solution",
-            )
+        times = times_within(t, self.duration)
         before = side == "before"
         z = self.dense.at(self.mesh.placed(times / self.duration), before=before)
         u = self.controls_at(times, before=before)
         nx = self.trajectory.x.shape[1]
-        values = self._assemble(times, z[:, :nx], u, z[:, nx:])
-        if self._otherwise is not None:
+        values = by_name(self, times, z[:, :nx], u, z[:, nx:])
+        if other_loop(self) is not None:
             values.pop(ESTIMATE, None)  # under this truth it is known at the nodes only
         if np.ndim(t) == 0:
             values = {name: value[0] for name, value in values.items()}
@@ -411,20 +345,7 @@ class Solution:
         Raises:
             ProblemError: where the symbol is neither.
         """
-        name = self._name(symbol)
-        b = block_of(name, self.blocks)
-        if b is None or b.kind not in ("state", "matrix"):
-            names = ", ".join(q.name for q in self.blocks if q.kind in ("state", "matrix"))
-            raise ProblemError(
-                f"'{name}' has no costate.",
-                expected=f"a state or a matrix: {names}",
-                received=name,
-                remedy="ask for one of them",
-            )
-        if b.kind == "matrix":
-            return unpack_costate(self.costates.matrices[:, b.span], b.size)
-        values = self.costates.state[:, b.span]
-        return np.asarray(values[:, 0] if b.size == 1 else values)
+        return costate_of(self, symbol)
 
     def multiplier(self, key: Given) -> Array:
         """Multiplier of a constraint, by its name, or of the terminal values of a state or a matrix.
@@ -443,16 +364,7 @@ class Solution:
         Raises:
             ProblemError: where there is no such constraint or symbol.
         """
-        for place, names in self.constraints.items():
-            rows = [i for i, n in enumerate(names) if isinstance(key, str) and (n == key or n.startswith(f"{key}["))]
-            if rows:
-                values = getattr(self.multipliers, "path_at_nodes" if place == "path" else place)[..., rows]
-                return np.asarray(values[..., 0] if len(rows) == 1 else values)
-        b = self.block(self._name(key, tuple(b for b in self.blocks if b.kind in ("state", "matrix"))))
-        if b.kind == "matrix":
-            return unpack_costate(self.final_multipliers[1][b.span], b.size)
-        values = self.final_multipliers[0][b.span]
-        return np.asarray(values[0] if b.size == 1 else values)
+        return multiplier_of(self, key)
 
     @property
     def final_multipliers(self) -> tuple[Array, Array]:
@@ -475,35 +387,13 @@ class Solution:
         Raises:
             ProblemError: where there is no estimation covariance, or the symbol is not in it.
         """
-        block = next((q for q in self.blocks if q.kind == "matrix" and q.estimation), None)
-        if block is None:
-            raise ProblemError(
-                "The problem has no estimation covariance.",
-                expected="a problem with estimation_covariance()",
-                received=self.name,
-                remedy="index the matrices of the problem by their names",
-            )
-        full = self.values[block.name].copy() if self.loop is None else self.loop.X
-        rows, columns = self._augmented_span(a), self._augmented_span(a if b is None else b)
-        return np.asarray(full[:, rows, columns])
+        return covariance_between(self, a, b)
 
     def deviation(self, symbol: Given) -> Array:
         """Standard deviation of a state, an unknown or an entry of one, (K,) or (K, n), in its unit."""
         variances = np.diagonal(self.covariance(symbol), axis1=1, axis2=2)
         values = np.sqrt(np.maximum(variances, 0.0))
         return np.asarray(values[:, 0] if values.shape[1] == 1 else values)
-
-    def _augmented_span(self, key: Given) -> slice:
-        both = [q for kind in ("state", "unknown") for q in self.blocks if q.kind == kind]
-        own = [q for q in both if error_names((q,))[0] in self.augmented]  # constants of a gain have no row
-        offsets = accumulate((error_size(q) for q in own), initial=0)
-        rows = tuple(
-            replace(q, kind="state", size=error_size(q), offset=offset, tangent=0)
-            for q, offset in zip(own, offsets, strict=False)
-        )
-        found = block_of(self._name(key, rows), rows)
-        assert found is not None
-        return found.span
 
     def check_path(self, points: int = 10) -> Mapping[str, float]:
         """Largest violation of each path constraint and state bound along the true path.
@@ -539,11 +429,12 @@ class Solution:
             return ()
         path = self.extremal.statement.path
         found = passed_limits(self.extremal, self._dense_for(path), points)
-        if self._otherwise is None or path.scattered is None:
+        other = other_loop(self)
+        if other is None or path.scattered is None:
             return found
         believed = spread_names(self.extremal.statement)
         known = [entry for entry in found if entry.name not in believed]
-        known += passed_by_spread(self.extremal, self._otherwise, path=True)
+        known += passed_by_spread(self.extremal, other, path=True)
         return tuple(sorted(known, key=lambda entry: -entry.share))
 
     def left_tables(self, points: int = 10) -> tuple[Passed, ...]:
@@ -593,11 +484,3 @@ class Solution:
     def state_names(self) -> tuple[str, ...]:
         """Names of the entries of the state."""
         return entry_names(tuple(b for b in self.blocks if b.kind == "state"))
-
-
-def _split_cost(terms: Mapping[str, float], loop: ClosedLoop | None, handed: float) -> dict[str, float]:
-    """Cost by term; of an expected cost the nominal's terms and what the deviations add, also those handed over."""
-    if loop is None:
-        return dict(terms)
-    nominal = {name: loop.cost[name] for name in ("terminal", "running", COVARIANCES) if name in loop.cost}
-    return nominal | {"deviations": float(sum(terms.values())) + handed - sum(nominal.values())}

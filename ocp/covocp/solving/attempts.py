@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 
 AnyOutcome = Outcome | ChainOutcome
+Found = TypeVar("Found", Outcome, Solution)
 # Starts that are tried where a method loses its way.
 TRIED = 4
 
@@ -115,9 +116,9 @@ def counted(first: AnyOutcome | Solution, second: AnyOutcome) -> dict[str, Any]:
     return {name: first.stats[name] + second.stats[name] for name in both}
 
 
-def with_stats(outcome: Outcome, **stats: Any) -> Outcome:
-    """The outcome with more that is told of it."""
-    return replace(outcome, stats={**outcome.stats, **stats})
+def with_stats(found: Found, /, **stats: Any) -> Found:
+    """An outcome, or a solution, with more that is told of it."""
+    return replace(found, stats={**found.stats, **stats})
 
 
 def interrupted(solution: Solution | PhasesSolution) -> Interrupted:

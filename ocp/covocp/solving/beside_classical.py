@@ -2,41 +2,105 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
+from covocp.base.errors import CovocpError, Interrupted, warn_user, without_warnings
 from covocp.base.matrices import Array
-from covocp.extremal.extremal import Extremal
+from covocp.base.short_repr import short_repr
+from covocp.base.threads import cached
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.solution.origin import Classical
 from covocp.solution.solution import Solution
+from covocp.solving.attempts import with_stats
 from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
-from covocp.transcription.mesh import Options
-from covocp.transcription.scales import magnitudes
+from covocp.transcription.mesh import Mesh, Options, with_substeps
 from covocp.transcription.stiffness import stiffness
 
-# A run along the controls of a nominal that leaves it by more than this, in magnitudes of the states, is another one.
-DRIFTED = 1e-3
-UNSTABLE = (
-    "the nominal is so unstable that roundoff of its controls moves a run along them by {:.1e} of the magnitude of a "
-    "state; nominal='combined' needs no such run"
-)
 # Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
 # so that costs have its square. Nothing else tells the size of a cost whose optimum is zero.
 ROUNDOFF = 1e-10
+# Relative decrease of the cost from which on it is asked whether both are zero.
+SUSPICIOUS_GAIN = 0.5
 # Relative excess of the cost over the classical design's above which a solution is a spurious stationary point.
 WORSE = 1e-6
 # Multiple of the error of the mesh up to which an excess may be that of unequal steps: around a given nominal they are
 # shorter, and the error is an estimate of the combined design's own.
 STEPS = 10.0
 
+# Values of the parameters -> what the classical design costs, and why there is none.
+Costs = Callable[[Array], tuple[float, str]]
 
-def drift(x: Array, run: Extremal) -> float:
-    """By how much a run along the controls leaves the states that were found, in their magnitudes."""
-    scale = magnitudes(run.statement, replace(run.trajectory, x=x), run.parameters).x
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float((np.abs(run.trajectory.x - x) / scale).max(initial=0.0))
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClassicalDesign:
+    """The classical design of a problem on the mesh of a combined one; its solver is made when it is first asked for.
+
+    Args:
+        statement: the problem.
+        options: of the mesh.
+        make: for some options, what gives the costs.
+    """
+
+    statement: Statement
+    options: Options
+    make: Callable[[Options], Costs]
+
+    __repr__ = short_repr
+
+    @cached
+    def costs(self) -> Costs:
+        """What gives its costs on the mesh."""
+        return self.make(self.options)
+
+    def beside(
+        self, solution: Solution, mesh: Mesh, parameters: Array, go_on: Callable[[Solution], Solution]
+    ) -> Solution:
+        """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point.
+
+        Args:
+            solution: of the combined design.
+            mesh: that it was found on.
+            parameters: their values, (np,).
+            go_on: what makes a solution more exact.
+        """
+        try:
+            costs = self.costs
+            with without_warnings():  # they concern another solution
+                classical, missing = costs(parameters)
+                if left_open(solution, classical):
+                    classical = self._on_equal_steps(classical, mesh, parameters)
+        except KeyboardInterrupt:
+            message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
+            raise Interrupted(message, solution=solution) from None
+        except CovocpError as error:  # no deterministic cost: there is nothing to compare with
+            return with_stats(solution, **Classical(missing=str(error).partition("\n")[0]).counts)
+        if missing:
+            return with_stats(solution, **Classical(missing=missing).counts)
+        worse, excess = is_worse(solution, classical), solution.cost - classical
+        suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
+        if suspicious and is_roundoff(excess, self.statement, self.options, parameters):
+            return with_stats(solution, **Classical(cost=classical, same=True).counts)
+        if worse:  # stationary up to a tolerance only, or spurious: going on from there tells
+            solution = go_on(solution)
+            worse = is_worse(solution, classical)
+        if worse:
+            warn_user(
+                f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
+                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
+            )
+        return with_stats(solution, **Classical(cost=classical).counts)
+
+    def _on_equal_steps(self, classical: float, mesh: Mesh, parameters: Array) -> float:
+        """Cost of the classical design with the steps of the combined one, where that is more: they are compared so."""
+        options = with_substeps(self.options, mesh, mesh.substeps)
+        if options.substeps == self.options.substeps:
+            return classical
+        cost, missing = self.make(options)(parameters)
+        return classical if missing else max(classical, cost)
 
 
 def is_worse(solution: Solution, classical: float) -> bool:

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import CovocpError
+from covocp.base.errors import CovocpError, without_warnings
+from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct, pack
+from covocp.base.progress import Progress
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
@@ -26,7 +28,7 @@ from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.problem.builder import Problem
 from covocp.problem.closed_loop_covariance import SMALLEST_VARIANCE, reasons, used_in, with_best_gain
 from covocp.problem.declarations import Declarations, Parameter, Place
-from covocp.problem.expected_cost import GAIN, statement_of
+from covocp.problem.expected_cost import ESTIMATE, GAIN, statement_of
 from covocp.solution.origin import METHOD
 from covocp.solution.report import ASKED
 from covocp.solution.solution import Solution
@@ -34,6 +36,9 @@ from covocp.solving.attempts import with_stats
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
+
+if TYPE_CHECKING:
+    from covocp.solving.solver import Solver
 
 # Parameters of the problem with weights of X: on the way and at the end.
 WEIGHTS: dict[Place, str] = {"path": "weights of X on the way", "final": "weights of X at the end"}
@@ -47,6 +52,34 @@ def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
     """The problem with the best gain, with E for X in its conditions, and without them; none where none asks for X."""
     chosen = [with_best_gain(problem.declarations, conditions=kept) for kept in (True, False)]
     return tuple(Problem.of(declarations) for declarations in chosen if declarations is not None)
+
+
+def best_gain(
+    solvers: tuple[Solver, ...], parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress
+) -> Solution | None:
+    """The solution with the best gain, without the conditions that ask for another: where a free gain starts.
+
+    Args:
+        solvers: of the problems with the best gain, in the order in which they are tried.
+        parameters: as the user gave them.
+        guess: likewise; one that says where the gain starts needs no other.
+        reporter: of the iterations, with the limits of all runs together.
+    """
+    named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
+    for solver in solvers if guess is None or named else ():
+        if reporter.stop:
+            break
+        seconds, iterations = reporter.left
+        run = {"guess": guess, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
+        try:
+            with without_warnings():  # they concern another solution
+                best: Solution = solver.solve(parameters, progress=False, **run)
+        except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
+            continue
+        reporter.count(int(best.stats["iterations"]))
+        if best.converged:
+            return best
+    return None
 
 
 def with_gain_told(problem: Problem, outcome: Outcome, best: Solution | None) -> Outcome:

@@ -1,12 +1,16 @@
-"""The methods, looked up by name."""
+"""The methods, looked up by name, and their options."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
-from covocp.base.errors import ProblemError, spelling
+from covocp.base.errors import ProblemError, no_option, spelling
+from covocp.base.expressions import Given
+from covocp.transcription.mesh import Options
 
 METHODS = {
     "ipopt": "covocp.solvers.ipopt",
@@ -14,6 +18,10 @@ METHODS = {
     "reduced": "covocp.solvers.reduced",
     "auto": "covocp.solving.automatic",
 }
+
+# Arguments of `solve` beside the options of mesh and method.
+ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
+NOMINALS = ("combined", "deterministic")
 
 
 def methods() -> tuple[str, ...]:
@@ -40,3 +48,23 @@ def check_method(method: str) -> None:
             received=repr(method),
             remedy=spelling(method, METHODS, "correct method="),
         )
+
+
+def divided_options(method: str, nominal: Given, options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of the mesh, and those of the method.
+
+    Raises:
+        ProblemError: one is neither, or the nominal is unknown.
+    """
+    known, own = {field.name for field in fields(Options)}, method_options(method)
+    for name in options:
+        if name not in known and name not in own:
+            raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
+    if nominal not in NOMINALS:
+        raise ProblemError(
+            "The option 'nominal' has an unknown value.",
+            expected="'combined' or 'deterministic'",
+            received=repr(nominal),
+            remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
+        )
+    return {k: v for k, v in options.items() if k in known}, {k: v for k, v in options.items() if k in own}

@@ -6,47 +6,39 @@ import time
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
 from covocp.base.checks import check_kind
-from covocp.base.errors import (
-    CovocpError,
-    Interrupted,
-    ProblemError,
-    evaluating,
-    no_option,
-    warn_user,
-    without_warnings,
-)
+from covocp.base.errors import CovocpError, Interrupted, ProblemError, evaluating
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.threads import methods_one_at_a_time
 from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Guess, Outcome, Prepared
-from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.extremal.given_controls import evaluation_mesh
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
 from covocp.problem.builder import Problem
-from covocp.problem.expected_cost import ESTIMATE, GAIN, deterministic, statement_of
+from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
-from covocp.solution.origin import Classical, Origin
 from covocp.solution.solution import Solution
 from covocp.solving import refining
+from covocp.solving.around_nominal import closed_around
 from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
 from covocp.solving.automatic import is_suited
-from covocp.solving.beside_classical import DRIFTED, UNSTABLE, drift, is_roundoff, is_worse, left_open
+from covocp.solving.beside_classical import ClassicalDesign, Costs
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
 from covocp.solving.coarse_start import from_coarser
 from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
-from covocp.solving.gain_start import meeting_conditions, with_best_gain_problems, with_gain_told
+from covocp.solving.gain_start import best_gain, meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
-from covocp.solving.methods import check_method, method_options
+from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
@@ -60,12 +52,7 @@ from covocp.transcription.instants import with_instants
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, step_unit, with_substeps
 from covocp.transcription.starts import own_start
 
-# Arguments of `solve` beside the options of mesh and method.
-ARGUMENTS = ("method", "guess", "nominal", "progress", "allow_failure", "parameters", "starts", "seed")
-NOMINALS = ("combined", "deterministic")
-# Relative decrease of the cost from which on it is asked whether both are zero.
-SUSPICIOUS_GAIN = 0.5
-# Before it is called that, the run goes on from there with this share of its tolerance, or of the usual one.
+# Before a solution is called spurious, the run goes on from it with this share of its tolerance, or of the usual one.
 CONTINUED = 1e-3
 TOLERANCE = 1e-7
 OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
@@ -116,22 +103,12 @@ class Solver:
         check_method(method)
         check_problem(problem)
         self._prepare = partial(made_ready, method)
-        known, own = {field.name for field in fields(Options)}, method_options(method)
-        for name in options:
-            if name not in known and name not in own:
-                raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
-        if nominal not in NOMINALS:
-            raise ProblemError(
-                "The option 'nominal' has an unknown value.",
-                expected="'combined' or 'deterministic'",
-                received=repr(nominal),
-                remedy="correct nominal=; evaluate(problem, nominal=...) takes any given nominal",
-            )
+        given, own = divided_options(method, nominal, options)
         self.method = method
         self.nominal = nominal
         self.statement: Statement = problem.statement()
         check_between(self.statement, method)
-        self._problem, self._classical = problem, cast("Solver | None", None)
+        self._problem = problem
         self._elsewhere = Elsewhere(
             declarations=problem.declarations,
             statement=self.statement,
@@ -139,7 +116,6 @@ class Solver:
             make=partial(Solver, method=method, intervals=intervals, nominal=nominal, **options),
         )
         count = INTERVALS if (refine := options.get("refine")) is None else refining.FIRST
-        given = {k: v for k, v in options.items() if k in known}
         asked = Options(intervals=count if intervals is None else intervals, **given)
         if refine is not None:
             asked = refining.first_options(self.statement, asked, nominal, points=method != AT_NODES)
@@ -150,11 +126,12 @@ class Solver:
         self._asked = with_instants(self.statement, graded(*self._ungraded, self.statement.values))
         self._values = self.statement.values
         self._options = self._laid_out()
+        self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = False  # at the steps along the guess
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
-        self._own = {k: v for k, v in options.items() if k in own}
+        self._own = own
         other = method not in ("ipopt", "auto") or str(self._own.get("plugin", "ipopt")) != "ipopt"
         patient = other or "max_iterations" in self._own
         self._loosened = bool(self._best) and can_be_loosened(solved) and not patient
@@ -255,7 +232,7 @@ class Solver:
         title = self.statement.name or "solving"
         with evaluating(self.statement.name):
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
-                first = self._best_gain(parameters, guess, reporter)
+                first = best_gain(self._best, parameters, guess, reporter)
                 if first is not None:
                     near = not reporter.stop
                     guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
@@ -272,7 +249,7 @@ class Solver:
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
             if self.nominal == "deterministic":
-                outcome = self._closed(outcome)
+                outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
             if reporter.asked:
                 raise interrupted(Solution.of(outcome, self.method))
             outcome = with_gain_told(self._problem, outcome, first)
@@ -286,25 +263,7 @@ class Solver:
         """The solution with the time that was waited for it beside that of its own runs: for others, and in looking."""
         waited, self._made_in = time.perf_counter() - begin + self._made_in, 0.0
         told = sum(float(solution.stats.get(name, 0.0)) for name in RUN_SECONDS)
-        return _noted(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
-
-    def _best_gain(self, parameters: Mapping[str, Any] | None, guess: Given, reporter: Progress) -> Solution | None:
-        """The solution with the best gain, without the conditions that ask for another: where a free gain starts."""
-        named = isinstance(guess, Mapping) and not any(str(key) in (GAIN, ESTIMATE) for key in guess)
-        for solver in self._best if guess is None or named else ():
-            if reporter.stop:
-                break
-            seconds, iterations = reporter.left
-            run = {"guess": guess, "time_limit": seconds, "iteration_limit": iterations, "allow_failure": True}
-            try:
-                with without_warnings():  # they concern another solution
-                    best: Solution = solver.solve(parameters, progress=False, **run)
-            except CovocpError:  # E alone may pass the limits; or they may be what keeps the nominal in its domain
-                continue
-            reporter.count(int(best.stats["iterations"]))
-            if best.converged:
-                return best
-        return None
+        return with_stats(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
@@ -404,78 +363,19 @@ class Solver:
         found = tightened(self._solved, begin.trajectory, mesh, values, run, lambda: reporter.stop)
         return failed if found is None else with_stats(found, **counted(failed, found))
 
-    def _closed(self, outcome: Outcome) -> Outcome:
-        """Filter and feedback around the nominal of the deterministic cost."""
-        found = outcome.extremal
-        mesh = evaluation_mesh(self.statement, self._options, found.parameters)
-        t = found.trajectory
-        closed = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
-        moved = drift(found.trajectory.x, closed.extremal)  # by steps of the same length
-        options = self._options
-        while self._own_steps and closed.converged and (finer := finer_steps(closed.extremal, options)):
-            mesh = evaluation_mesh(self.statement, finer, found.parameters)
-            shorter = evaluate_controls(self.statement, mesh, t.u, t.duration, found.parameters, t.x[0])
-            if not shorter.converged:
-                break
-            closed, options = shorter, finer
-        if closed.converged and outcome.converged and not moved <= DRIFTED:
-            message = UNSTABLE.format(moved)
-            return replace(closed, converged=False, message=message, violations=outcome.violations)
-        return replace(
-            closed,
-            converged=outcome.converged and closed.converged,
-            message=f"{outcome.message}: nominal of the deterministic cost, filter and feedback around it",
-            violations=outcome.violations,
-            stats={**outcome.stats, "origin": Origin.CLASSICAL.value},
-        )
-
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
         """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
         if self.nominal != "combined" or not self.statement.behind or not solution.converged:
             return solution
-        try:
-            if self._classical is None:
-                self._classical = self._classical_on(self._options)
-            with without_warnings():  # they concern another solution
-                given = values[: self.statement.np]
-                classical, missing = self._classical._solve_values(given)
-                if left_open(solution, classical):
-                    classical = self._on_equal_steps(classical, given)
-        except KeyboardInterrupt:
-            message = "Interrupted while the classical design was computed. On this error (.solution): a solution."
-            raise Interrupted(message, solution=solution) from None
-        except CovocpError as error:  # no deterministic cost: there is nothing to compare with
-            return _noted(solution, **Classical(missing=str(error).partition("\n")[0]).counts)
-        if missing:
-            return _noted(solution, **Classical(missing=missing).counts)
-        worse, excess = is_worse(solution, classical), solution.cost - classical
-        suspicious = worse or excess < -SUSPICIOUS_GAIN * abs(classical)
-        if suspicious and is_roundoff(excess, self.statement, self._options, given):
-            return _noted(solution, **Classical(cost=classical, same=True).counts)
-        if worse:  # stationary up to a tolerance only, or spurious: going on from there tells
-            solution = self._continued(solution, given)
-            worse = is_worse(solution, classical)
-        if worse:
-            warn_user(
-                f"This is a spurious stationary point: its expected cost {solution.cost:.8g} is above that of the "
-                f"classical design, {classical:.8g}. Start from it: guess=solve(problem, nominal='deterministic')."
-            )
-        return _noted(solution, **Classical(cost=classical).counts)
+        given = values[: self.statement.np]
+        return self._classical.beside(solution, self._prepared.mesh, given, partial(self._continued, given))
 
-    def _classical_on(self, options: Options) -> Solver:
-        """What finds the classical design on the mesh of some options."""
-        mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
-        return Solver(self._problem, "ipopt", nominal="deterministic", **mesh)
+    def _classical_design(self) -> ClassicalDesign:
+        """The classical design on the present mesh."""
+        make = partial(_classical_costs, self._problem)
+        return ClassicalDesign(statement=self.statement, options=self._options, make=make)
 
-    def _on_equal_steps(self, classical: float, values: Array) -> float:
-        """Cost of the classical design with the steps of the combined one, where that is more: they are compared so."""
-        options = with_substeps(self._options, self._prepared.mesh, self._prepared.mesh.substeps)
-        if options.substeps == self._options.substeps:
-            return classical
-        cost, missing = self._classical_on(options)._solve_values(values)
-        return classical if missing else max(classical, cost)
-
-    def _continued(self, solution: Solution, values: Array) -> Solution:
+    def _continued(self, values: Array, solution: Solution) -> Solution:
         """The solution after going on from it with a smaller tolerance, where that makes it better."""
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
         try:
@@ -490,14 +390,15 @@ class Solver:
                 raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
-        return _noted(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
+        return with_stats(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
 
-    def _solve_values(self, values: Array) -> tuple[float, str]:
+    def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
         with Progress("", show=False) as reporter:
             self._suit(values, nodes=False)
             guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
-            outcome = self._closed(from_starts(self._prepared, values, guesses, reporter)[0])
+            outcome, _ = from_starts(self._prepared, values, guesses, reporter)
+            outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
             if reporter.stop:
                 raise KeyboardInterrupt
         if outcome.converged:
@@ -521,7 +422,8 @@ class Solver:
 
     def _keep(self, options: Options, prepared: Prepared) -> None:
         """Other steps from now on; what the classical design costs is then another number."""
-        self._options, self._prepared, self._classical = options, prepared, None
+        self._options, self._prepared = options, prepared
+        self._classical = self._classical_design()
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
         """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
@@ -573,5 +475,7 @@ class Solver:
         return OTHER_WAY if ipopt and is_suited(self._solved, self._prepared.mesh) else ""
 
 
-def _noted(solution: Solution, **stats: Any) -> Solution:
-    return replace(solution, stats={**solution.stats, **stats})
+def _classical_costs(problem: Problem, options: Options) -> Costs:
+    """What gives the cost of the classical design for values of the parameters, on the mesh of some options."""
+    mesh = {field.name: getattr(options, field.name) for field in fields(Options) if field.name != "refine"}
+    return Solver(problem, "ipopt", nominal="deterministic", **mesh)._cost_of_values

@@ -23,9 +23,10 @@ from covocp.base.quadrature import covariance_after, interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
+from covocp.transcription.choosing import IMPLICIT_SUBSTEPS, choose_step
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.instants import completed, with_instants
-from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Graded, Mesh, Options, choose_step, explicit_substeps
+from covocp.transcription.mesh import Graded, Mesh, Options, explicit_substeps
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory

@@ -14,7 +14,8 @@ from covocp.base.short_repr import short_repr
 from covocp.passage.sweep import passed_by
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import NUMERIC_RUN, interval_columns, shoot
+from covocp.transcription.sequences import NUMERIC_RUN
+from covocp.transcription.shooting import interval_columns, shoot
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
 

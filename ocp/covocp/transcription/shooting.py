@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -16,35 +15,20 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import LINEAR_SOLVER
-from covocp.base.matrices import half_length
 from covocp.passage.library import functions
-from covocp.passage.sweep import Told, passed_by
+from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
-from covocp.transcription.covariance_steps import fed, gauss_points, moving_step, propagate_step, step_matrix
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.sequences import Passage, in_sequence
 from covocp.transcription.steps import (
     full_interval,
     gathering_step,
     in_order,
     joint_interval,
     nominal_interval,
-    read_by,
-    read_step,
-    runge_kutta_step,
     simpson_interval,
-    told_at,
 )
-
-# Steps that a sequence of numbers takes at a time.
-NUMERIC_RUN = 10
-
-# How eliminated matrices pass: by CasADi's operations (None); where the steps allow it in compiled code (`passed_by`),
-# of which CasADi sees no sparsity (slopes along directions, no Jacobians); or by what has the same arguments.
-Passage = Callable[..., Any] | None
-
-# (value, arguments, count) -> what a sequence of steps gives, a column for each step.
-Run = Callable[[Any, list[Any], int], list[Any]]
 
 
 def repeat(column: Expr, count: int) -> Any:
@@ -212,7 +196,7 @@ def passages(
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     columns = _substeps(statement, mesh, x, fine, intervals)
     own = None if passage is passed_by and not compiled_steps(mesh) else passage
-    sequence = partial(_sequence, statement, mesh, own)
+    sequence = partial(in_sequence, statement, mesh, own)
     first = e0[statement.entries(statement.ahead)]
     groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
     if statement.matrix_end is not None:
@@ -245,7 +229,7 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
     columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
     assert statement.matrix_end is not None
     last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)
-    sequence = partial(_sequence, statement, mesh, None)
+    sequence = partial(in_sequence, statement, mesh, None)
     return _backward(statement, mesh, sequence, last, columns, None)[0][:, 0]
 
 
@@ -336,179 +320,6 @@ def _backward(
 def compiled_steps(mesh: Mesh) -> bool:
     """Whether the compiled passage has the steps of a mesh: those of Gauss, where CasADi writes nothing out as C."""
     return mesh.step in ("gauss", "rodas") and mesh.linear_solver == LINEAR_SOLVER and functions() is not None
-
-
-def _sequence(
-    statement: Statement,
-    mesh: Mesh,
-    passage: Passage,
-    positions: tuple[int, ...],
-    first: Expr,
-    columns: tuple[Any, ...],
-    kicks: Expr,
-) -> tuple[Any, Any]:
-    """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
-    count = mesh.intervals * mesh.substeps
-    reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
-    if reads and passage is not None and len(positions) == 1:
-        return _reading_passage(statement, mesh, passage, positions[0], first, columns, kicks)
-    moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
-    chosen = [column[:, moving] for column in columns] if reads else columns
-    matrices, run = _steps(statement, mesh, passage, positions, kicks is not None)(chosen, count - len(reads))
-    read = read_step(statement, positions) if reads else None
-    at_reads = [columns[0], *columns[2:]]
-    if kicks is None:
-        values = _stretches(run, read, first, (matrices, at_reads), reads, count)[0]
-        return values, values
-    at_nodes = ca.MX(first.shape[0], count)
-    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
-    given = ([*matrices, at_nodes[:, moving]], [*at_reads, at_nodes])
-    passed, before = _stretches(run, None if read is None else _kicked(read), first, given, reads, count)
-    return before, passed
-
-
-def _steps(
-    statement: Statement, mesh: Mesh, passage: Passage, positions: tuple[int, ...], kicked: bool
-) -> Callable[[Any, int], tuple[list[Any], Run]]:
-    """What makes, from the columns of some steps, the arguments of a sequence of them and the sequence."""
-    kinds: list[ca.Function]
-    if fed(statement, positions) and mesh.step != "rk4":  # steps of one that depend on another
-        step = moving_step(statement, positions, mesh.step, mesh.linear_solver)
-        step = _kicked(step) if kicked else step
-        return lambda columns, _: (list(columns), partial(_accumulated, step))
-    if passage is not None:
-        sizes = [statement.matrices[i].size for i in positions]
-        kinds = [gauss_points(statement, i, mesh.step) for i in positions]
-        run = partial(_compiled, passage, sizes, kicked)
-        return lambda columns, count: ([h for kind in kinds for h in kind.map(count).call(list(columns))], run)
-    if mesh.step == "rk4":
-        step = runge_kutta_step(statement, positions)
-        step = _kicked(step) if kicked else step
-        return lambda columns, _: ([column for k, column in enumerate(columns) if k != 1], partial(_accumulated, step))
-    step = propagate_step(statement, positions, mesh.step, mesh.linear_solver)
-    step = _kicked(step) if kicked else step
-    kinds = [step_matrix(statement, i, mesh.step, mesh.linear_solver) for i in positions]
-    return lambda columns, count: ([kind.map(count)(*columns) for kind in kinds], partial(_accumulated, step))
-
-
-def _compiled(
-    passing: Callable[..., Any], sizes: list[int], kicked: bool, first: Expr, arguments: list[Any], count: int
-) -> list[Any]:
-    """What `_accumulated` gives, by the compiled passage: arguments are h H of each matrix at both Gauss points."""
-    kicks = arguments[-1] if kicked else None
-    ends = np.cumsum([0, *(half_length(size) for size in sizes)]).tolist()
-    parts = []
-    for k, (size, (i, j)) in enumerate(zip(sizes, pairwise(ends), strict=True)):
-        own = None if kicks is None else kicks[i:j, :]
-        parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own))
-    passed = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
-    return [passed] if kicks is None else [passed, passed - kicks]
-
-
-def _reading_passage(
-    statement: Statement,
-    mesh: Mesh,
-    passage: Callable[..., Any],
-    position: int,
-    first: Expr,
-    columns: tuple[Any, ...],
-    kicks: Expr,
-) -> tuple[Any, Any]:
-    """What `_sequence` gives of the covariance of the error where it is read at instants, by the compiled passage.
-
-    What a substep reads is a step of the passage for each group of rows.
-    """
-    assert statement.samples is not None
-    count, groups = mesh.intervals * mesh.substeps, len(statement.samples.groups)
-    reads = _reads(mesh)
-    within = set(reads)
-    moving = [k for k in range(count) if k not in within]
-    lengths = np.where(np.isin(np.arange(count), reads), groups, 1)
-    last = np.cumsum(lengths) - 1
-    steps = tuple(int(last[k]) - groups + 1 + j for k in reads for j in range(groups))
-    chosen = [column[:, reads] for column in (columns[0], *columns[2:])]
-    height = max(len(group) for group in statement.samples.groups)
-    told = Told(steps=steps, rows=height, columns=told_at(statement).map(len(reads))(*chosen))
-    points = gauss_points(statement, position, mesh.step).map(len(moving)).call([c[:, moving] for c in columns])
-    size = statement.matrices[position].size
-    if kicks is None:
-        values = passage(first, points, size, None, told)[:, last.tolist()]
-        return values, values
-    later = ca.MX(first.shape[0], int(last[-1]) + 1)
-    later[:, last[mesh.substeps - 1 :: mesh.substeps].tolist()] = kicks
-    passed = passage(first, points, size, ca.densify(later), told)[:, last.tolist()]
-    at_nodes = ca.MX(first.shape[0], count)
-    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
-    return passed - at_nodes, passed
-
-
-def _reads(mesh: Mesh) -> list[int]:
-    """The substeps, in the order of travel forward, at which something is read."""
-    return [k * mesh.substeps + j for k in mesh.instants if mesh.readings[:, k].any() for j in range(mesh.substeps)]
-
-
-def _kicked(step: ca.Function) -> ca.Function:
-    """A step with a kick after it: (*its arguments, kick) -> after the kick, before it."""
-    inputs = step.mx_in()
-    kick = ca.MX.sym("kick", inputs[0].shape[0])
-    arrived = step(*inputs)
-    return ca.Function("kicked", [*inputs, kick], [arrived + kick, arrived])
-
-
-def _stretches(
-    run: Run,
-    read: ca.Function | None,
-    first: Expr,
-    given: tuple[list[Any], list[Any]],
-    reads: list[int],
-    count: int,
-) -> list[Any]:
-    """What steps give in sequence, and between them what is read, a column each.
-
-    Args:
-        run: (value, columns of `given[0]`, their count) -> values after the steps, perhaps more.
-        read: (value, *columns of `given[1]`) -> the same.
-        first: value at the start.
-        given: arguments of the steps that move, without columns for the others; of those that read, a column for each.
-        reads: which of all steps read.
-        count: of all steps.
-    """
-    if read is None:
-        return run(first, given[0], count)
-    parts: list[list[Any]] = []
-    value, moved, k = first, 0, 0
-    for stop in [*reads, count]:
-        if length := stop - k:
-            own = [_columns(argument, moved, length, count - len(reads)) for argument in given[0]]
-            parts.append(run(value, own, length))
-            value, moved = parts[-1][0][:, -1], moved + length
-        if stop < count:
-            outputs = read(value, *(argument[:, stop] for argument in given[1]))
-            parts.append(list(outputs) if isinstance(outputs, (tuple, list)) else [outputs])
-            value = parts[-1][0]
-        k = stop + 1
-    return [ca.horzcat(*values) for values in zip(*parts, strict=True)]
-
-
-def _columns(argument: Any, begin: int, length: int, count: int) -> Any:
-    """The part of an argument that belongs to some steps, of which each has as many columns."""
-    width = argument.shape[1] // count
-    return argument[:, begin * width : (begin + length) * width]
-
-
-def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> list[Any]:
-    """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
-    if not isinstance(arguments[0], ca.DM):
-        run = step if count == 1 else step.mapaccum("propagate", count)
-        return run.call([first, *arguments])
-    lengths = [min(NUMERIC_RUN, count - begin) for begin in range(0, count, NUMERIC_RUN)]
-    runs = {length: step if length == 1 else step.mapaccum("propagate", length) for length in set(lengths)}
-    parts = [ca.horzsplit(argument, NUMERIC_RUN * (argument.shape[1] // count)) for argument in arguments]
-    value, passed = first, []
-    for length, *columns in zip(lengths, *parts, strict=True):
-        passed.append(runs[length].call([value, *columns]))
-        value = passed[-1][0][:, -1]
-    return [ca.horzcat(*values) for values in zip(*passed, strict=True)]
 
 
 def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any, ...]) -> tuple[Any, Any, Any]:

@@ -21,6 +21,7 @@ from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Conditions, Statement
+from covocp.transcription.choosing import IMPLICIT_SUBSTEPS
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import (
     check_model,
@@ -33,7 +34,7 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
-from covocp.transcription.mesh import IMPLICIT_SUBSTEPS, Mesh, Options, control_places, explicit_substeps
+from covocp.transcription.mesh import Mesh, Options, control_places, explicit_substeps
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory, at_nodes

@@ -14,10 +14,11 @@ from covocp.base.errors import CovocpError, ProblemError
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
+from covocp.transcription.choosing import choose_mesh, choose_step
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import controls_guess, starts
 from covocp.transcription.instants import with_instants
-from covocp.transcription.mesh import STIFFNESS_PER_STEP, Graded, Mesh, Options, Stiffness, choose_mesh, choose_step
+from covocp.transcription.mesh import STIFFNESS_PER_STEP, Graded, Mesh, Options, Stiffness
 
 # Real part over modulus of an eigenvalue below which what it belongs to dies out before it turns.
 DAMPED = -0.5

@@ -20,14 +20,8 @@ from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.pieces import is_separable, pieces
 from covocp.transcription.scales import limit_units
-from covocp.transcription.shooting import (
-    Passage,
-    backward_at_start,
-    compiled_steps,
-    interval_columns,
-    nominal_run,
-    shoot,
-)
+from covocp.transcription.sequences import Passage
+from covocp.transcription.shooting import backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
 from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
 from covocp.transcription.taped import Taped
 

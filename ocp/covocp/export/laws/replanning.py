@@ -17,8 +17,9 @@ from covocp.export.laws.law import QUATERNION, Port
 from covocp.export.text.names import identifier
 from covocp.problem.builder import Problem
 from covocp.problem.decisions import matters
-from covocp.problem.declarations import Declarations, Free, Matrix, Parameter, State
+from covocp.problem.declarations import Declarations, Free, Parameter, State
 from covocp.problem.expected_cost import derive, statement_of
+from covocp.problem.matrices import Matrix
 from covocp.problem.restart import Start, restartable
 from covocp.statement.statement import Statement
 

@@ -27,7 +27,8 @@ from covocp.passage.written import Tape
 from covocp.problem.builder import Problem
 from covocp.solution.solution import Solution
 from covocp.solving.solver import Solver
-from covocp.transcription.mesh import GROWTH, Mesh, Options, segment_lengths
+from covocp.transcription.choosing import GROWTH, segment_lengths
+from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import NLP
 from covocp.transcription.pieces import is_separable
 from covocp.transcription.scales import choose_scales, evened

@@ -1,0 +1,98 @@
+"""What a key of a solution stands for, and the values along its nominal by the names of the problem."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.checks import as_number
+from covocp.base.errors import ProblemError
+from covocp.base.expressions import Given
+from covocp.base.matrices import Array, unpack
+from covocp.extremal.closed_loop import ClosedLoop
+from covocp.extremal.spread_limits import scattered
+from covocp.solution.origin import Origin
+from covocp.statement.names import name_of, sizes_of, unknown_name
+from covocp.statement.statement import Block
+from covocp.statement.time_data import TimeData
+
+if TYPE_CHECKING:
+    from covocp.solution.solution import Solution
+
+
+def other_loop(solution: Solution) -> ClosedLoop | None:
+    """The loop under other statistics than the design's, of which the matrices are; None: there are no others."""
+    return solution.loop if solution.origin is Origin.OTHER_TRUTH else None
+
+
+def name_in(
+    solution: Solution, key: Given, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False
+) -> str:
+    """Name of a symbol, a name or an entry among some blocks; None: among all values."""
+    names = tuple(solution.values) if blocks is None else tuple(b.name for b in blocks)
+    sizes = sizes_of(solution.blocks if blocks is None else blocks)
+    if blocks is None:
+        sizes |= {entry.name: entry.values.shape[1] for entry in _data(solution)}
+    return name_of(key, solution.symbols, names, missing_ok=missing_ok, sizes=sizes)
+
+
+def by_name(solution: Solution, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
+    """Values by name at some times; x (K, nx), u (K, nu), e (K, ne)."""
+    sources = {"state": x, "control": u}
+    result: dict[str, Array] = {"time": t, "duration": np.full(t.shape, solution.duration)}
+    for b in solution.blocks:
+        if b.kind == "matrix":
+            result[b.name] = unpack(e[:, b.span], b.size)
+            continue
+        values = sources[b.kind][:, b.span] if b.kind in sources else np.tile(solution.parameters[b.span], (t.size, 1))
+        if b.tangent:  # of unit length, which interpolation keeps up to its error
+            values = values / np.linalg.norm(values, axis=1, keepdims=True)
+        result[b.name] = values[:, 0] if b.size == 1 else values
+    return result | {entry.name: entry.at(t) for entry in _data(solution)}
+
+
+def expression_values(solution: Solution, expression: ca.MX) -> Array:
+    """Values of an expression of the problem's symbols, (K,) or (K, rows, columns) without axes of one entry.
+
+    Raises:
+        ProblemError: it contains a symbol of another problem.
+    """
+    extremal, other = solution.extremal, other_loop(solution)
+    statement = extremal.statement
+    try:
+        function = statement.expression(expression, scattered=other is not None)
+    except RuntimeError as error:
+        raise unknown_name(expression, tuple(solution.values)) from error
+    count = extremal.mesh.nodes.size
+    arguments = extremal.columns()
+    if other is not None and function.n_in() > len(arguments):
+        arguments = (*arguments, scattered(other).T)
+    value = np.asarray(function.map(count)(*arguments).full())
+    rows, columns = expression.shape
+    shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
+    return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
+
+
+def times_within(t: Given, duration: float) -> Array:
+    """Times at which a solution has values, one or a row of them.
+
+    Raises:
+        ProblemError: one lies outside, or is not a number.
+    """
+    times = np.atleast_1d(as_number("at", "times", t))
+    margin = 1e-9 * duration
+    if times.ndim != 1 or not ((times >= -margin) & (times <= duration + margin)).all():
+        raise ProblemError(
+            "A solution has no values there.",
+            expected=f"a time or a row of times within [0, {duration:g}] s",
+            received=str(t)[:100],
+            remedy="stay within the duration of the solution",
+        )
+    return times
+
+
+def _data(solution: Solution) -> tuple[TimeData, ...]:
+    """What is given over time and used; () for a solution read from a file."""
+    return solution.statement.data if solution.statement is not None else ()
