@@ -11,22 +11,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
 from covocp.base.expressions import Expr
-from covocp.base.matrices import SEMIDEFINITE_TOLERANCE, Array, distinct, half_indices, read_only, unpack
+from covocp.base.matrices import Array, half_indices, read_only
 from covocp.base.quadrature import hermite
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
+from covocp.extremal.polynomials import Dense, joined, lengths, rows_of, semidefinite
 from covocp.statement.interval import one_sided, repeated
-from covocp.statement.statement import Block, Statement
+from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
-from covocp.transcription.mesh import SAME_NODE
 from covocp.transcription.steps import joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
@@ -47,45 +47,6 @@ SAFETY, TINY = 0.8, 1e-9
 CHUNKS = (1, 4, 16, 64, 256, 1024)
 # Such functions that are kept.
 MAPS = 32
-# Points inside a piece at which a covariance is looked at.
-LOOKS = 7
-# Knots closer than this share of what is before them in their interval, or of it before its end, are one.
-SAME = 1e-10
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Dense:
-    """States and half-vectors as piecewise cubic polynomials of the normalised time.
-
-    Args:
-        knots: normalised times, (P + 1,), rising from 0 to 1; the nodes of the mesh are among them, twice where a
-            measurement is taken: the piece between has no length.
-        values: x and e stacked there, (P + 1, nx + ne).
-        first: slopes by the normalised time at the starts of the pieces, (P, nx + ne).
-        last: slopes at their ends, which differ where a rate jumps.
-    """
-
-    knots: Array
-    values: Annotated[Array, "knots xe"]
-    first: Annotated[Array, "pieces xe"]
-    last: Annotated[Array, "pieces xe"]
-
-    __repr__ = short_repr
-
-    def at(self, s: Array, *, before: bool = False) -> Array:
-        """x and e stacked at some normalised times, (K, nx + ne); before or after what is read there."""
-        side: Any = "left" if before else "right"
-        k = np.clip(np.searchsorted(self.knots, s, side=side) - 1, 0, self.knots.size - 2)
-        h = (self.knots[k + 1] - self.knots[k])[:, None]
-        c = np.where(h > 0, (s[:, None] - self.knots[k][:, None]) / _lengths(h), float(not before))
-        return np.asarray(
-            hermite(self.values[k], self.values[k + 1], h * self.first[k], h * self.last[k], c), dtype=float
-        )
-
-
-def _lengths(h: Array) -> Array:
-    """Lengths of pieces, to divide by: 1 of those that have none."""
-    return np.where(h > 0, h, 1.0)
 
 
 def dense_output(extremal: Extremal, *, matrices: bool = True) -> Dense:
@@ -114,7 +75,7 @@ def _between(extremal: Extremal, matrices: bool) -> Dense:
         return coarse
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return _joined(extremal, _tracks(extremal, coarse, matrices))
+            return joined(extremal, _tracks(extremal, coarse, matrices))
     except RuntimeError:  # CasADi's, of a linear system that is singular: the steps of the transcription were not
         return coarse
 
@@ -140,15 +101,10 @@ def _tracks(extremal: Extremal, coarse: Dense, matrices: bool) -> list[tuple[lis
         if rows and matrices:
             tracks.append((rows, _march(_Steps.of(extremal, coarse, rows, states))))
         elif rows:
-            tracks.append((rows, _rows(coarse, rows)))
+            tracks.append((rows, rows_of(coarse, rows)))
     if gathered := [nx + k for k in st.entries(st.summed)]:  # what they are at the nodes is what counts
-        tracks.append((gathered, _rows(coarse, gathered)))
+        tracks.append((gathered, rows_of(coarse, gathered)))
     return tracks
-
-
-def _rows(dense: Dense, rows: list[int]) -> Dense:
-    """Some entries."""
-    return Dense(knots=dense.knots, values=dense.values[:, rows], first=dense.first[:, rows], last=dense.last[:, rows])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -446,7 +402,7 @@ def _table(steps: _Steps, pieces: _Pieces) -> Dense:
     missed = _corrections(steps, pieces, missed)[k]
     low, high = pieces.low - pieces.c[:, None] * missed, pieces.high - pieces.d[:, None] * missed
     high[arrived] = steps.goal
-    length = _lengths(np.diff(nodes)[k][:, None])
+    length = lengths(np.diff(nodes)[k][:, None])
     first, last = (pieces.first - missed) / length, (pieces.last - missed) / length
     places = steps.place(k, pieces.c), steps.place(k, pieces.d)
     if steps.backward:
@@ -467,75 +423,8 @@ def _corrections(steps: _Steps, pieces: _Pieces, missed: Array) -> Array:
     for block in st.matrices:
         if block.covariance and st.nx + block.span.start in steps.rows:
             where = [steps.rows.index(st.nx + i) for i in range(block.span.start, block.span.stop)]
-            good = _semidefinite(pieces.high[:, where], block.size) & (pieces.d < 1.0)
+            good = semidefinite(pieces.high[:, where], block.size) & (pieces.d < 1.0)
             bad = np.zeros(len(result), dtype=bool)
-            bad[pieces.k[good & ~_semidefinite(corrected[:, where], block.size)]] = True
+            bad[pieces.k[good & ~semidefinite(corrected[:, where], block.size)]] = True
             result[np.ix_(bad, np.array(where))] = 0.0
     return result
-
-
-def _semidefinite(halves: Array, size: int) -> Any:
-    """Whether covariances of half-vectors (..., entries) are positive semidefinite up to roundoff."""
-    eigenvalues = np.linalg.eigvalsh(np.nan_to_num(unpack(halves, size)))
-    return eigenvalues[..., 0] >= -SEMIDEFINITE_TOLERANCE * np.abs(eigenvalues[..., -1])
-
-
-def _joined(extremal: Extremal, tracks: list[tuple[list[int], Dense]]) -> Dense:
-    """One table of all entries, on the knots of all."""
-    knots = _union(extremal.mesh.nodes, [dense.knots for _, dense in tracks])
-    size = extremal.statement.nx + extremal.statement.ne
-    values, first, last = np.zeros((knots.size, size)), *np.zeros((2, knots.size - 1, size))
-    for rows, dense in tracks:
-        parts = (dense.values, dense.first, dense.last)
-        if not np.array_equal(dense.knots, knots):
-            parts = _restricted(dense, knots)
-        values[:, rows], first[:, rows], last[:, rows] = parts
-    result = Dense(knots=knots, values=values, first=first, last=last)
-    for block in extremal.statement.matrices:
-        if block.covariance:
-            _straighten(result, block, extremal.statement.nx)
-    return result
-
-
-def _union(nodes: Array, groups: list[Array]) -> Array:
-    """The knots of all, without those that differ by roundoff from a node or from the one before."""
-    inside = distinct(*groups)
-    k = np.clip(np.searchsorted(nodes, inside) - 1, 0, nodes.size - 2)
-    length = np.diff(nodes)[k]
-    known = np.maximum(SAME**2 * length, SAME_NODE * nodes[k])
-    kept = (inside - nodes[k] > known) & (nodes[k + 1] - inside > SAME * length)
-    inside, passed = inside[kept], (inside - nodes[k])[kept]
-    apart = np.diff(inside, prepend=-1.0) > SAME * passed
-    return np.sort(np.concatenate([nodes, inside[apart]]))
-
-
-def _restricted(dense: Dense, knots: Array) -> tuple[Array, Array, Array]:
-    """Values and slopes of the same polynomials at other knots."""
-    j = np.clip(np.searchsorted(dense.knots, 0.5 * (knots[1:] + knots[:-1])) - 1, 0, dense.knots.size - 2)
-    j[np.diff(knots) == 0] = np.flatnonzero(np.diff(dense.knots) == 0)  # the same instants in both
-    h = _lengths((dense.knots[j + 1] - dense.knots[j])[:, None])
-    a, b, slopes = dense.values[j], dense.values[j + 1], (h * dense.first[j], h * dense.last[j])
-
-    def value(at: Array) -> Array:
-        return np.asarray(hermite(a, b, *slopes, (at[:, None] - dense.knots[j][:, None]) / h))
-
-    def slope(at: Array) -> Array:
-        c = (at[:, None] - dense.knots[j][:, None]) / h
-        chord = 6 * c * (1 - c) * (b - a)
-        return np.asarray((chord + (1 - c) * (1 - 3 * c) * slopes[0] + c * (3 * c - 2) * slopes[1]) / h)
-
-    values = np.vstack([value(knots[:-1]), dense.values[-1]])
-    return values, slope(knots[:-1]), slope(knots[1:])
-
-
-def _straighten(dense: Dense, block: Block, offset: int) -> None:
-    """Make a covariance linear (in place) over the pieces where its cubic is indefinite and their ends are not."""
-    rows = slice(block.span.start + offset, block.span.stop + offset)
-    h = np.diff(dense.knots)[:, None, None]
-    c = np.linspace(0.0, 1.0, LOOKS + 2)[None, :, None]
-    ends = dense.values[:-1, None, rows], dense.values[1:, None, rows]
-    looks = hermite(*ends, h * dense.first[:, None, rows], h * dense.last[:, None, rows], c)
-    bad = ~_semidefinite(looks, block.size)
-    pieces = np.flatnonzero(bad.any(axis=1) & ~bad[:, 0] & ~bad[:, -1])
-    chord = (dense.values[pieces + 1, rows] - dense.values[pieces, rows]) / _lengths(h[pieces, 0])
-    dense.first[pieces, rows] = dense.last[pieces, rows] = chord

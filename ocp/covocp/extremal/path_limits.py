@@ -10,8 +10,9 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
-from covocp.extremal.dense_output import OF_RANGE, Dense, mapped
+from covocp.extremal.dense_output import OF_RANGE, mapped
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.polynomials import Dense
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement

@@ -20,7 +20,7 @@ from covocp.base.pages import as_html
 from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.extremal.closed_loop import ClosedLoop, close_loop
 from covocp.extremal.costates import discrete_costates
-from covocp.extremal.dense_output import Dense, dense_output
+from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.links import Within
@@ -30,6 +30,7 @@ from covocp.extremal.nodes import filter_gains, rates_along
 from covocp.extremal.optimality import Optimality, assess, identities
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.phase_loops import PhaseLoop
+from covocp.extremal.polynomials import Dense
 from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.solution.chances import Reached, reached
 from covocp.solution.costs import identity_of_costs, split_cost
