@@ -16,12 +16,13 @@ from covocp.extremal.links import ChainOutcome
 from covocp.solvers.gradient.chain import ChainIterate, ChainLinear, ChainSpace, chain_space, given_entries
 from covocp.solvers.gradient.influence import Sweeps, build_sweeps, terminal_conditions
 from covocp.solvers.gradient.iterate import Space, make_space, point_of
+from covocp.solvers.gradient.lengths import lengths
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.search import Search, Settings
 from covocp.solvers.gradient.statuses import Status
 from covocp.statement.chain import Chain, Link
 from covocp.statement.statement import Statement
-from covocp.transcription.mesh import Mesh
+from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import check_costs
 from covocp.transcription.program import Arrays
 from covocp.transcription.trajectory import Trajectory
@@ -67,9 +68,12 @@ def _check_decisions(link: Link, before: Statement, after: Statement) -> None:
 class GradientChainSolver:
     """The compiled sweeps of all phases with the settings of the method."""
 
-    def __init__(self, chain: Chain, meshes: tuple[Mesh, ...], pairs: tuple[int, ...], settings: Settings) -> None:
+    def __init__(
+        self, chain: Chain, options: tuple[Options, ...], meshes: tuple[Mesh, ...], settings: Settings
+    ) -> None:
         """Keep the settings; the sweeps are compiled at the first call of `solve`."""
-        self._chain, self._meshes, self._pairs, self._settings = chain, meshes, pairs, settings
+        self._chain, self._options, self._meshes, self._settings = chain, options, meshes, settings
+        self._pairs = (0,) * len(meshes)
         self._sweeps: list[Sweeps] = []
 
     @property
@@ -80,11 +84,12 @@ class GradientChainSolver:
     def solve(self, parameters: Arrays, guesses: tuple[Guess, ...], progress: Progress) -> ChainOutcome:
         """Solve for these parameters from these guesses; the last iterate is returned whatever happens."""
         begin = time.perf_counter()
+        misled = self._suited(parameters)
         space = self._space(parameters, guesses)
         built = time.perf_counter()
         pairs = zip(space.parts, guesses, strict=True)
         current = space.at(np.concatenate([point_of(part, guess.trajectory) for part, guess in pairs]))
-        self._check(current)
+        self._check(current, misled)
         search = Search(space, self._settings, progress)
         end = search.run(current)
         counts = {
@@ -122,10 +127,21 @@ class GradientChainSolver:
             bounds_at_ends=tuple((np.zeros_like(last), last) for last in at_ends),
             cost_terms=tuple({"terminal": own.run.terminal, "running": own.run.running} for own in iterate.parts),
             converged=end.status is Status.SOLVED,
-            message=str(end.status),
+            message=end.status.told(misled),
             violations=space.violations(iterate, self._settings.violation_tolerance),
             stats=counts,
         )
+
+    def _suited(self, parameters: Arrays) -> str:
+        """Take the backward steps that these values need; what is too long nonetheless, in words."""
+        parts = list(zip(self._chain.statements, self._meshes, self._options, parameters, strict=True))
+        found = [lengths(st, mesh, own, values) for st, mesh, own, values in parts]
+        wanted = tuple(one.pairs(mesh) for one, mesh in zip(found, self._meshes, strict=True))
+        if any(new > old for new, old in zip(wanted, self._pairs, strict=True)):
+            self._pairs, self._sweeps = wanted, []
+        reasons = [one.reason(mesh, pairs) for one, mesh, pairs in zip(found, self._meshes, self._pairs, strict=True)]
+        said = [f"in '{st.name}' {words}" for (st, *_), words in zip(parts, reasons, strict=True) if words]
+        return said[0] if said else ""
 
     def _space(self, parameters: Arrays, guesses: tuple[Guess, ...]) -> ChainSpace:
         """The unknowns of all phases for these parameters, with the compiled sweeps."""
@@ -144,18 +160,37 @@ class GradientChainSolver:
             parts.append(make_space(sweeps, groups, own, guess, given))
         return chain_space(tuple(parts), self._chain.links)
 
-    def _check(self, current: ChainIterate) -> None:
+    def _check(self, current: ChainIterate, misled: str) -> None:
         """The first trajectory must stay in the domain of the model."""
         for space, own in zip(current.spaces, current.parts, strict=True):
             if np.isfinite(own.run.z).all():
                 check_costs(_trajectory(space, own), own.run.running, own.run.terminal)
-        if not current.run.finite:
-            raise OutsideDomainError(
-                "The trajectory of the first control is NaN or inf.",
-                expected="a first control along which the model stays in its domain",
-                received="a forward integration that diverges",
-                remedy="give another guess of the controls, more intervals, or use method='ipopt'",
-            )
+        check_domain(current.run.finite, misled)
+
+
+def check_domain(finite: bool, misled: str) -> None:
+    """The first trajectory must be numbers. `misled`: that its steps are too long, where they are.
+
+    Raises:
+        OutsideDomainError: it leaves the domain of the model.
+        ProblemError: its steps are too long.
+    """
+    if finite:
+        return
+    if misled:
+        reason, _, remedy = misled.partition(": ")
+        raise ProblemError(
+            "The trajectory of the first control is NaN or inf.",
+            expected="integration steps that are short enough for these values of the parameters",
+            received=reason,
+            remedy=remedy,
+        )
+    raise OutsideDomainError(
+        "The trajectory of the first control is NaN or inf.",
+        expected="a first control along which the model stays in its domain",
+        received="a forward integration that diverges",
+        remedy="give another guess of the controls, more intervals, or use method='ipopt'",
+    )
 
 
 def _trajectory(space: Space, iterate: Any) -> Trajectory:

@@ -33,17 +33,18 @@ from scipy.sparse.linalg import splu
 
 from covocp.base.arguments import checked, one_of, positive, share, whole
 from covocp.base.checks import as_number
-from covocp.base.errors import OutsideDomainError, ProblemError, shown
+from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
 from covocp.extremal.decisions import with_tied_multipliers
 from covocp.extremal.extremal import Extremal, Guess, Outcome
-from covocp.solvers.gradient.chain_method import GradientChainSolver, check_phases
+from covocp.solvers.gradient.chain_method import GradientChainSolver, check_domain, check_phases
 from covocp.solvers.gradient.descent import solve_step
 from covocp.solvers.gradient.influence import build_sweeps
 from covocp.solvers.gradient.iterate import Space, make_space
+from covocp.solvers.gradient.lengths import lengths
 from covocp.solvers.gradient.memory import learnt
 from covocp.solvers.gradient.penalty import penalty_groups
 from covocp.solvers.gradient.records import Iterate
@@ -54,13 +55,9 @@ from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import controls_guess
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.nlp import check_costs
-from covocp.transcription.stiffness import resolve_mesh, stiffness
+from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Trajectory
 
-LARGEST_PAIRS = 64
-# Steps per interval of the backward integration: h times the rate of the costates stays below this. The method ends
-# where its own slopes vanish: on a graded mesh steps of 1 (limit 2.78) cost 1e-5, steps of 1/4 1e-8 of the cost.
-STIFFNESS_PER_PAIR = 0.25
 # Relative difference of two entries of a metric that count as equal.
 SYMMETRIC = 1e-9
 
@@ -121,10 +118,11 @@ def prepare(
     Raises:
         ProblemError: an option is wrong.
     """
-    mesh, pairs = _meshed(statement, options, statement.values if parameters is None else parameters)
+    parameters = statement.values if parameters is None else parameters
+    mesh = _meshed(statement, options, parameters)
     _check_weight(weight, statement.nu, mesh.nodes.size)
     settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
-    return GradientSolver(statement, mesh, pairs, settings)
+    return GradientSolver(statement, options, mesh, lengths(statement, mesh, options, parameters).pairs(mesh), settings)
 
 
 @checked("the method 'gradient'", **KINDS)
@@ -156,12 +154,12 @@ def prepare_chain(
     settings = _settings(variant, weight, weight_factor, fraction, tolerance, violation_tolerance, max_iterations)
     check_phases(chain, settings)
     _check_weight(weight, 1, 0)
-    pairs = [_meshed(st, own, st.values) for st, own in zip(chain.statements, options, strict=True)]
-    return GradientChainSolver(chain, tuple(mesh for mesh, _ in pairs), tuple(count for _, count in pairs), settings)
+    meshes = tuple(_meshed(st, own, st.values) for st, own in zip(chain.statements, options, strict=True))
+    return GradientChainSolver(chain, options, meshes, settings)
 
 
-def _meshed(statement: Statement, options: Options, parameters: Array) -> tuple[Mesh, int]:
-    """The mesh in one segment with propagated matrices, and the steps of an interval backward.
+def _meshed(statement: Statement, options: Options, parameters: Array) -> Mesh:
+    """The mesh in one segment with propagated matrices.
 
     Raises:
         ProblemError: an option of shooting.
@@ -172,11 +170,7 @@ def _meshed(statement: Statement, options: Options, parameters: Array) -> tuple[
     if options.points not in ("auto", 1):
         raise _option_error("points", "'auto' or 1: its penalties act at the nodes; 'ipopt' has more", options.points)
     mesh = resolve_mesh(statement, options, parameters)
-    mesh = replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
-    found = stiffness(statement, options, parameters)
-    stiff = max(found.nominal, found.matrices)
-    pairs = int(np.clip(np.ceil(stiff / STIFFNESS_PER_PAIR), mesh.substeps, max(LARGEST_PAIRS, mesh.substeps)))
-    return mesh, pairs
+    return replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
 
 
 def _settings(
@@ -235,9 +229,13 @@ def _option_error(name: str, expected: str, received: Given) -> ProblemError:
 class GradientSolver:
     """The compiled sweeps with the settings of the method."""
 
-    def __init__(self, statement: Statement, mesh: Mesh, pairs: int, settings: Settings) -> None:
-        """Keep the settings; see `prepare`. The sweeps are compiled at the first call of `solve`."""
-        self._statement, self._mesh, self._pairs, self._settings = statement, mesh, pairs, settings
+    def __init__(self, statement: Statement, options: Options, mesh: Mesh, pairs: int, settings: Settings) -> None:
+        """Keep the settings; see `prepare`. The sweeps are compiled at the first call of `solve`.
+
+        pairs: steps of the costates in an interval, for the values that the mesh was made for.
+        """
+        self._statement, self._options, self._mesh = statement, options, mesh
+        self._pairs, self._settings = pairs, settings
         self._sweeps: Any = None
         self._groups: Any = ()
 
@@ -249,23 +247,22 @@ class GradientSolver:
     def solve(self, parameters: Array, guess: Guess, progress: Progress) -> Outcome:
         """Solve for these parameters from this guess; the last iterate is returned whatever happens."""
         begin = time.perf_counter()
+        found = lengths(self._statement, self._mesh, self._options, parameters)
+        if found.pairs(self._mesh) > self._pairs:  # the mesh may be kept for faster costates
+            self._pairs, self._sweeps = found.pairs(self._mesh), None
+        misled = found.reason(self._mesh, self._pairs)
         space = self.space(parameters, guess)
         built = time.perf_counter()
         current = space.first(guess)
         if np.isfinite(current.run.z).all():
             check_costs(self._trajectory(current), current.run.running, current.run.terminal)
-        if not current.run.finite:
-            raise OutsideDomainError(
-                "The trajectory of the first control is NaN or inf.",
-                expected="a first control along which the model stays in its domain",
-                received="a forward integration that diverges",
-                remedy="give another guess of the controls, more intervals, or use method='ipopt'",
-            )
+        check_domain(current.run.finite, misled)
         search = Search(space, self._settings, progress)
         end = search.run(current)
         return self._outcome(
             space,
             end,
+            misled,
             {
                 "iterations": search.control.iterations,
                 "build_seconds": built - begin,
@@ -292,8 +289,8 @@ class GradientSolver:
         u = self._mesh.acting(run.u.T).T
         return Trajectory(x=run.z[:, :nx], u=u, e=run.z[:, nx:], duration=run.duration)
 
-    def _outcome(self, space: Space, end: End, stats: dict[str, Any]) -> Outcome:
-        """The last iterate as data."""
+    def _outcome(self, space: Space, end: End, misled: str, stats: dict[str, Any]) -> Outcome:
+        """The last iterate as data; `misled`: the reason of a run that failed, where its steps are too long."""
         run = end.iterate.run
         return Outcome(
             extremal=with_tied_multipliers(
@@ -307,7 +304,7 @@ class GradientSolver:
             ),
             cost_terms={"terminal": run.terminal, "running": run.running},
             converged=end.status is Status.SOLVED,
-            message=str(end.status),
+            message=end.status.told(misled),
             violations=space.violations(end.iterate, self._settings.violation_tolerance),
             stats=stats,
         )

@@ -29,3 +29,8 @@ class Status(Ending):
     def __init__(self, words: str, advice: str) -> None:
         """Keep the parts of the value by name."""
         self.words, self.advice = words, advice
+
+    def told(self, misled: str) -> str:
+        """In words; of a run that failed with steps that are too long these, `misled`, are the reason."""
+        by_itself = self in (Status.SOLVED, Status.STOPPED, Status.ITERATIONS)
+        return misled if misled and not by_itself else str(self)

@@ -118,3 +118,26 @@ def test_steps_that_have_c_code_are_exact_in_any_units():
             other[:] = [a - factor * b for a, b in zip(other, pivot, strict=True)]
     exact = np.array([float(row[-1] / row[i]) for i, row in enumerate(rows)])
     np.testing.assert_allclose(found, exact, rtol=1e-13)
+
+
+@pytest.mark.parametrize("start", [{}, {"initial_x": 1.5}, {"initial_x": -1.5}])
+def test_plans_of_a_problem_with_a_large_prior_are_those_of_the_converged_optimum(start):
+    """Its cost is two, its curvature in units of the variables two thousand: the first slopes led astray."""
+
+    def make():
+        ocp = co.Problem(duration=10.0, name="prior")
+        x, b = ocp.state("x", initial=0.0, final=1.0, variance=1e3), ocp.unknown("b", mean=1.0, variance=5.0)
+        u = ocp.control("u")
+        ocp.dynamics(x, -b * x + u, noise=1.0)
+        ocp.measurement("m", x, noise=1.0)
+        ocp.minimize_expected(running=0.5 * u**2, terminal_weight={x: 2.0})
+        return ocp
+
+    folder = FOLDER / f"prior_{len(start)}_{sum(start.values()) > 0}"
+    planner = export_c(make(), folder, intervals=20).reference()
+    plan = planner(**start)
+    assert planner.status == "OK"
+    nodes = plan["time"].ravel() / plan["time"].ravel()[-1]
+    guess = {"u": plan["u"]}
+    solution = co.solve(moved(make(), start), grid=nodes, guess=guess, progress=False, plugin_options=TIGHT)
+    assert float(plan["cost"]) == pytest.approx(solution.cost, rel=SAME)

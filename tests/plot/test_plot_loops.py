@@ -175,7 +175,7 @@ def test_entries_are_explained_once_and_units_stand_below_long_names(entry):
     _, flight = entry
     figure = flight.plot("rms", "K")
     assert [bool(entries_of(axes)) for axes in panels(figure).values()] == [True] + [False] * 4 + [True] + [False] * 4
-    assert entries_of(panels(figure)["K[h]"]) == ["accelerometers[0]", "accelerometers[1]"]
+    assert entries_of(panels(figure)["K[h] [ft/((ft/s^2) s)]"]) == ["accelerometers[0]", "accelerometers[1]"]
     assert "rms of log_density\n[ln(slug/ft^3)]" in panels(figure)
 
 

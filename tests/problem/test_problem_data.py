@@ -74,7 +74,7 @@ def test_shape_of_a_guess():
     solve(simple(control={"guess": np.zeros((3, 2))})[0])
 
 
-@wrong("guess of 'u'", "function of s", "shape (3, 2)")
+@wrong("guess of 'u'", "one value at each s", "shape (3, 2)")
 def test_shape_of_a_guessing_function():
     solve(simple(control={"guess": lambda s: np.zeros((3, 2))})[0])
 

@@ -203,3 +203,60 @@ def test_a_control_of_the_cost_is_used(expected):
         ocp.measurement("m", x, noise=1.0)
     (ocp.minimize_expected if expected else ocp.minimize)(running=u**2 + v**2 + x**2)
     assert run(ocp).converged
+
+
+def two_parts(use):
+    """x' = u through two phases; a control v in what `use` declares in the second one, beside the rate and the cost."""
+    parts = []
+    for k, name in enumerate(("climb", "cruise")):
+        ocp = co.Problem(1.0, name=name)
+        x = ocp.state("x", initial=None if k else 0.0, final=2.0 if k else None, variance=None if k else 1.0)
+        u = ocp.control("u")
+        ocp.dynamics(x, u, noise=0.1)
+        ocp.measurement("m", x, noise=1.0)
+        if k:
+            use(ocp, x, u, ocp.control("v", guess=0.5))
+        ocp.estimation_covariance()
+        ocp.minimize(running=u**2)
+        parts.append(ocp)
+    return co.Phases(parts)
+
+
+def test_a_control_on_which_nothing_depends_in_its_phase():
+    phases = two_parts(lambda ocp, x, u, v: None)
+    with pytest.warns(co.CovocpWarning, match="Nothing depends on the control 'v' of the phase 'cruise'") as given:
+        solution = run(phases)
+    assert len(given) == 1
+    assert solution.cost == pytest.approx(2.0)  # u = 1 in both
+    run(phases)  # it is said once
+    nominal = [{"u": 1.0}, {"u": 1.0, "v": 0.5}]
+    with pytest.warns(co.CovocpWarning, match="Nothing depends on the control 'v' of the phase 'cruise'"):
+        co.evaluate(two_parts(lambda ocp, x, u, v: None), nominal=nominal, intervals=4)
+
+
+def test_a_phase_that_has_changed_is_looked_at_again():
+    phases = two_parts(lambda ocp, x, u, v: None)
+    with pytest.warns(co.CovocpWarning, match="the control 'v' of the phase 'cruise'"):
+        run(phases)
+    phases.problems[0].control("w")
+    with pytest.warns(co.CovocpWarning, match="the control '[vw]' of the phase") as given:
+        run(phases)
+    assert "the control 'w' of the phase 'climb'" in str(given[0].message)
+    assert len(given) == 2
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda ocp, x, u, v: ocp.dynamics(ocp.state("y", initial=0.0, final=1.0), v),
+        lambda ocp, x, u, v: ocp.measurement("n", x, noise=1.0 + v**2),
+        lambda ocp, x, u, v: ocp.subject_to(u - v, lower=0.0, upper=0.0, name="same"),
+        lambda ocp, x, u, v: ocp.chance(x + v, upper=30.0, probability=0.9),
+        lambda ocp, x, u, v: ocp.integral(v**2),
+    ],
+    ids=["rate", "noise of a reading", "condition", "chance", "integral"],
+)
+def test_a_control_that_is_used_in_its_phase_is_meant(use):
+    from covocp.solving.unused import mention_idle_in
+
+    mention_idle_in(two_parts(use))  # warnings are errors

@@ -4,7 +4,8 @@
     def simulate(...)
 
 A kind looks at a value and says what it should have been, or "" where it is one. What depends on other arguments, or
-takes arrays and expressions, is checked where it is read (`covocp.base.checks`).
+takes arrays and expressions, is checked where it is read (`covocp.base.checks`). Names that the function does not know,
+and those that it needs, are told too (`covocp.base.calls`).
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from covocp.base.calls import called_as, refused_call
 from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Given
 
 P = ParamSpec("P")
 R = TypeVar("R")
+C = TypeVar("C", bound=type)
 Kind = Callable[[Any], str]
 
 # Whole numbers above this count nothing that fits into a memory.
@@ -35,7 +38,7 @@ def checked(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
         kinds: by name of the argument.
 
     Raises:
-        ProblemError: by the function, where an argument is not of its kind.
+        ProblemError: by the function, where an argument is not of its kind, not known, or missing.
     """
 
     def of(function: Callable[P, R]) -> Callable[P, R]:
@@ -43,7 +46,7 @@ def checked(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
         positional = [
             p.name for p in parameters if p.kind in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
         ]
-        owner = called or f"{function.__qualname__.removesuffix('.__init__')}()"
+        owner = called or called_as(function)
 
         @wraps(function)
         def with_checks(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -51,11 +54,23 @@ def checked(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
                 kind = kinds.get(name)
                 if kind is not None:
                     check_argument(owner, name, kind, value)
-            return function(*args, **kwargs)
+            try:
+                return function(*args, **kwargs)
+            except TypeError:
+                error = refused_call(function, owner, args, kwargs)
+                if error is None:
+                    raise
+            raise error
 
         return with_checks
 
     return of
+
+
+def checked_class(cls: C) -> C:
+    """The class, which refuses arguments that it does not know, and says which it needs."""
+    setattr(cls, "__init__", checked()(vars(cls)["__init__"]))  # noqa: B010 - mypy takes it for a slip otherwise
+    return cls
 
 
 def check_argument(owner: str, name: str, kind: Kind, value: Given) -> None:

@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from covocp.solution.solution import Solution
 
@@ -192,7 +192,14 @@ def no_export_option(what: str, name: str, value: object, known: Sequence[str]) 
     )
 
 
-def no_option(what: str, name: str, value: object, known: Iterable[str], beside: Iterable[str] = ()) -> ProblemError:
+def no_option(
+    what: str,
+    name: str,
+    value: object,
+    known: Iterable[str],
+    beside: Collection[str] = (),
+    otherwise: str = "correct or remove it",
+) -> ProblemError:
     """The error for an option that is not there.
 
     Args:
@@ -200,14 +207,16 @@ def no_option(what: str, name: str, value: object, known: Iterable[str], beside:
         name: of the option.
         value: that was given to it.
         known: the options that there are.
-        beside: other arguments of the call, which may be meant too.
+        beside: other arguments of the call, which may be meant too; one that is given here is known elsewhere.
+        otherwise: the remedy where no name is near.
     """
     names = sorted(known)
+    elsewhere = f"'{name}' belongs to the call that solves, such as Solver.solve({name}=...)" if name in beside else ""
     return ProblemError(
         f"{what} has no option '{name}'.",
         expected="one of " + ", ".join(names),
         received=f"{name}={value!r}"[:100],
-        remedy=spelling(name, [*names, *beside], "correct or remove it"),
+        remedy=elsewhere or spelling(name, [*names, *beside], otherwise),
     )
 
 

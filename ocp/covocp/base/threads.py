@@ -17,6 +17,7 @@ from types import FunctionType
 from typing import Any, Generic, ParamSpec, Self, TypeVar, overload
 
 from covocp.base.blas import Limits, one_blas_thread
+from covocp.base.calls import called_as, refused_call
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -76,12 +77,18 @@ if hasattr(os, "register_at_fork"):
 
 
 def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, which waits for its turn."""
+    """The function, which waits for its turn; a call that does not fit it is refused by a `ProblemError`."""
 
     @wraps(function)
     def in_turn(*args: P.args, **kwargs: P.kwargs) -> R:
-        with TURN:
-            return function(*args, **kwargs)
+        try:
+            with TURN:
+                return function(*args, **kwargs)
+        except TypeError:
+            error = refused_call(function, called_as(function), args, kwargs)
+            if error is None:
+                raise
+        raise error
 
     return in_turn
 

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from covocp.base.arguments import checked
 from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError, spelling
 from covocp.base.expressions import TABLE, Expr, Given
@@ -108,6 +109,7 @@ class Table:
         return _polynomial(ca.MX(ca.DM(values.T))[:, cell], offsets)
 
 
+@checked()
 def table(name: str, grid: Given, values: Given, *, kind: Literal["linear", "cubic"] = "linear") -> Table:
     """A table of one to three variables, usable wherever an expression is.
 

@@ -216,14 +216,16 @@ class _Steps:
     def allowed(self, start: Array, end: Array) -> Array:
         """Largest errors of a step between these values."""
         spread = np.maximum(self.seen[1] - self.seen[0], OF_SIZE * self.size)
-        allowed = np.broadcast_to(OF_RANGE * spread, start.shape)
+        allowed = np.broadcast_to(np.maximum(OF_RANGE * spread, ROUNDOFF * self.size), start.shape)
         known = self.pairs[0] >= 0
         if known.any():
             near = np.maximum(np.abs(start), np.abs(end))
             variances = near[:, self.pairs[0][known]] * near[:, self.pairs[1][known]]
             allowed = allowed.copy()
-            allowed[:, known] = np.minimum(allowed[:, known], OF_DEVIATIONS * np.sqrt(variances))
-        return np.asarray(np.maximum(allowed, ROUNDOFF * self.size))
+            # What a variance once was says nothing of the roundoff when it is less by many orders of magnitude.
+            least = ROUNDOFF**2 * self.size[known]
+            allowed[:, known] = np.clip(OF_DEVIATIONS * np.sqrt(variances), least, allowed[:, known])
+        return np.asarray(allowed)
 
 
 def _variances(statement: Statement, rows: list[int]) -> Any:

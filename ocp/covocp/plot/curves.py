@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -220,6 +220,15 @@ def shortened(expression: Given) -> str:
     return text if len(text) <= LONGEST_LABEL else text[: LONGEST_LABEL - 3] + "..."
 
 
+def units_in(solutions: Iterable[Solution]) -> dict[str, str]:
+    """Units by name of what is in solutions, and of what is measured where their problem is known."""
+    units: dict[str, str] = {}
+    for solution in solutions:
+        measured = () if solution.statement is None else solution.statement.measurements
+        units |= {block.name: block.unit for block in (*solution.blocks, *measured)}
+    return units
+
+
 def unit_of(name: str, units: Mapping[str, str]) -> str:
     """The unit of a symbol as it stands on an axis; "" where none is known."""
     word = _unit(name, units)
@@ -244,6 +253,14 @@ def ratio_unit(above: str, below: str, units: Mapping[str, str]) -> str:
     """Unit of a gain from one symbol to another."""
     words = _unit(above, units), _unit(below, units)
     return f" [{_bracketed(words[0])}/{_bracketed(words[1])}]" if all(words) else ""
+
+
+def filter_unit(state: str, measurement: str, units: Mapping[str, str]) -> str:
+    """Unit of a gain K = E M' U^-1 of the continuous filter: of the state per measured value and second."""
+    above, below = _unit(state, units), _unit(measurement, units)
+    if not above or not below:
+        return ""
+    return " [1/s]" if above == below else f" [{_bracketed(above)}/({_bracketed(below)} s)]"
 
 
 def _bracketed(word: str) -> str:

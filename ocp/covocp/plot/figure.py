@@ -16,7 +16,7 @@ from covocp.base.arguments import checked, either, optional, positives, sequence
 from covocp.base.errors import ProblemError, no_option
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
-from covocp.plot.curves import Panel
+from covocp.plot.curves import Panel, units_in
 from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.plot.paths import outline
@@ -142,7 +142,7 @@ def plot_solutions(
         check_target(path, SUFFIXES)
     given = list(solutions)
     legend = _labels(given, labels)
-    known = {block.name: block.unit for solution in given for block in solution.blocks}
+    known = units_in(given)
     strange = [name for name in units or {} if name not in known]
     if strange:
         raise ProblemError(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from covocp.base.expressions import Given
-from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, ratio_unit, shortened, unit_of
+from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, filter_unit, ratio_unit, shortened, unit_of
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
 from covocp.statement.statement import Block, entry_names, error_names
@@ -74,29 +74,34 @@ def gain(drawn: Sequence[Drawn], word: str, of: str | None, units: Mapping[str, 
         drawn: solutions that have it.
         word: which gain.
         of: the state or unknown; None: all whose gain is not zero.
-        units: by name.
+        units: by name; where they differ within a panel they stand with its entries.
     """
     fed = word == GAIN
     histories = [d.between(d.solution.gains[word].transpose(0, 2, 1) if fed else d.solution.gains[word]) for d in drawn]
     labels = drawn[0].solution.augmented
     others = _controls(drawn[0].solution) if fed else _measured(drawn[0].solution)
+    owners = [name.split("[")[0] for name in (others if fed else _measured(drawn[0].solution, alone=True))]
     panels = []
     some = any(np.any(history) for history in histories)
     for owner in dict.fromkeys(label.split("[")[0] for label in labels) if of is None else (of,):
         rows = [i for i, label in enumerate(labels) if owner in (label, label.split("[")[0])]
         if of is None and some and not any(np.any(history[:, rows]) for history in histories):
             continue
-        unit = ratio_unit(others[0].split("[")[0], owner, units) if fed else ""
         for group in [rows] if len(rows) > SEPARATE_ENTRIES else [[i] for i in rows]:
             entries = [(i, j) for i in group for j in range(len(others))]
-            names = tuple(_entry(labels[i], others[j], fed) for i, j in entries) if len(group) > 1 else tuple(others)
+            names = [_entry(labels[i], others[j], fed) for i, j in entries] if len(group) > 1 else list(others)
+            pairs = [(owners[j], owner) if fed else (owner, owners[j]) for _, j in entries]
+            words = [(ratio_unit if fed else filter_unit)(above, below, units) for above, below in pairs]
+            alike = len(set(words)) == 1
+            names = names if alike else [name + unit for name, unit in zip(names, words, strict=True)]
             whole = _entry(labels[group[0]] if len(group) == 1 else owner, others[0] if len(others) == 1 else "", fed)
             curves = [
                 Curve(t=d.t, y=history[:, i, j], order=d.order, entry=k)
                 for d, history in zip(drawn, histories, strict=True)
                 for k, (i, j) in enumerate(entries)
             ]
-            panels.append(Panel(label=f"{word}[{whole}]{unit}", entries=names, curves=tuple(curves)))
+            label = f"{word}[{whole}]" + (words[0] if alike else "")
+            panels.append(Panel(label=label, entries=tuple(names), curves=tuple(curves)))
     return panels
 
 
@@ -110,12 +115,12 @@ def _controls(solution: Solution) -> list[str]:
     return list(entry_names(tuple(b for b in solution.blocks if b.kind == "control" and b.name != GAIN)))
 
 
-def _measured(solution: Solution) -> list[str]:
-    """Names of the measured values; a single one needs none, and those of a file without its problem have numbers."""
+def _measured(solution: Solution, *, alone: bool = False) -> list[str]:
+    """Names of the measured values, those of a file without its problem with numbers; `alone`: also of a single one."""
     assert solution.filter_gain is not None
     count = solution.filter_gain.shape[2]
     known = solution.statement.measurement_names if solution.statement is not None else ()
-    if count == 1:
+    if count == 1 and not alone:
         return [""]
     name = known[0] if len(known) == 1 else "m"
     return list(known) if len(known) == count else [f"{name}[{i}]" for i in range(count)]

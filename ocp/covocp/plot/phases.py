@@ -13,7 +13,7 @@ from covocp.base.arguments import checked, optional, positives, text, texts_by_n
 from covocp.base.expressions import Given
 from covocp.base.files import check_target
 from covocp.base.matrices import Array
-from covocp.plot.curves import Panel
+from covocp.plot.curves import Panel, units_in
 from covocp.plot.figure import SUFFIXES, drawn_figure
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.solution.instants import instant_times
@@ -63,7 +63,7 @@ def plot_phases(
     if path is not None:
         check_target(path, SUFFIXES)
     phases = list(solution.phases)
-    words = {block.name: block.unit for phase in phases for block in phase.blocks} | dict(units or {})
+    words = units_in(phases) | dict(units or {})
     panels = choose_panels(phases, names, costates=costates, over=over, units=words)
     shifts = solution.starts if over is None else np.zeros(len(phases))
     return drawn_figure(

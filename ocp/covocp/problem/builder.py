@@ -465,7 +465,7 @@ class Problem:
             at: instants at which it is taken [s], rising; the mesh has nodes there.
             every: period [s] in place of them, first taken one period after the start.
             relative: whether `at` or `every` are fractions of the duration, as they must be where it is free.
-            unit: for exported code.
+            unit: for the axes of gains, and for exported code.
 
         Raises:
             ProblemError: name used twice, singular, negative or of the wrong size, both or neither given, instants

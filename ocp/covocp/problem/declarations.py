@@ -9,7 +9,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from covocp.base.arguments import check_argument, truth
+from covocp.base.arguments import check_argument, checked_class, truth
 from covocp.base.checks import check_positive, check_times, one_number
 from covocp.base.geometry import Chart
 from covocp.base.matrices import Array
@@ -23,6 +23,7 @@ Place = Literal["path", "initial", "final"]
 Where = Literal[Place, "inside"]
 
 
+@checked_class
 @dataclass(frozen=True, kw_only=True)
 class Free:
     """A terminal time that the solver chooses.
@@ -251,6 +252,7 @@ class Constraint:
     __repr__ = short_repr
 
 
+@checked_class
 @dataclass(frozen=True, kw_only=True)
 class Gain:
     """A feedback gain with constraints, optimised instead of the unconstrained optimal one.

@@ -47,6 +47,9 @@ class Phases:
         problems: the phases in their order, at least two.
         name: appears in printouts and plots.
 
+    Attributes:
+        doubts_told: the chain of which it was said what is probably forgotten in it.
+
     Raises:
         ProblemError: no sequence of two or more different problems.
     """
@@ -76,6 +79,7 @@ class Phases:
         self._problems = tuple(problems)
         self._name = name
         self._jumps: tuple[Jump, ...] = ()
+        self.doubts_told: Chain | None = None
         self._chain: tuple[tuple[Any, ...], Chain] | None = None
 
     @property

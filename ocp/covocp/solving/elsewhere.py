@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from covocp.base.arguments import is_number
+from covocp.base.arguments import checked, is_number
 from covocp.base.checks import check_kind, check_positive
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 KEPT = 4
 
 
+@checked()
 def movable(problem: Problem) -> Problem:
     """The same problem with its start as parameters, "initial_<name>": what `Solver.solve(initial=)` solves.
 

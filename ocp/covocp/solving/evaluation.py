@@ -43,6 +43,8 @@ from covocp.transcription.nlp import check_costs
 
 # Relative difference of rates or slopes above which the truth is another system.
 SAME = 1e-9
+# Arguments of `evaluate` beside the options of the mesh.
+ARGUMENTS = ("nominal", "truth", "intervals", "parameters")
 
 
 @overload
@@ -270,7 +272,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
     }  # nothing is imposed or solved here
     for name in options:
         if name not in known:
-            raise no_option("evaluate()", name, options[name], known)
+            raise no_option("evaluate()", name, options[name], known, ARGUMENTS)
     return options
 
 

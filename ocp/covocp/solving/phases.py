@@ -23,7 +23,7 @@ from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.phases_runs import ChainRuns
 from covocp.solving.random_starts import multistart
 from covocp.solving.refining import FIRST, adapted, first_options
-from covocp.solving.unused import mention_lengths
+from covocp.solving.unused import mention_idle_in, mention_lengths
 from covocp.statement.chain import Chain
 from covocp.transcription.mesh import INTERVALS, Options
 
@@ -83,6 +83,7 @@ def solve_phases(
     for statement, mesh_of_phase, entry in zip(chain.statements, asked, guesses, strict=True):
         if isinstance(entry, Mapping):
             mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase, statement)
+    mention_idle_in(phases)
     values = values_of(chain, {} if parameters is None else parameters)
     run = {"guess": guess, "parameters": parameters, **{name: v for name, v in given.items() if name != "refine"}}
     starts = [guesses]

@@ -18,6 +18,7 @@ from covocp.transcription.mesh import Options
 if TYPE_CHECKING:
     from covocp.problem.builder import Problem
     from covocp.problem.declarations import Declarations
+    from covocp.problem.phases import Phases
 
 # A guess with fewer rows than this share of the nodes is a row of waypoints.
 WAYPOINTS = 0.5
@@ -30,6 +31,16 @@ def mention_forgotten(problem: Problem) -> None:
     problem.doubts_told = True
     for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise, _mention_idle):
         mention(problem.declarations)
+
+
+def mention_idle_in(phases: Phases) -> None:
+    """Warn of controls on which nothing depends in their phase; once for each statement of the phases."""
+    chain = phases.chain()
+    if phases.doubts_told is chain:
+        return
+    phases.doubts_told = chain
+    for name, problem in zip(phases.names, phases.problems, strict=True):
+        _mention_idle(problem.stated, f" of the phase '{name}'")
 
 
 def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Statement) -> None:
@@ -152,16 +163,16 @@ def _mention_spread_noise(problem: Declarations) -> None:
             )
 
 
-def _mention_idle(problem: Declarations) -> None:
-    """Controls on which nothing depends: no method moves them from where they start."""
+def _mention_idle(problem: Declarations, of: str = "") -> None:
+    """Controls on which nothing depends: no method moves them from where they start. `of`: the phase, in words."""
     used = {symbol.__hash__() for expression in _written(problem) for symbol in ca.symvar(expression)}
     idle = [control.name for control in problem.controls if control.symbol.__hash__() not in used]
     if idle:
         listed = " and ".join(f"'{name}'" for name in idle)
         warn_user(
-            f"Nothing depends on the control{'s' if len(idle) > 1 else ''} {listed}: no rate, noise, measurement, cost "
-            "or condition changes with it, and a solution has its starting guess. Use it in one of them, or leave it "
-            "out."
+            f"Nothing depends on the control{'s' if len(idle) > 1 else ''} {listed}{of}: no rate, noise, measurement, "
+            "cost or condition changes with it, and a solution has its starting guess. Use it in one of them, or leave "
+            "it out."
         )
 
 

@@ -12,7 +12,7 @@ from covocp.base.buffered import swept
 from covocp.base.checks import as_number, check_density
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, is_semidefinite, pack, real_numbers, unpack
+from covocp.base.matrices import Array, is_semidefinite, pack, unpack
 from covocp.base.quadrature import interpolated
 from covocp.passage.sweep import passed_by
 from covocp.statement.statement import Block, Statement
@@ -64,9 +64,9 @@ def evaluate_guess(block: Block, guess: Given, at: Array) -> Array:
     """A guess (number, array over the nodes, function of s) as an array (len(at), size).
 
     Raises:
-        ProblemError: where its shape does not fit or it is not finite.
+        ProblemError: where its shape does not fit or it is not finite; a function has a value for each entry.
     """
-    values = _called(block.name, guess, at) if callable(guess) else guess
+    values = _called(block, guess, at) if callable(guess) else guess
     numbers = as_number(block.name, "guess", values)
     if numbers.ndim == 0:
         numbers = np.full((at.size, block.size), float(numbers))
@@ -89,24 +89,55 @@ def evaluate_guess(block: Block, guess: Given, at: Array) -> Array:
     return numbers
 
 
-def _called(name: str, guess: Callable[[Any], Any], at: Array) -> Any:
+def _called(block: Block, guess: Callable[[Any], Any], at: Array) -> Array:
     """A function of s at all of them at once, or one by one where it takes numbers only (`math.sin`, `if s < 0.5`).
 
     Raises:
-        ProblemError: it fails.
+        ProblemError: it fails, or returns another number of values than the block has entries.
     """
+    # As many places as entries would leave open which axis is which: then one place is asked for twice.
+    places = np.append(at, at[-1]) if at.size == block.size else at
     try:
-        return guess(at)
-    except Exception:  # whatever the user's function raises
+        together = as_number(block.name, "guess", guess(places))
+    except Exception:  # whatever the user's function raises, or lists of numbers and arrays
+        together = None
+    if together is not None:
+        if together.shape == (places.size,) and block.size == 1:
+            together = together[:, None]
+        elif together.shape == (block.size, places.size):
+            together = together.T
+        if together.shape == (places.size, block.size):
+            return together[: at.size]
+    rows = []
+    for s in at:
         try:
-            return np.array([real_numbers(guess(float(s))) for s in at])
+            value = guess(float(s))
         except Exception as error:
+            if together is not None:
+                raise _other_count(block, f"shape {together.shape} for {places.size} values of s") from error
             raise ProblemError(
-                f"The guess of '{name}' is a function that fails.",
+                f"The guess of '{block.name}' is a function that fails.",
                 expected="a function of s = t/T, an array of numbers in [0, 1], that returns as many values",
                 received=f"{type(error).__name__}: {error}"[:200],
-                remedy=f"correct the guess of '{name}': numpy.sin, not math.sin; one argument",
+                remedy=f"correct the guess of '{block.name}': numpy.sin, not math.sin; one argument",
             ) from error
+        row = as_number(block.name, "guess", value)
+        if row.size != block.size:
+            raise _other_count(block, f"shape {row.shape} at s = {s:g}")
+        rows.append(row.ravel())
+    return np.array(rows)
+
+
+def _other_count(block: Block, received: str) -> ProblemError:
+    """The error of a function of s that has another number of values than the block has entries."""
+    values = "one value" if block.size == 1 else f"{block.size} values"
+    one, several = ("()", "(K,)") if block.size == 1 else (f"({block.size},)", f"(K, {block.size})")
+    return ProblemError(
+        f"The guess of '{block.name}' is a function that returns another number of values than it has.",
+        expected=f"{values} at each s: shape {one} for a number, {several} for an array of K",
+        received=received,
+        remedy=f"return {values} for each s; numbers over the nodes, which are interpolated, go in as an array",
+    )
 
 
 def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:

@@ -30,11 +30,11 @@ def hessians(method: str, own: Mapping[str, Any], *, alone: bool) -> list[bool]:
     return [False] if alone else [True, False]
 
 
-def plugin_settings(method: str, exact: bool, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of the plugin."""
+def plugin_settings(method: str, exact: bool, own: Mapping[str, Any], share: float = 1.0) -> dict[str, Any]:
+    """Settings of the plugin; `share`: of the unit of the cost in its scale, by which slopes must be smaller."""
     settings: dict[str, Any] = dict(QUIET)
     if method == "sqpmethod":
-        settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": ASKED, "tol_pr": ASKED}
+        settings |= {"qpsol": "qrqp", "max_iter": MAX_ITERATIONS, "tol_du": share * ASKED, "tol_pr": ASKED}
         settings |= {"print_header": False, "print_iteration": False, "print_status": False, "min_step_size": 1e-14}
         settings["qpsol_options"] = {
             "print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False,

@@ -42,6 +42,8 @@ INFEASIBLE, STATIONARY = 1e-6, 1e-5
 WIDENED = 1e-8
 # Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
 ROUNDING, APART = 1e-6, 1e-2
+# Directions in which the curvature of the cost is looked at, and how far, in units of the variables.
+DIRECTIONS, NEAR = 8, 1e-3
 # Distance and multiplier of a bound that is not reached at the solution of the export.
 UNREACHED = 1e-5
 TOLERANCE = 1e-8
@@ -78,7 +80,8 @@ class _Task:
         made: the problem and the arguments of its solver.
         nlp: its transcription.
         solution: of the export.
-        scale: of the cost.
+        scale: of the cost in the solver.
+        unit: of the cost, in which it is judged what counts as solved.
         multipliers: of the solution in units of the NLP, of the variables and of the constraints.
         written: the transcription that is written out, with the passages of its tape; None: `nlp` itself.
     """
@@ -87,6 +90,7 @@ class _Task:
     nlp: NLP
     solution: Solution
     scale: float
+    unit: float
     multipliers: tuple[Array, Array]
     written: tuple[NLP, Tape] | None
 
@@ -132,13 +136,15 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
     failed = ""
     condensed = alone and chosen.get("segments", "auto") == "auto"
     tries = [
-        (exact, mesh)
+        (exact, mesh, False)
         for exact in hessians(method, own, alone=alone)
         for mesh in ([_condensed(solution)] if condensed and not exact else []) + [solution.mesh]
     ]
-    for exact, mesh in tries:
-        task = _task(made, solution, mesh, limited=not exact)
-        law = _law(task, method, plugin_settings(method, exact, own))
+    if method == "sqpmethod":
+        tries += [(False, mesh, True) for exact, mesh, _ in tries if not exact]
+    for exact, mesh, curved in tries:
+        task = _task(made, solution, mesh, limited=not exact, curved=curved)
+        law = _law(task, method, plugin_settings(method, exact, own, task.unit / task.scale))
         failure = _failure(law)
         if not failure:
             return law, PLUGINS[method]
@@ -200,8 +206,12 @@ def _condensed(solution: Solution) -> Mesh:
     return replace(mesh, segments=segment_lengths(mesh.intervals, count))
 
 
-def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool) -> _Task:
-    """Transcription near a reference solution; `limited`: for slopes of first order."""
+def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool, curved: bool = False) -> _Task:
+    """Transcription near a reference solution; `limited`: for slopes of first order; `curved`: scaled by curvature.
+
+    Curvature that is learnt step by step begins with one: where that of the cost is larger by orders of magnitude, as
+    from a large prior, the first steps lead astray.
+    """
     statement = made.statement
     mesh = replace(mesh, linear_solver=COMPILED_SOLVER)
     scales = choose_scales(statement, mesh, solution.trajectory, statement.values)
@@ -215,10 +225,13 @@ def _task(made: Replannable, solution: Solution, mesh: Mesh, *, limited: bool) -
         written = written_out(statement, mesh, scales, tape), tape
     else:
         nlp = transcribe(statement, mesh, scales, taken=is_separable(statement, mesh))
-    scale = _cost_scale(nlp, solution)
+    unit = _cost_scale(nlp, solution)
+    scale = max(unit, _curvature(nlp, solution)) if curved else unit
     timed = any(entry.port.name == "duration" for entry in made.entries)
     multipliers = _multipliers(nlp, solution, scale, timed=timed)
-    return _Task(made=made, nlp=nlp, solution=solution, scale=scale, multipliers=multipliers, written=written)
+    return _Task(
+        made=made, nlp=nlp, solution=solution, scale=scale, unit=unit, multipliers=multipliers, written=written
+    )
 
 
 def _multipliers(nlp: NLP, solution: Solution, scale: float, *, timed: bool) -> tuple[Array, Array]:
@@ -247,6 +260,17 @@ def _cost_scale(nlp: NLP, solution: Solution) -> float:
     if not np.isfinite(slope) or size > ROUNDING * slope:
         return size or 1.0
     return slope or 1.0
+
+
+def _curvature(nlp: NLP, solution: Solution) -> float:
+    """Typical second derivative of the cost in units of the variables, near the solution."""
+    w, p, slope = nlp.pack(solution.trajectory), np.append(nlp.statement.values, 1.0), _lagrangian_slope(nlp)
+    random, found = np.random.default_rng(SEED), []
+    for _ in range(DIRECTIONS):
+        step = NEAR * random.standard_normal(w.size)
+        change = np.asarray((slope(w + step, p, 0.0) - slope(w, p, 0.0)).full())
+        found.append(float(np.linalg.norm(change) / max(np.linalg.norm(step), np.finfo(float).tiny)))
+    return float(np.nan_to_num(np.median(found), posinf=0.0))
 
 
 def _lagrangian_slope(nlp: NLP) -> ca.Function:
@@ -423,10 +447,12 @@ def _residuals(
     task: _Task, nlp: NLP, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
 ) -> tuple[Any, Any]:
     """Largest violation of a constraint; largest slope of the Lagrangian, with multipliers of what does not bind."""
-    left = _lagrangian_slope(nlp)(result["x"], ca.vertcat(p, task.scale), result["lam_g"]) + result["lam_x"]
+    by_unit = task.scale / task.unit
+    multipliers = {name: by_unit * result[name] for name in ("lam_x", "lam_g")}
+    left = _lagrangian_slope(nlp)(result["x"], ca.vertcat(p, task.unit), multipliers["lam_g"]) + multipliers["lam_x"]
     both = ca.vertcat(result["x"], g)
     lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
-    weights = ca.vertcat(result["lam_x"], result["lam_g"])
+    weights = ca.vertcat(multipliers["lam_x"], multipliers["lam_g"])
     violation = ca.mmax(ca.fmax(0.0, ca.fmax(lower - both, both - upper)))
     violation = ca.fmax(violation, ca.if_else(duration > 0.0, 0.0, 1.0))  # a plan backwards in time is none
     slack = ca.if_else(weights > 0.0, upper - both, both - lower)
