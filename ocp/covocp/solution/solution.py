@@ -518,7 +518,7 @@ class Solution:
 
         Returns:
             Violation by name, in the unit of the constraint; only those that are violated by more than 1e-5 of their
-            limit, the accuracy of the path.
+            limit, the accuracy of the path; inf where a constraint is NaN or inf.
 
         Raises:
             ProblemError: where `points` is not a positive whole number.
