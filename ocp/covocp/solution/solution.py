@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.arguments import checked, one_of
-from covocp.base.checks import as_number, is_whole
+from covocp.base.arguments import checked, one_of, truth
+from covocp.base.checks import is_whole
 from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
 from covocp.base.later import later
@@ -35,7 +35,7 @@ from covocp.extremal.spread_limits import passed_by_spread, scattered, spread_na
 from covocp.solution.chances import Reached, reached
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
-from covocp.solution.sample import Sample
+from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
 from covocp.statement.names import block_of, entry_values, name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names, error_names, error_size
@@ -371,15 +371,7 @@ class Solution:
         Raises:
             ProblemError: where a time lies outside, or is not a number.
         """
-        times = np.atleast_1d(as_number("at", "times", t))
-        margin = 1e-9 * self.duration
-        if times.ndim != 1 or not ((times >= -margin) & (times <= self.duration + margin)).all():
-            raise ProblemError(
-                "A solution has no values there.",
-                expected=f"a time or a row of times within [0, {self.duration:g}] s",
-                received=str(t)[:100],
-                remedy="stay within the duration of the solution",
-            )
+        times = asked_times("at", t, self.duration, "the solution")
         before = side == "before"
         z = self.dense.at(self.mesh.placed(times / self.duration), before=before)
         u = self.controls_at(times, before=before)
@@ -391,9 +383,16 @@ class Solution:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols=self.symbols)
 
-    def controls_at(self, times: Array, *, before: bool = False) -> Array:
-        """Controls at some times [s], (K, nu); where they jump those after it, or before it."""
-        return self.extremal.controls_at(self.mesh.placed(times / self.duration), before=before)
+    @checked(before=truth)
+    def controls_at(self, times: Given, *, before: bool = False) -> Array:
+        """Controls at a time (nu,), or at an array of times [s] (K, nu); where they jump those after it, or before it.
+
+        Raises:
+            ProblemError: where a time lies outside, or is not a number.
+        """
+        row = asked_times("controls_at", times, self.duration, "the solution")
+        u = self.extremal.controls_at(self.mesh.placed(row / self.duration), before=before)
+        return u[0] if np.ndim(times) == 0 else u
 
     @cached
     def dense(self) -> Dense:
