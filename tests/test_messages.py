@@ -1,5 +1,6 @@
 """Names that are not known: the answer suggests the one that was meant, and says what can be given."""
 
+import casadi as ca
 import pytest
 from refusals import lag, refused, simple
 
@@ -70,6 +71,23 @@ def test_symbols(solved):
     refused(lambda: co.solve(lag()[0], guess={"U": 1.0}), "perhaps 'u' is meant")
     refused(lambda: co.solve(lag()[0], substeps="ato"), "'auto' or 1, 2, 3, ...")
     refused(lambda: co.solve(lag()[0], segments=0), "'auto' or 1, 2, 3, ...")
+
+
+def test_limits_that_vary():
+    """In subject_to() and chance() the remedy is another expression; bounds of a state are said to be a condition."""
+    ocp = co.Problem(1.0)
+    x, limit = ocp.state("x", 2, initial=0.0), ocp.parameter("limit", 1.0)
+    refused(lambda: ocp.subject_to(x[0], upper=limit), "limit upper=", "subject_to(x[0] - limit, upper=0)")
+    refused(lambda: ocp.subject_to(x[0], lower=-limit), "subject_to(x[0] - (-limit), lower=0)")
+    refused(lambda: ocp.subject_to(x, upper=[limit, 2.0]), "subject_to(x - limit, upper=0)")
+    refused(lambda: ocp.subject_to(x[0], equals=limit), "subject_to(x[0] - limit, equals=0)")
+    refused(lambda: ocp.chance(x[1], upper=limit, probability=0.9), "chance(x[1] - limit, upper=0)")
+    refused(
+        lambda: ocp.subject_to(ca.sin(x[0]) ** 2 + ca.exp(x[0]) * ca.cos(x[1]) ** 4, upper=limit),
+        "(expression - limit, upper=0)",
+    )
+    refused(lambda: ocp.control("u", upper=limit), "a bound that varies is a subject_to()")
+    ocp.subject_to(x[0] - limit, upper=0)
 
 
 def test_a_sample_shows_its_values(solved):
