@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
+from covocp.statement.conditions import beyond
 from covocp.transcription.program import Program
 
 # A run that has not brought its largest violation below this share of the smallest one before, for so many iterations,
@@ -95,7 +96,7 @@ class Monitor(ca.Callback):
         """Report an iteration with such a cost and such rows, variables and multipliers; whether to stop."""
         if self._progress is None:
             return False
-        violation = float(np.maximum(self._bounds["lbg"] - g, g - self._bounds["ubg"]).max(initial=0.0))
+        violation = float(beyond(g, self._bounds["lbg"], self._bounds["ubg"]).max(initial=0.0))
         if self._progress.limited:
             one = Iterate(w=w, lam_x=lam_x, lam_g=lam_g, cost=cost, violation=violation)
             if self.best is None or one.rank < self.best.rank:

@@ -216,7 +216,7 @@ def residuals(
     missed = float(np.sum(np.abs(lam_g) * excess))
     for limits in (bounds["lbg"], bounds["ubg"]):  # the size of a limit is one of what it limits
         row = np.maximum(row, np.where(np.isfinite(limits), np.abs(limits), 0.0))
-    worst = max(float((excess / row).max(initial=0.0)), float((apart / unit).max(initial=0.0)))
+    worst = float(np.concatenate([excess / row, apart / unit]).max(initial=0.0))
     size = sum(abs(costs["running"]) + abs(costs["terminal"]) for costs in values["parts"])
     if not np.isfinite([slope, rest, missed, worst, size]).all():
         return Residuals(slope=np.inf, complementarity=np.inf, infeasibility=np.inf, violation=np.inf)

@@ -1,5 +1,6 @@
 """Names that are not known: the answer suggests the one that was meant, and says what can be given."""
 
+import casadi as ca
 import pytest
 from refusals import lag, refused, simple
 
@@ -70,6 +71,64 @@ def test_symbols(solved):
     refused(lambda: co.solve(lag()[0], guess={"U": 1.0}), "perhaps 'u' is meant")
     refused(lambda: co.solve(lag()[0], substeps="ato"), "'auto' or 1, 2, 3, ...")
     refused(lambda: co.solve(lag()[0], segments=0), "'auto' or 1, 2, 3, ...")
+
+
+def test_limits_that_vary():
+    """In subject_to() and chance() the remedy is another expression; bounds of a state are said to be a condition."""
+    ocp = co.Problem(1.0)
+    x, limit = ocp.state("x", 2, initial=0.0), ocp.parameter("limit", 1.0)
+    refused(lambda: ocp.subject_to(x[0], upper=limit), "limit upper=", "subject_to(x[0] - limit, upper=0)")
+    refused(lambda: ocp.subject_to(x[0], lower=-limit), "subject_to(x[0] - (-limit), lower=0)")
+    refused(lambda: ocp.subject_to(x, upper=[limit, 2.0]), "subject_to(x - limit, upper=0)")
+    refused(lambda: ocp.subject_to(x[0], equals=limit), "subject_to(x[0] - limit, equals=0)")
+    refused(lambda: ocp.chance(x[1], upper=limit, probability=0.9), "chance(x[1] - limit, upper=0)")
+    refused(
+        lambda: ocp.subject_to(ca.sin(x[0]) ** 2 + ca.exp(x[0]) * ca.cos(x[1]) ** 4, upper=limit),
+        "(expression - limit, upper=0)",
+    )
+    refused(lambda: ocp.control("u", upper=limit), "a bound that varies is a subject_to()")
+    ocp.subject_to(x[0] - limit, upper=0)
+
+
+def test_a_symbol_of_another_problem(solved, tmp_path):
+    """It has a name that is known, and is told apart from a name that is not."""
+    ocp, solution = solved
+    other, x, u = damped()
+    other.minimize(running=u**2)
+    of_another = "'position' is a symbol of another problem"
+    as_word = "as a string: 'position'"
+    loaded = co.load(solution.save(tmp_path / "solved.npz"))
+    refused(lambda: loaded.multiplier(ocp.statement().symbols["position"]), "only names are known here", as_word)
+    refused(lambda: solution[x], of_another, as_word, "received: position\n")
+    refused(lambda: solution[2 * x + ocp.statement().symbols["u"]], of_another, as_word)
+    refused(lambda: solution.multiplier(x), of_another, as_word)
+    refused(lambda: solution.deviation(x), of_another, as_word)
+    refused(lambda: solution.deviation(u), "'u' is not in this solution", "a symbol or name of position\n")
+    friction = other.statement().symbols["friction"]
+    refused(lambda: co.solve(ocp, parameters={friction: 0.7}), "it is a symbol of another problem", "'friction'")
+    third, _, force = damped()
+    refused(lambda: third.minimize_expected(force**2, terminal_weight={x: 1.0}), "it is a symbol of another problem")
+
+
+def test_constraints_are_among_what_has_a_multiplier():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=0.0), ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(u, x[0]))
+    ocp.subject_to(u, upper=3.0, name="thrust")
+    ocp.subject_to(x, upper=9.0, at="final", name="end")
+    ocp.minimize(running=(u - 1) ** 2)
+    solution = co.solve(ocp, intervals=5, progress=False)
+    refused(lambda: solution.multiplier("thrst"), "or a constraint by its name: thrust, end", "'thrust' is meant")
+    refused(lambda: solution.multiplier("x[2]"), "'x' has no entry 2")
+    refused(lambda: solution.multiplier(u), "a symbol or name of x, or a constraint by its name: thrust, end")
+    assert solution.multiplier("thrust").shape == (6,)
+
+
+def test_instants_that_are_given_twice():
+    ocp = co.Problem(4.0)
+    x = ocp.state("x", initial=0.0)
+    refused(lambda: ocp.measurement("m", x, noise=1.0, at=[0.5, 1.0, 1.0]), "each once", "received: 1 twice")
+    refused(lambda: ocp.measurement("m", x, noise=1.0, at=[2.0, 1.5]), "received: 1.5 after 2\n")
 
 
 def test_a_sample_shows_its_values(solved):

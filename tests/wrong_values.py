@@ -329,8 +329,9 @@ def in_phases() -> Iterator[tuple[str, str, Call]]:
 def results() -> Iterator[tuple[str, str, Call]]:
     """Of what asks for results."""
     solution, closed, runs = made()["solution"], made()["closed"], made()["runs"]
-    for name in ("at", "block", "costate", "multiplier", "covariance", "deviation", "check_path", "save"):
-        valid = {"covariance": {"a": "x"}}.get(name, {})
+    names = ("at", "controls_at", "block", "costate", "multiplier", "covariance", "deviation", "check_path", "save")
+    for name in names:
+        valid = {"covariance": {"a": "x"}, "controls_at": {"times": 0.5}}.get(name, {})
         for argument, call in called(getattr(solution, name), **valid):
             yield f"Solution.{name}", argument, call
     for name in ("solution", "sample", "comparison"):

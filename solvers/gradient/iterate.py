@@ -334,7 +334,7 @@ class Space(Unknowns):
             if value > tolerance * scale
         }
         for group, excess, scales in zip(self.groups, iterate.penalty.excess, self.weights.scales, strict=True):
-            worst = np.abs(excess).max(axis=0)
+            worst = np.where(np.isnan(excess), np.inf, np.abs(excess)).max(axis=0)
             result |= {
                 name: float(value)
                 for name, value, scale in zip(group.names, worst, scales, strict=True)

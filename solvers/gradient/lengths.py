@@ -13,7 +13,8 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
-from covocp.transcription.mesh import STABILITY_LIMIT, STIFFNESS_PER_STEP, Mesh, Options
+from covocp.transcription.choosing import STABILITY_LIMIT
+from covocp.transcription.mesh import STIFFNESS_PER_STEP, Mesh, Options
 from covocp.transcription.stiffness import stiffness
 
 LARGEST_PAIRS = 64

@@ -214,7 +214,7 @@ def _group(
         penalty,
         *slopes_by(penalty, (z, u, duration)),
         2 * weights * shifted,
-        excess(value),
+        ca.if_else(ca.fabs(value) < np.inf, excess(value), np.nan),  # the larger of NaN and 0 is 0, and would hold
         by_control.T @ (ca.repmat(active, 1, nu) * by_control),
         room(value, shifted),
         ca.fabs(ca.jacobian(value, z)),

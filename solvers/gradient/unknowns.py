@@ -150,7 +150,7 @@ class Unknowns(ABC):
             ell=ell,
             residual=residual,
             active=active,
-            slope=max(slope, float(extra)),
+            slope=float(np.maximum(slope, extra)),
             miss=float((np.abs(iterate.run.miss) / scale).max(initial=0.0)),
             transversality=float(by_time[np.argmax(np.abs(by_time))]) if by_time.size else 0.0,
         )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from certificates import is_symmetric
 from problems import lag, simulate, solve
+from refusals import refused
 
 import covocp as co
 
@@ -225,6 +226,22 @@ def test_covariances_between_the_nodes_are_semidefinite():
 def test_times_outside(data, t):
     with pytest.raises(ValueError, match="no values there"):
         data.solution.at(t)
+
+
+@pytest.mark.parametrize(("t", "received"), [(400.0, "400.0"), ([0.0, 3.0], "[0.0, 3.0]"), (np.nan, "nan"), ("1", "1")])
+def test_controls_at_times(data, t, received):
+    """As `at` takes them: a time, a list, an array, none outside; the values are those of `at`."""
+    s = data.solution
+    times = [0.0, 0.33, 2.0]
+    sample = s.at(times)
+    both = np.hstack([sample["u"][:, None], sample["w"]])
+    np.testing.assert_array_equal(s.controls_at(times), both)
+    np.testing.assert_array_equal(s.controls_at(tuple(times)), both)
+    np.testing.assert_array_equal(s.controls_at(np.array(times)), both)
+    np.testing.assert_array_equal(s.controls_at(0.33), both[1])
+    assert s.controls_at(1).shape == (3,)
+    refused(lambda: s.controls_at(t), f"received: {received}" if t != "1" else "'controls_at' is not a number")
+    refused(lambda: s.controls_at(1.0, before="no"), "True or False")
 
 
 # --- plain, frozen data -----------------------------------------------------------------------------------------------

@@ -46,13 +46,14 @@ class Residuals:
 
     @property
     def worst(self) -> float:
-        """The largest of them, the violation in multiples of what it may be."""
-        return max(self.slope, self.complementarity, self.infeasibility, LIMIT * self.violation / VIOLATION)
+        """The largest of them, the violation in multiples of what it may be; inf where one is NaN."""
+        parts = [self.slope, self.complementarity, self.infeasibility, LIMIT * self.violation / VIOLATION]
+        return float(np.where(np.isnan(parts), np.inf, parts).max())
 
     def hold(self, limit: float) -> bool:
         """Whether all are small: those of the cost below `limit`, the violation below VIOLATION."""
-        worst = max(self.slope, self.complementarity, self.infeasibility)
-        return bool(worst <= limit and self.violation <= VIOLATION)
+        parts = (self.slope, self.complementarity, self.infeasibility)
+        return all(part <= limit for part in parts) and self.violation <= VIOLATION
 
     def __str__(self) -> str:
         """The residuals in words, for a message."""

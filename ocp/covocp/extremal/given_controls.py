@@ -9,6 +9,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
+from covocp.statement.conditions import beyond
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
@@ -75,7 +76,10 @@ def evaluate_controls(
 
 
 def missed(extremal: Extremal) -> dict[str, float]:
-    """Prescribed final values, bounds, terminal and path inequalities that the nominal does not meet, by name."""
+    """Prescribed final values, bounds, terminal and path inequalities that the nominal does not meet, by name.
+
+    Those that are NaN or inf somewhere are missed by inf.
+    """
     st, t = extremal.statement, extremal.trajectory
     result = {}
     target = st.boundary_values(extremal.parameters)[1]
@@ -91,6 +95,26 @@ def missed(extremal: Extremal) -> dict[str, float]:
         allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED
         result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
     for conditions, _, rows in extremal.inequalities():
-        excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)
+        excess = beyond(rows, conditions.lower, conditions.upper).max(axis=0)
         result |= {n: float(v) for n, v in zip(conditions.names, excess, strict=True) if v > MISS}
     return result
+
+
+def without_value(extremal: Extremal) -> dict[str, float]:
+    """Inequalities that are NaN or inf at a node where they are to hold, and the first time of that [s], by name."""
+    result: dict[str, float] = {}
+    for conditions, place, rows in extremal.inequalities():
+        known = np.isfinite(rows)
+        for i in np.flatnonzero(~known.all(axis=0)):
+            if place == "instants":
+                time = _instants(extremal)[i]
+            else:
+                time = float(extremal.time[-1] if place == "end" else extremal.time[known[:, i].argmin()])
+            result[conditions.names[i]] = min(time, result.get(conditions.names[i], time))
+    return result
+
+
+def _instants(extremal: Extremal) -> list[float]:
+    """The time of each row of the conditions at instants [s]."""
+    parts = extremal.statement.inside.parts
+    return [part.place * extremal.trajectory.duration for part in parts for _ in part.conditions.names]

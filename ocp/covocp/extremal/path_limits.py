@@ -29,15 +29,20 @@ class Passed:
 
     Attributes:
         name: of the state or the constraint.
-        by: largest violation, in the unit of the constraint.
+        by: largest violation, in the unit of the constraint; inf where the constraint is NaN or inf.
         share: the same relative to the limit (see `limit_sizes`).
-        time: where it is largest relative to the limit [s].
+        time: where it is largest relative to the limit [s]; where it has no value, the first such time.
     """
 
     name: str
     by: float
     share: float
     time: float
+
+    @property
+    def defined(self) -> bool:
+        """Whether what has the limit has a value everywhere."""
+        return bool(np.isfinite(self.by))
 
 
 def limited(extremal: Extremal) -> bool:
@@ -103,6 +108,7 @@ def _passed(
     """Rows that pass their limits along the true path, from what gives them at normalised times of intervals."""
     mesh, (lower, upper) = extremal.mesh, limits
     worst, largest = np.zeros((2, len(names))), np.zeros(len(names))
+    limited_rows = np.isfinite(lower) | np.isfinite(upper)
     when = np.zeros((2, len(names)))
     nearest = np.clip(np.searchsorted(mesh.nodes, dense.knots), 0, mesh.intervals)
     inner = dense.knots[mesh.nodes[nearest] != dense.knots]
@@ -116,8 +122,12 @@ def _passed(
         s = np.concatenate([s, extra])
         k = np.concatenate([k, np.searchsorted(mesh.nodes, extra) - 1])
         values = values_at(k, s)
-        largest = np.maximum(largest, np.abs(values).max(axis=0))
-        for side, excess in enumerate((lower - values, values - upper)):
+        largest = np.maximum(largest, finite_sizes(values))
+        unknown = ~np.isfinite(values) & limited_rows
+        with np.errstate(invalid="ignore"):
+            sides = lower - values, values - upper
+        for side, excess in enumerate(sides):
+            excess[unknown] = np.inf  # what has no value meets no limit
             place = excess.argmax(axis=0)
             found = excess[place, np.arange(len(names))]
             when[side] = np.where(found > worst[side], s[place], when[side])
@@ -135,6 +145,11 @@ def _passed(
         if shares[side[i], i] > OF_RANGE
     ]
     return tuple(sorted(result, key=lambda entry: -entry.share))
+
+
+def finite_sizes(values: Array) -> Array:
+    """Largest size of each column among its finite values, 0 where there are none."""
+    return np.asarray(np.where(np.isfinite(values), np.abs(values), 0.0).max(axis=0))
 
 
 def limit_sizes(lower: Array, upper: Array, largest: Array) -> Array:

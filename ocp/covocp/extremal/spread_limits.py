@@ -13,8 +13,8 @@ import numpy as np
 from covocp.base.matrices import Array, pack
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
-from covocp.extremal.path_limits import NOTED, Passed, limit_sizes
-from covocp.statement.conditions import Conditions
+from covocp.extremal.path_limits import NOTED, Passed, finite_sizes, limit_sizes
+from covocp.statement.conditions import Conditions, beyond
 from covocp.statement.statement import Statement
 
 
@@ -69,8 +69,8 @@ def _passed(extremal: Extremal, joint: Array, rows: Conditions, nodes: Array) ->
     columns = [np.asarray(column)[:, nodes] for column in extremal.columns()]
     values = np.asarray(rows.scattered.map(nodes.size)(*columns, joint[nodes].T).full())[chosen].T
     lower, upper = rows.lower[chosen], rows.upper[chosen]
-    sizes = limit_sizes(lower, upper, np.abs(values).max(axis=0)).min(axis=0)
-    excess = np.maximum(lower - values, values - upper)
+    sizes = limit_sizes(lower, upper, finite_sizes(values)).min(axis=0)
+    excess = beyond(values, lower, upper)
     worst = excess.argmax(axis=0)
     return [
         Passed(

@@ -26,7 +26,14 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
 from covocp.base.normal import quantile, two_sided
-from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
+from covocp.problem.checks import (
+    check_constrains,
+    check_known_limits,
+    check_name,
+    check_size,
+    column_expression,
+    limit_columns,
+)
 from covocp.problem.closed_loop_covariance import LARGEST_ROUNDING, SMALLEST_VARIANCE, SPREAD, with_closed_loop
 from covocp.problem.constraints import check_place
 from covocp.problem.declarations import Chance, Constraint, Declarations, Dynamics
@@ -63,6 +70,7 @@ def with_chance(
             received="neither",
             remedy="say between which limits the expression is to stay",
         )
+    check_known_limits("chance", label, value, {"lower": lower, "upper": upper})
     low, high = limit_columns(label, lower, upper, check_size(label, value.shape[0]))
     for i in np.flatnonzero(low == high):
         raise ProblemError(

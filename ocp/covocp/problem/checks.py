@@ -10,13 +10,15 @@ import numpy as np
 
 from covocp.base.arguments import is_number
 from covocp.base.arguments import is_whole as is_whole
-from covocp.base.checks import bound_columns, column, is_symbolic, shape_error
+from covocp.base.checks import bound_columns, column, gathered, is_symbolic, shape_error
 from covocp.base.errors import ProblemError, kind_and_name, shown, spelling
 from covocp.base.expressions import Given, symbol_of
 from covocp.base.matrices import Array, real_numbers
 
 # Components of a symbol that still make a matrix that fits into a memory.
 LARGEST_SIZE = 10**4
+# Letters of an expression that a remedy repeats.
+LONGEST = 40
 
 
 def check_size(name: str, size: Given) -> int:
@@ -166,6 +168,35 @@ def check_constrains(name: str, expression: ca.MX, constants: list[Any]) -> None
             received=str(expression),
             remedy="remove it, or use the symbols that state(), control() and symmetric() return",
         )
+
+
+def check_known_limits(call: str, name: str, expression: ca.MX, limits: Mapping[str, Given]) -> None:
+    """Limits of an expression are numbers: what varies belongs to the expression.
+
+    Args:
+        call: "subject_to" or "chance".
+        name: of the condition.
+        expression: that is limited.
+        limits: by the argument that gives them, "lower", "upper" or "equals".
+
+    Raises:
+        ProblemError: a limit contains a symbol.
+    """
+    for side, limit in limits.items():
+        if is_symbolic(gathered(limit)):
+            raise ProblemError(
+                f"The limit {side}= of '{name}' contains a symbol.",
+                expected="numbers",
+                received=str(limit)[:200],
+                remedy="what varies belongs to the expression: "
+                f"{call}({_in_words(expression, 'expression')} - {_in_words(limit, 'limit')}, {side}=0)",
+            )
+
+
+def _in_words(value: Given, otherwise: str) -> str:
+    """An expression as a user would write it, where that is short."""
+    text = str(value)
+    return text if len(text) <= LONGEST and "@" not in text and isinstance(value, ca.MX) else otherwise
 
 
 def limit_columns(name: str, lower: Given, upper: Given, size: int) -> tuple[Array, Array]:

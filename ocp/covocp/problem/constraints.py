@@ -11,7 +11,14 @@ from covocp.base.arguments import is_number
 from covocp.base.checks import caller, column
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
-from covocp.problem.checks import check_constrains, check_name, check_size, column_expression, limit_columns
+from covocp.problem.checks import (
+    check_constrains,
+    check_known_limits,
+    check_name,
+    check_size,
+    column_expression,
+    limit_columns,
+)
 from covocp.problem.decisions import decisions_of
 from covocp.problem.declarations import Constraint, Declarations, Where
 from covocp.problem.integrals import integrals_of
@@ -47,6 +54,7 @@ def with_constraint(
     place = _place(own, label, value, at, instant)
     check_name(label, list(own.named))
     size = check_size(label, value.shape[0])
+    check_known_limits("subject_to", label, value, dict(zip(("lower", "upper", "equals"), limits, strict=True)))
     low, high = limit_columns(label, *_both_limits(label, *limits, size), size)
     if not (between is None or (isinstance(between, str) and between == "auto")) or (between and place != "path"):
         raise ProblemError(

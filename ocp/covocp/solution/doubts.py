@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from covocp.base.errors import warn_user
+from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.solution import Solution
@@ -24,7 +27,9 @@ def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
     error = solution.mesh_error
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
-    if not error <= COARSE_MESH:
+    if not np.isfinite(error):
+        warn_user(_unknown_error(solution))
+    elif not error <= COARSE_MESH:
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
             + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
@@ -46,12 +51,35 @@ def mention_doubts(solution: Solution) -> None:
         )
 
 
+def _unknown_error(solution: Solution) -> str:
+    """What is not finite where the error of the mesh is no number."""
+    said = "How much the mesh costs is not known: "
+    undefined = without_value(solution.extremal) if solution.statement is not None else {}
+    if undefined:
+        name, time = min(undefined.items(), key=lambda item: item[1])
+        return f"{said}'{name}' is NaN or inf, first at t = {time:.4g} s. Keep what it depends on where it has a value."
+    costates = np.hstack([solution.costates.state, solution.costates.matrices])
+    broken = np.flatnonzero(~np.isfinite(costates).all(axis=1))
+    if broken.size:  # they are integrated from the end: what is last in time came first
+        return (
+            f"{said}the costates are NaN or inf up to t = {solution.t[broken[-1]]:.4g} s, where a rate, a cost or a "
+            "condition has no finite slope. Keep what it depends on away from there."
+        )
+    return (
+        f"{said}with integration steps of half the length a state, a covariance or the cost becomes NaN or inf. Use "
+        "more intervals or substeps."
+    )
+
+
 def _mention_tables(solution: Solution) -> None:
     """Warn of tables that are read where they have no values."""
     left = solution.left_tables()
     if not left:
         return
     more = f", and {len(left) - 1} more" if len(left) > 1 else ""
+    if not left[0].defined:
+        warn_user(f"The {left[0].name} is read at NaN or inf at t = {left[0].time:.4g} s{more}: it has no value there.")
+        return
     warn_user(
         f"The {left[0].name} is read beyond its knots, by {left[0].by:.3g} at t = {left[0].time:.4g} s{more}: its "
         "outermost piece goes on there, which no value supports. Give it knots that reach so far, or keep what it "
@@ -65,6 +93,13 @@ def mention_limits(solution: Solution) -> None:
     if not passed:
         return
     more = f", and {len(passed) - 1} more" if len(passed) > 1 else ""
+    if not passed[0].defined:
+        warn_user(
+            f"Between the points where it is imposed '{passed[0].name}' is NaN or inf at t = {passed[0].time:.4g} s"
+            f"{more}: its limit does not hold there. Bound what it is made of, impose it at more points of each "
+            f"interval (points={2 * solution.mesh.points}, method 'ipopt'), or use more intervals."
+        )
+        return
     warn_user(
         f"Between the points where it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
         f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. Impose it at more points of each "

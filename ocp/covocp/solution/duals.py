@@ -42,7 +42,8 @@ def multiplier_of(solution: Solution, key: Given) -> Array:
             values = getattr(solution.multipliers, "path_at_nodes" if place == "path" else place)[..., rows]
             return np.asarray(values[..., 0] if len(rows) == 1 else values)
     moving = tuple(b for b in solution.blocks if b.kind in ("state", "matrix"))
-    b = solution.block(name_in(solution, key, moving))
+    others = tuple(dict.fromkeys(name.split("[")[0] for names in solution.constraints.values() for name in names))
+    b = solution.block(name_in(solution, key, moving, others=others))
     if b.kind == "matrix":
         return unpack_costate(solution.final_multipliers[1][b.span], b.size)
     values = solution.final_multipliers[0][b.span]

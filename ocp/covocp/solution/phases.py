@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.arguments import checked, one_of
-from covocp.base.checks import as_number
 from covocp.base.errors import ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
@@ -18,7 +17,7 @@ from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
 from covocp.solution.report import refinement, sections, starts_told
-from covocp.solution.sample import Sample
+from covocp.solution.sample import Sample, asked_times
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link
 from covocp.statement.names import name_of, sizes_of, unknown_name
@@ -184,16 +183,7 @@ class PhasesSolution:
         Raises:
             ProblemError: where a time lies outside, or is not a number; another side.
         """
-        times = np.atleast_1d(as_number("at", "times", t))
-        margin = 1e-9 * self.duration
-        inside = times.ndim == 1 and bool(((times >= -margin) & (times <= self.duration + margin)).all())
-        if not inside:
-            raise ProblemError(
-                "A solution has no values there.",
-                expected=f"a time or a row of times within [0, {self.duration:g}] s",
-                received=str(t)[:100],
-                remedy="stay within the duration of all phases",
-            )
+        times = asked_times("at", t, self.duration, "all phases")
         found = np.searchsorted(self.starts[1:], times, side="right" if side == "after" else "left")
         samples: list[tuple[Any, Mapping[str, Array]]] = []
         for k, phase in enumerate(self.phases):

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import as_number
-from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
 from covocp.extremal.closed_loop import ClosedLoop
@@ -28,14 +26,22 @@ def other_loop(solution: Solution) -> ClosedLoop | None:
 
 
 def name_in(
-    solution: Solution, key: Given, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False
+    solution: Solution,
+    key: Given,
+    blocks: tuple[Block, ...] | None = None,
+    *,
+    missing_ok: bool = False,
+    others: tuple[str, ...] = (),
 ) -> str:
-    """Name of a symbol, a name or an entry among some blocks; None: among all values."""
+    """Name of a symbol, a name or an entry among some blocks; None: among all values.
+
+    others: further names that could be meant, told where none is found.
+    """
     names = tuple(solution.values) if blocks is None else tuple(b.name for b in blocks)
     sizes = sizes_of(solution.blocks if blocks is None else blocks)
     if blocks is None:
         sizes |= {entry.name: entry.values.shape[1] for entry in _data(solution)}
-    return name_of(key, solution.symbols, names, missing_ok=missing_ok, sizes=sizes)
+    return name_of(key, solution.symbols, names, missing_ok=missing_ok, sizes=sizes, others=others)
 
 
 def by_name(solution: Solution, t: Array, x: Array, u: Array, e: Array) -> dict[str, Array]:
@@ -64,7 +70,7 @@ def expression_values(solution: Solution, expression: ca.MX) -> Array:
     try:
         function = statement.expression(expression, scattered=other is not None)
     except RuntimeError as error:
-        raise unknown_name(expression, tuple(solution.values)) from error
+        raise unknown_name(expression, tuple(solution.values), solution.symbols) from error
     count = extremal.mesh.nodes.size
     arguments = extremal.columns()
     if other is not None and function.n_in() > len(arguments):
@@ -73,24 +79,6 @@ def expression_values(solution: Solution, expression: ca.MX) -> Array:
     rows, columns = expression.shape
     shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
     return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
-
-
-def times_within(t: Given, duration: float) -> Array:
-    """Times at which a solution has values, one or a row of them.
-
-    Raises:
-        ProblemError: one lies outside, or is not a number.
-    """
-    times = np.atleast_1d(as_number("at", "times", t))
-    margin = 1e-9 * duration
-    if times.ndim != 1 or not ((times >= -margin) & (times <= duration + margin)).all():
-        raise ProblemError(
-            "A solution has no values there.",
-            expected=f"a time or a row of times within [0, {duration:g}] s",
-            received=str(t)[:100],
-            remedy="stay within the duration of the solution",
-        )
-    return times
 
 
 def _data(solution: Solution) -> tuple[TimeData, ...]:

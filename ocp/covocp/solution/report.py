@@ -417,6 +417,9 @@ def _between_nodes(solution: Solution) -> Section:
         return []
     worst = found[0]
     where = "the nodes" if solution.mesh.points == 1 else f"{solution.mesh.points} points of each interval"
+    if not worst.defined:
+        text = f"limits are imposed at {where}; between them '{worst.name}' is NaN or inf, at t = {worst.time:.4g} s"
+        return [Sentence(text + ": check_path() lists all")]
     text = (
         f"limits are imposed at {where}; between them that of '{worst.name}' is passed by up to {worst.by:.2g}, "
         f"{100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: points= or more intervals make it less, "

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.checks import as_number
+from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.statement.names import entry_values, name_of
@@ -31,6 +33,30 @@ class Sample:
         """The values by name, on one line."""
         shown = {"t": self.t, **{name: v for name, v in self.values.items() if name not in ("time", "duration")}}
         return f"Sample({', '.join(f'{name} = {_in_line(value)}' for name, value in shown.items())})"
+
+
+def asked_times(called: str, t: Given, duration: float, whole: str) -> Array:
+    """What a user gives as a time or a row of times, as a row.
+
+    Args:
+        called: the method that takes them.
+        t: what was given.
+        duration: the last of the times that there are [s].
+        whole: that has this duration, in words.
+
+    Raises:
+        ProblemError: one lies outside, or is not a number.
+    """
+    times = np.atleast_1d(as_number(called, "times", t))
+    margin = 1e-9 * duration
+    if times.ndim != 1 or not ((times >= -margin) & (times <= duration + margin)).all():
+        raise ProblemError(
+            "A solution has no values there.",
+            expected=f"a time or a row of times within [0, {duration:g}] s",
+            received=str(t)[:100],
+            remedy=f"stay within the duration of {whole}",
+        )
+    return times
 
 
 def _in_line(value: Given) -> str:

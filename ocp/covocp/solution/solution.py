@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.arguments import checked, one_of
+from covocp.base.arguments import checked, one_of, truth
 from covocp.base.checks import is_whole
 from covocp.base.errors import ProblemError, has_key
 from covocp.base.expressions import Given
@@ -38,8 +38,8 @@ from covocp.solution.covariances import all_covariances, are_semidefinite, covar
 from covocp.solution.duals import costate_of, multiplier_of
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
-from covocp.solution.reading import by_name, expression_values, name_in, other_loop, times_within
-from covocp.solution.sample import Sample
+from covocp.solution.reading import by_name, expression_values, name_in, other_loop
+from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
 from covocp.statement.names import block_of, entry_values, unknown_name
 from covocp.statement.statement import Block, Statement, entry_names
@@ -314,7 +314,7 @@ class Solution:
         Raises:
             ProblemError: where a time lies outside, or is not a number.
         """
-        times = times_within(t, self.duration)
+        times = asked_times("at", t, self.duration, "the solution")
         before = side == "before"
         z = self.dense.at(self.mesh.placed(times / self.duration), before=before)
         u = self.controls_at(times, before=before)
@@ -326,9 +326,16 @@ class Solution:
             values = {name: value[0] for name, value in values.items()}
         return Sample(t=t, values=values, symbols=self.symbols)
 
-    def controls_at(self, times: Array, *, before: bool = False) -> Array:
-        """Controls at some times [s], (K, nu); where they jump those after it, or before it."""
-        return self.extremal.controls_at(self.mesh.placed(times / self.duration), before=before)
+    @checked(before=truth)
+    def controls_at(self, times: Given, *, before: bool = False) -> Array:
+        """Controls at a time (nu,), or at an array of times [s] (K, nu); where they jump those after it, or before it.
+
+        Raises:
+            ProblemError: where a time lies outside, or is not a number.
+        """
+        row = asked_times("controls_at", times, self.duration, "the solution")
+        u = self.extremal.controls_at(self.mesh.placed(row / self.duration), before=before)
+        return u[0] if np.ndim(times) == 0 else u
 
     @cached
     def dense(self) -> Dense:
@@ -409,7 +416,7 @@ class Solution:
 
         Returns:
             Violation by name, in the unit of the constraint; only those that are violated by more than 1e-5 of their
-            limit, the accuracy of the path.
+            limit, the accuracy of the path; inf where a constraint is NaN or inf.
 
         Raises:
             ProblemError: where `points` is not a positive whole number.

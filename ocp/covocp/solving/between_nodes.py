@@ -72,6 +72,12 @@ def more_points(options: Options, mesh: Mesh) -> Options | None:
 
 def mention_between(passed: Passed, points: int, reason: str, where: str = "") -> None:
     """Warn of a limit that does not hold as it was asked for; `where`: " of the phase ..." where there are several."""
+    if not passed.defined:
+        warn_user(
+            f"'{passed.name}'{where} is NaN or inf between the nodes at t = {passed.time:.4g} s: its limit does not "
+            f"hold there as between='auto' asks; {reason}. Bound what it is made of, or use more intervals."
+        )
+        return
     warn_user(
         f"The limit of '{passed.name}'{where} does not hold between the nodes as between='auto' asks: with {points} "
         f"points of each interval it is passed by {passed.by:.3g} ({100 * passed.share:.2g} % of it) at "

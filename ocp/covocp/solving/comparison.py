@@ -25,6 +25,7 @@ from covocp.solution.solution import Solution
 from covocp.solving.methods import METHODS, method_options
 from covocp.solving.once import solve
 from covocp.solving.solver import Solver, check_problem
+from covocp.statement.conditions import beyond
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -344,9 +345,12 @@ def terminal_miss(solution: Solution) -> float | None:
     if st is None:
         return None
     _, final, _, final_matrices = st.boundary_values(solution.parameters)
-    misses = [np.abs(solution.trajectory.x[-1] - final), np.abs(solution.trajectory.e[-1] - final_matrices)]
+    reached = (solution.trajectory.x[-1], solution.trajectory.e[-1])
+    misses = [
+        beyond(values[~np.isnan(goal)], goal[~np.isnan(goal)], goal[~np.isnan(goal)])  # NaN: free
+        for values, goal in zip(reached, (final, final_matrices), strict=True)
+    ]
     for conditions, place, values in solution.extremal.inequalities():
         if place in ("end", "instants"):
-            misses.append(np.maximum(0.0, np.maximum(conditions.lower - values[0], values[0] - conditions.upper)))
-    values = np.concatenate(misses)
-    return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
+            misses.append(beyond(values[0], conditions.lower, conditions.upper))
+    return float(np.concatenate(misses).max(initial=0.0))

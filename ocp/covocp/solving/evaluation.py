@@ -23,16 +23,14 @@ from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.joint import Statistics
 from covocp.extremal.mesh_error import finer_steps
-from covocp.extremal.path_limits import NOTED
-from covocp.extremal.spread_limits import passed_by_spread, spread_names
 from covocp.problem.builder import Problem
 from covocp.problem.phases import Phases
 from covocp.solution.chances import reached
-from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
+from covocp.solving.missed import missed_by_loop, told
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
@@ -83,7 +81,8 @@ def evaluate(
         options: of the mesh, as in `solve`.
 
     Returns:
-        A solution by the method "evaluate"; terminal conditions that the nominal misses are among its `violations`. Of
+        A solution by the method "evaluate"; conditions that the nominal misses are among its `violations`, by inf those
+        that are NaN or inf along it: it has then not converged, and its message says which they are. Of
         phases a `PhasesSolution`. Under a truth, costs, `loop`, `covariance()`, chances, X and Xhat by subscript, and
         what is violated of conditions that contain X are those under it (at the nodes); E by subscript is what the
         filter of the design computes, the actual one is `loop.E`. Multipliers and costates are the design's.
@@ -141,7 +140,8 @@ def _along(
         outcome, given = shorter, finer
     if outcome.converged:
         check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
-    solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
+    with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
+        solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
     return told(solution) if solution.converged else solution
 
 
@@ -173,22 +173,6 @@ def run_along(
     x0, e0 = statement.started(given, parameters, e0)
     check_model(statement, x0, u[:1].ravel(), e0, duration, parameters)
     return evaluate_controls(statement, mesh, u, duration, parameters, x0)
-
-
-def told(solution: Solution) -> Solution:
-    """A solution with the limits that it passes between the nodes; what the user must know about it is said."""
-    mention_doubts(solution)
-    return replace(solution, violations=_with_passed(solution))
-
-
-def _with_passed(solution: Solution) -> dict[str, float]:
-    """What a nominal misses, and the limits that it passes between the nodes."""
-    result = dict(solution.violations)
-    for entry in solution.passed_limits():
-        name = f"bounds of {entry.name}" if entry.name in solution.state_names else entry.name
-        if entry.share > NOTED:
-            result[name] = max(result.get(name, 0.0), entry.by)
-    return result
 
 
 def _started_like(
@@ -351,16 +335,7 @@ def _under(solution: Solution, truth: Given) -> Solution:
         loop=loop,
         stored_optimality=None,
     )
-    return replace(result, chances=reached(result), violations=violations_under(result))
-
-
-def violations_under(solution: Solution) -> dict[str, float]:
-    """What a solution misses with the loop that it has: of conditions on X what that does, else what was missed."""
-    extremal, loop = solution.extremal, solution.loop
-    assert loop is not None
-    believed = spread_names(extremal.statement)
-    kept = {name: value for name, value in solution.violations.items() if name not in believed}
-    return kept | {entry.name: entry.by for entry in passed_by_spread(extremal, loop)}
+    return missed_by_loop(replace(result, chances=reached(result)))
 
 
 def true_statistics(extremal: Extremal, truth: Given) -> Statistics:

@@ -250,7 +250,7 @@ def _searched(statement: Statement, rows: list[Row], best: Solution, parameters:
     closest, found = np.inf, outcome
     for turn in range(ROUNDS):
         shares, weights, slopes = raised(rows, weights, best, spread_halves(loop, fed=True), least)
-        worst = max(shares)
+        worst = float(np.max(shares))  # NaN where one is
         if turn == 0 and worst <= 1.0:
             return None
         if outcome is not None and worst < closest:

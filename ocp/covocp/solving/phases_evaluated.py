@@ -26,6 +26,7 @@ from covocp.extremal.phase_loops import ChainStatistics, phase_loops
 from covocp.problem.phase_feedback import in_phase
 from covocp.problem.phases import Phases
 from covocp.solution.chances import reached
+from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.evaluation import (
@@ -34,9 +35,8 @@ from covocp.solving.evaluation import (
     first_options,
     run_along,
     statistics_along,
-    told,
-    violations_under,
 )
+from covocp.solving.missed import missed_by_loop, with_missed
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.unused import mention_idle_in
@@ -181,11 +181,15 @@ def solved(chain: Chain, runs: Runs) -> PhasesSolution:
         stats={},
         given=True,
     )
-    solution = phases_solution(chain, joined, METHOD)
+    with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
+        solution = phases_solution(chain, joined, METHOD)
     pairs = zip(solution.phases, runs.options, strict=True)
-    phases = tuple(told(replace(phase, stats={**phase.stats, **own.grading})) for phase, own in pairs)
+    phases = tuple(with_missed(replace(phase, stats={**phase.stats, **own.grading})) for phase, own in pairs)
     violations = {f"{phase.name}: {name}": value for phase in phases for name, value in phase.violations.items()}
-    return replace(solution, phases=phases, violations=violations)
+    whole = _as_converged(replace(solution, phases=phases, violations=violations))
+    for phase in phases if whole.converged else ():  # else costates of all phases may mean nothing
+        mention_doubts(phase)
+    return whole
 
 
 def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
@@ -227,12 +231,21 @@ def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
             stored_optimality=None,
             within=replace(phase.within, deviations=closed.start, handed=0.0),
         )
-        phases.append(replace(evaluated, chances=reached(evaluated), violations=violations_under(evaluated)))
+        phases.append(missed_by_loop(replace(evaluated, chances=reached(evaluated))))
     message = "evaluated under other statistics than the design's"
     missed = {f"{phase.name}: {name}": by for phase in phases for name, by in phase.violations.items()}
     named = tuple(f"{phase.name}: " for phase in phases)
     between = {name: by for name, by in solution.violations.items() if not name.startswith(named)}
-    return replace(solution, method=METHOD, message=message, phases=tuple(phases), violations=missed | between)
+    whole = replace(solution, method=METHOD, message=message, phases=tuple(phases), violations=missed | between)
+    return _as_converged(whole)
+
+
+def _as_converged(solution: PhasesSolution) -> PhasesSolution:
+    """Evaluated phases, as converged as each of them: one along which a condition has no value says so for all."""
+    failed = next((phase for phase in solution if not phase.converged), None)
+    if failed is None or not solution.converged:
+        return solution
+    return replace(solution, converged=False, message=f"the phase '{failed.name}': {failed.message}")
 
 
 def _true_chain(solution: PhasesSolution, truth: Given) -> ChainStatistics:

@@ -163,7 +163,7 @@ def _searched(
                 continue
             halves = spread_halves(loop, fed=True)
             shares, weights[k], slopes = raised(listed, weights[k], best[k], halves, least[k])
-            worst = max(worst, *shares)
+            worst = float(np.max([worst, *shares]))  # NaN where one is
             values |= {name + _of(k): value for name, value in slopes.items()}
         if runs is not None and worst < closest:
             closest, found = worst, runs

@@ -170,7 +170,7 @@ def _resampled(
     def at(nodes: Array, *, before: bool = False) -> dict[str, Array]:
         places = _places(nodes, duration, solution, elapsed)
         z = dense.at(solution.mesh.placed(places), before=before)
-        u = solution.controls_at(places * solution.duration, before=before)
+        u = solution.extremal.controls_at(solution.mesh.placed(places), before=before)
         return {"state": z[:, : t.x.shape[1]], "control": u, "matrix": z[:, t.x.shape[1] :]}
 
     sample = at(mesh.nodes)

@@ -16,6 +16,15 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 
 
+def beyond(values: Array, lower: Array, upper: Array) -> Array:
+    """How far values lie beyond their limits, negative within them; inf where they are NaN or inf.
+
+    What has no value meets no limit, and NaN would pass every comparison with one.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(values), np.maximum(lower - values, values - upper), np.inf)
+
+
 class Columns(NamedTuple):
     """States, controls, half-vectors and times of several points, a column each."""
 

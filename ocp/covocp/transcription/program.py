@@ -172,8 +172,8 @@ class Program:
         offset = 0
         for rows in self.link_rows:
             for i, name in enumerate(rows.names):
-                value = abs(float(values[offset + i]))
-                if not value <= VIOLATION:
+                value = abs(float(values[offset + i])) if np.isfinite(values[offset + i]) else np.inf
+                if value > VIOLATION:
                     result[name] = value * float(rows.scale[i])
             offset += rows.lower.size
         return dict(sorted(result.items(), key=lambda entry: -entry[1]))

@@ -19,8 +19,9 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
+from covocp.statement.conditions import Conditions, beyond
 from covocp.statement.interval import repeated
-from covocp.statement.statement import Conditions, Statement
+from covocp.statement.statement import Statement
 from covocp.transcription.choosing import IMPLICIT_SUBSTEPS
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.first_guess import (
@@ -381,8 +382,10 @@ def _merit(run: Run, u: Array) -> tuple[float, float]:
             chosen = [c[:, at] for c in columns]
             rows = conditions.function.map(chosen[0].shape[1])(*chosen).full().T
             limits = [np.nan_to_num(v, posinf=0.0, neginf=0.0) for v in (conditions.lower, conditions.upper)]
+            excess = beyond(rows, conditions.lower, conditions.upper).max(axis=0)
+            if not np.isfinite(excess).all():
+                return np.inf, np.inf
             size = np.maximum.reduce([np.abs(rows).max(axis=0), np.abs(limits[0]), np.abs(limits[1])])
-            excess = np.maximum(conditions.lower - rows, rows - conditions.upper).max(axis=0)
             violation = max(violation, float((excess / np.where(size > 0, size, 1.0)).max(initial=0.0)))
     return (cost, violation) if np.isfinite(violation) else (np.inf, np.inf)
 
