@@ -90,6 +90,40 @@ def test_limits_that_vary():
     ocp.subject_to(x[0] - limit, upper=0)
 
 
+def test_a_symbol_of_another_problem(solved, tmp_path):
+    """It has a name that is known, and is told apart from a name that is not."""
+    ocp, solution = solved
+    other, x, u = damped()
+    other.minimize(running=u**2)
+    of_another = "'position' is not in this solution: it is a symbol of another problem"
+    as_word = "as a string: 'position'"
+    loaded = co.load(solution.save(tmp_path / "solved.npz"))
+    refused(lambda: loaded.multiplier(ocp.statement().symbols["position"]), "only names are known here", as_word)
+    refused(lambda: solution[x], of_another, as_word, "received: position\n")
+    refused(lambda: solution[2 * x + ocp.statement().symbols["u"]], of_another, as_word)
+    refused(lambda: solution.multiplier(x), of_another, as_word)
+    refused(lambda: solution.deviation(x), of_another, as_word)
+    refused(lambda: solution.deviation(u), "'u' is not in this solution", "a symbol or name of position\n")
+    friction = other.statement().symbols["friction"]
+    refused(lambda: co.solve(ocp, parameters={friction: 0.7}), "it is a symbol of another problem", "'friction'")
+    third, _, force = damped()
+    refused(lambda: third.minimize_expected(force**2, terminal_weight={x: 1.0}), "it is a symbol of another problem")
+
+
+def test_constraints_are_among_what_has_a_multiplier():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=0.0), ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(u, x[0]))
+    ocp.subject_to(u, upper=3.0, name="thrust")
+    ocp.subject_to(x, upper=9.0, at="final", name="end")
+    ocp.minimize(running=(u - 1) ** 2)
+    solution = co.solve(ocp, intervals=5, progress=False)
+    refused(lambda: solution.multiplier("thrst"), "or a constraint by its name: thrust, end", "'thrust' is meant")
+    refused(lambda: solution.multiplier("x[2]"), "'x' has no entry 2")
+    refused(lambda: solution.multiplier(u), "a symbol or name of x, or a constraint by its name: thrust, end")
+    assert solution.multiplier("thrust").shape == (6,)
+
+
 def test_a_sample_shows_its_values(solved):
     solution = solved[1]
     text = repr(solution.at(0.5))

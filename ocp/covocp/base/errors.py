@@ -170,13 +170,18 @@ def kind_and_name(value: object) -> str:
 def spelling(name: object, known: Iterable[str], otherwise: str) -> str:
     """The remedy for a name that is not known: the known one that is nearly the same, where there is one.
 
+    A symbol that prints as a known name and is not known is that of another problem.
+
     Args:
-        name: what was given.
+        name: what was given, a word or a symbol.
         known: what could be given.
         otherwise: the remedy where nothing is near.
     """
     import difflib  # here: most programs make no mistakes, and importing covocp must not take long
 
+    known = tuple(known)
+    if hasattr(name, "is_symbolic") and str(name) in known:
+        return f"it is a symbol of another problem: take that of this problem, or the name as a string, '{name}'"
     lower = {word.casefold(): word for word in known}
     found = difflib.get_close_matches(str(name).casefold(), lower, n=1, cutoff=ALIKE)
     return f"check the spelling: perhaps '{lower[found[0]]}' is meant" if found else otherwise

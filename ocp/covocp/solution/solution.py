@@ -290,13 +290,20 @@ class Solution:
             raise unknown_name(name, tuple(b.name for b in self.blocks))
         return found
 
-    def _name(self, key: Given, blocks: tuple[Block, ...] | None = None, *, missing_ok: bool = False) -> str:
+    def _name(
+        self,
+        key: Given,
+        blocks: tuple[Block, ...] | None = None,
+        *,
+        missing_ok: bool = False,
+        others: tuple[str, ...] = (),
+    ) -> str:
         """Name of a symbol, a name or an entry among some blocks; None: among all values."""
         names = tuple(self.values) if blocks is None else tuple(b.name for b in blocks)
         sizes = sizes_of(self.blocks if blocks is None else blocks)
         if blocks is None:
             sizes |= {entry.name: entry.values.shape[1] for entry in self._data}
-        return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes)
+        return name_of(key, self.symbols, names, missing_ok=missing_ok, sizes=sizes, others=others)
 
     @cached
     def values(self) -> Mapping[str, Array]:
@@ -343,7 +350,7 @@ class Solution:
         try:
             function = statement.expression(key, scattered=self._otherwise is not None)
         except RuntimeError as error:
-            raise unknown_name(key, tuple(self.values)) from error
+            raise unknown_name(key, tuple(self.values), self.symbols) from error
         count = self.mesh.nodes.size
         columns = self.extremal.columns()
         if self._otherwise is not None and function.n_in() > len(columns):
@@ -447,7 +454,9 @@ class Solution:
             if rows:
                 values = getattr(self.multipliers, "path_at_nodes" if place == "path" else place)[..., rows]
                 return np.asarray(values[..., 0] if len(rows) == 1 else values)
-        b = self.block(self._name(key, tuple(b for b in self.blocks if b.kind in ("state", "matrix"))))
+        others = tuple(dict.fromkeys(name.split("[")[0] for names in self.constraints.values() for name in names))
+        blocks = tuple(b for b in self.blocks if b.kind in ("state", "matrix"))
+        b = self.block(self._name(key, blocks, others=others))
         if b.kind == "matrix":
             return unpack_costate(self.final_multipliers[1][b.span], b.size)
         values = self.final_multipliers[0][b.span]

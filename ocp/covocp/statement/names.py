@@ -29,6 +29,7 @@ def name_of(
     *,
     missing_ok: bool = False,
     sizes: Mapping[str, int] | None = None,
+    others: tuple[str, ...] = (),
 ) -> str:
     """Name of a symbol, a name, or an entry of a vector; "" where it is none of them and that is allowed.
 
@@ -38,6 +39,7 @@ def name_of(
         names: that may be meant.
         missing_ok: whether it may be none of them.
         sizes: number of entries of the vectors whose entries may be meant too; the name of an entry is "p[0]".
+        others: names of constraints that could be given in the same place, for the error.
 
     Raises:
         ProblemError: where it is unknown.
@@ -58,7 +60,7 @@ def name_of(
         return found
     if missing_ok:
         return ""
-    raise _no_such_entry(key, vectors) or unknown_name(key, names)
+    raise _no_such_entry(key, vectors) or unknown_name(key, names, symbols, others)
 
 
 def sizes_of(blocks: Iterable[Block]) -> dict[str, int]:
@@ -197,8 +199,17 @@ def _is_matrix_of(key: Given, half: Given) -> bool:
     return np.array_equal(np.asarray(ca.Function("probe", [half], [key])(probe).full()), probe[unpack_indices(size)])
 
 
-def unknown_name(key: Given, names: tuple[str, ...]) -> ProblemError:
-    """The error for something that is not in the solution."""
+def unknown_name(
+    key: Given, names: tuple[str, ...], symbols: Mapping[str, Any] | None = None, others: tuple[str, ...] = ()
+) -> ProblemError:
+    """The error for something that is not in the solution.
+
+    Args:
+        key: what was asked for.
+        names: that could be meant.
+        symbols: of the solution by name, where they are at hand.
+        others: names of constraints that could be meant too.
+    """
     if _of_closed_loop(key) and CLOSED_LOOP not in names:
         return ProblemError(
             f"The covariance {CLOSED_LOOP} of the closed loop is no value at this place.",
@@ -207,12 +218,36 @@ def unknown_name(key: Given, names: tuple[str, ...]) -> ProblemError:
             remedy="use solution.loop, which has X = E + Xhat of states and unknowns at the nodes, Xhat and the gain C "
             "(that of the controls is C Xhat C'); covariance(x) and deviation(x) are entries of loop.X",
         )
+    constraints = ", or a constraint by its name: " + ", ".join(others) if others else ""
+    expected = "a symbol or name of " + ", ".join(names) + constraints
+    if foreign := _foreign_name(key, names, symbols or {}):
+        known = symbols is None or bool(symbols)
+        return ProblemError(
+            f"'{foreign}' is not in this solution: it is a symbol of another problem, and has the same name."
+            if known
+            else f"'{foreign}' is a symbol, and only names are known here: of several phases, or read from a file.",
+            expected=expected if known else expected.replace("symbol or name", "name", 1),
+            received=str(key)[:100],
+            remedy=("take the symbol of the problem that was solved, or " if known else "give ")
+            + f"the name as a string: '{foreign}'",
+        )
     return ProblemError(
         f"'{key}' is not in this solution.",
-        expected="a symbol or name of " + ", ".join(names),
+        expected=expected,
         received=str(key),
-        remedy=spelling(key, names, "check the spelling, or use the symbols of the problem that was solved"),
+        remedy=spelling(
+            key, (*names, *others), "check the spelling, or use the symbols of the problem that was solved"
+        ),
     )
+
+
+def _foreign_name(key: Given, names: tuple[str, ...], symbols: Mapping[str, Any]) -> str:
+    """Name of a symbol in an expression that has a name of this solution without being its symbol; "" if none."""
+    if not isinstance(symbol_of(key), ca.MX):
+        return ""
+    own = {symbol.__hash__() for symbol in symbols.values() if isinstance(symbol, ca.MX)}
+    found = (symbol for symbol in ca.symvar(symbol_of(key)) if symbol.__hash__() not in own)
+    return next((symbol.name() for symbol in found if symbol.name() in names), "")
 
 
 def _of_closed_loop(key: Given) -> bool:
