@@ -124,6 +124,13 @@ def test_constraints_are_among_what_has_a_multiplier():
     assert solution.multiplier("thrust").shape == (6,)
 
 
+def test_instants_that_are_given_twice():
+    ocp = co.Problem(4.0)
+    x = ocp.state("x", initial=0.0)
+    refused(lambda: ocp.measurement("m", x, noise=1.0, at=[0.5, 1.0, 1.0]), "each once", "received: 1 twice")
+    refused(lambda: ocp.measurement("m", x, noise=1.0, at=[2.0, 1.5]), "received: 1.5 after 2\n")
+
+
 def test_a_sample_shows_its_values(solved):
     solution = solved[1]
     text = repr(solution.at(0.5))

@@ -85,8 +85,9 @@ def _checked(name: str, at: Given, duration: float) -> Array:
     if outside.any() or not shares.size:
         raise _refused(name, f"instants in [0, {duration:g}], at least one", times[outside])
     shares = np.clip(shares, 0.0, 1.0)
-    if (np.diff(shares) <= SAME).any():
-        bad = times[1:][np.diff(shares) <= SAME]
+    for k in np.flatnonzero(np.diff(shares) <= SAME):
+        same = abs(shares[k + 1] - shares[k]) <= SAME
+        bad = f"{times[k]:g} twice" if same else f"{times[k + 1]:g} after {times[k]:g}"
         raise _refused(name, "instants that rise, each once", bad)
     return np.asarray(shares)
 
