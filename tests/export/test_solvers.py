@@ -172,3 +172,22 @@ def test_a_function_of_the_user_is_not_replaced(monkeypatch):
     with pytest.raises(co.ExportError, match="seen"):
         export_c(moved(), FOLDER / "given", intervals=5, plugin_options={"hess_lag": given})
     assert taken == [given]
+
+
+@pytest.mark.parametrize("value", [ca.log, ca.sqrt])
+def test_a_plan_along_which_a_condition_has_no_value_is_none(value):
+    """Of least cost is x = x(0) - 0.1 t: from 0.1 it is below zero after 1 s, where neither function has a value."""
+    ocp = co.Problem(duration=2.0)
+    x, u = ocp.state("x", initial=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.subject_to(value(x), upper=2.0, name="level")
+    ocp.minimize(running=(u + 0.1) ** 2)
+    made = export_c(ocp, FOLDER / f"undefined_{value.__name__}", intervals=5)
+    made.build(flags=[*STRICT, "-O1"])
+    planner = made.python()
+    np.testing.assert_allclose(planner(initial_x=0.5)["x"], 0.5 - 0.1 * np.linspace(0.0, 2.0, 6), atol=1e-6)
+    assert planner.status == "OK"
+    for start in (0.1, -1.0):
+        plan = planner(initial_x=start)
+        assert planner.status == "FAILED"
+        assert plan["x"][0] == pytest.approx(1.0)  # the plan made at the export

@@ -427,6 +427,8 @@ def _residuals(
     lower, upper = ca.vertcat(bounds["lbx"], bounds["lbg"]), ca.vertcat(bounds["ubx"], bounds["ubg"])
     weights = ca.vertcat(result["lam_x"], result["lam_g"])
     violation = ca.mmax(ca.fmax(0.0, ca.fmax(lower - both, both - upper)))
+    # the larger of NaN and 0 is 0: what has no value would be met
+    violation = ca.fmax(violation, ca.mmax(ca.if_else(ca.fabs(both) < np.inf, 0.0, np.inf)))
     violation = ca.fmax(violation, ca.if_else(duration > 0.0, 0.0, 1.0))  # a plan backwards in time is none
     slack = ca.if_else(weights > 0.0, upper - both, both - lower)
     loose = ca.mmax(ca.if_else(weights == 0.0, 0.0, ca.fmin(ca.fabs(weights), ca.fabs(slack))))
