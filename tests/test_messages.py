@@ -95,7 +95,7 @@ def test_a_symbol_of_another_problem(solved, tmp_path):
     ocp, solution = solved
     other, x, u = damped()
     other.minimize(running=u**2)
-    of_another = "'position' is a symbol of another problem"
+    of_another = "'position' is not in this solution: it is a symbol of another problem"
     as_word = "as a string: 'position'"
     loaded = co.load(solution.save(tmp_path / "solved.npz"))
     refused(lambda: loaded.multiplier(ocp.statement().symbols["position"]), "only names are known here", as_word)

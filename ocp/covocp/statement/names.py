@@ -223,7 +223,7 @@ def unknown_name(
     if foreign := _foreign_name(key, names, symbols or {}):
         known = symbols is None or bool(symbols)
         return ProblemError(
-            f"'{foreign}' is a symbol of another problem; this solution has a '{foreign}' of its own."
+            f"'{foreign}' is not in this solution: it is a symbol of another problem, and has the same name."
             if known
             else f"'{foreign}' is a symbol, and only names are known here: of several phases, or read from a file.",
             expected=expected if known else expected.replace("symbol or name", "name", 1),
