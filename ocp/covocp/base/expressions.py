@@ -30,8 +30,5 @@ def slopes_by(value: Expr, symbols: Sequence[Expr]) -> list[Any]:
         whole = ca.densify(ca.gradient(value, ca.veccat(*symbols)))
         parts = ca.vertsplit(whole, np.cumsum([0, *sizes]).tolist())
         return [ca.reshape(part, *symbol.shape) for part, symbol in zip(parts, symbols, strict=True)]
-    wanted = {symbol.__hash__() for symbol in symbols}
-    others = [symbol for symbol in ca.symvar(value) if symbol.__hash__() not in wanted]
-    arguments = [*symbols, *others]
-    reverse = ca.Function("value", arguments, [value]).reverse(1)
-    return [ca.densify(slope) for slope in reverse.call([*arguments, value, ca.DM(1)], True, False)[: len(symbols)]]
+    slopes = ca.reverse([value], list(symbols), [[ca.MX(1)]])[0]  # what the value is made of stands there once
+    return [ca.densify(slope) for slope in slopes]

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array
 from covocp.passage.sweep import depends, passed_by
 from covocp.passage.written import Tape
@@ -343,9 +343,8 @@ class _AlongRun:
         variables = self._variables
         w, p, nx, n = variables.w, variables.p, variables.statement.nx, variables.mesh.intervals
         cost: Any = sum(_costs(variables, self._nodes)) / variables.cost_scale
-        back = ca.Function("cost", [w, *self._given, p], [cost]).reverse(1)
-        slopes = back(w, *self._given, p, cost, 1.0)[:4]
-        after = ca.Function("cost_after_run", [w, p, *self._given], [cost, *map(ca.densify, slopes)])
+        slopes = slopes_by(cost, [w, *self._given])
+        after = ca.Function("cost_after_run", [w, p, *self._given], [cost, *slopes])
         value, by_w, by_ends, by_fine, by_costs = after(w, p, *self._run)
         tall = nx * variables.mesh.substeps
         seeds: Expr = ca.reshape(by_fine, tall, n) + ca.vertcat(ca.DM(tall - nx, n), by_ends)
