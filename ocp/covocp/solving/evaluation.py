@@ -31,6 +31,7 @@ from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.missed import missed_by_loop, told
+from covocp.solving.not_finite import with_shortest_steps
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
@@ -133,6 +134,8 @@ def _along(
     given = graded(st, first_options(nominal, intervals, options), values)
     outcome = run_along(st, nominal, given, values)
     own_steps = given.substeps == "auto"
+    if not outcome.converged:
+        outcome = with_shortest_steps(outcome, given, lambda shorter: run_along(st, nominal, shorter, values))
     while own_steps and outcome.converged and (finer := finer_steps(outcome.extremal, given)):
         shorter = run_along(st, nominal, finer, values)
         if not shorter.converged:
