@@ -91,6 +91,7 @@ def test_costates_that_explicit_steps_do_not_reach_are_not_compared():
     with pytest.warns(co.CovocpWarning, match="The mesh is too coarse"):
         solution = solve(ocp, intervals=10)
     assert solution.optimality.costate_difference is None
+    assert "not checked" in str(solution)
 
 
 def test_stationarity_does_not_grow_with_an_interval_that_is_short():

@@ -59,6 +59,8 @@ RESIDUALS = {
 }
 
 
+# Of costates that nothing is compared with.
+UNCHECKED = "not checked: explicit steps back would be too many; costates near the end may be off"
 # Where to begin to worry about a residual, and what a large one means.
 WORRIES: dict[str, tuple[float, str]] = {
     "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
@@ -381,6 +383,8 @@ def _optimality(solution: Solution) -> Section:
         return [Sentence(f"necessary conditions: not evaluated ({str(error).splitlines()[0][:100]})")]
     rows = []
     for name, value in values.items():
+        if value is None and name == "costate_difference" and values["stationarity"] is not None:
+            rows.append([RESIDUALS[name], "-", UNCHECKED])
         if value is None or (name == "smallest_eigenvalue" and np.isinf(value)):
             continue
         rows.append(
