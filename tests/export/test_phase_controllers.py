@@ -352,3 +352,128 @@ def test_a_spurious_time_changes_nothing_for_the_next_step(order: tuple[str, ...
                     assert returned[row] == pytest.approx(float(nominal[name]), rel=1e-9)
                 np.testing.assert_array_equal(step.step([np.nan], valid[-1] + 0.1), known[0])
                 np.testing.assert_array_equal(step.estimate, known[1])
+
+
+RATE, MOVED, SEEN, TURN, SIDE = -0.5, 0.2, 0.05, -0.8, 0.05
+
+
+def _quiet(name: str, *, measures: str) -> co.Problem:
+    """A lag moved by noise for a second, of which the position is measured, or nothing: said, or left out."""
+    first = name == "one"
+    ocp = co.Problem(1.0, name=name)
+    x = ocp.state("x", initial=1.0 if first else None, variance=0.3 if first else None)
+    u = ocp.control("u")
+    ocp.dynamics(x, RATE * x + u, noise=MOVED)
+    if measures == "position":
+        ocp.measurement("position", x, noise=SEEN)
+    elif measures == "no information":
+        ocp.measurement("position", x, information=0.0)
+    ocp.minimize_expected(running=0.5 * u**2 + x**2, terminal=2.0 * x**2 if name == "three" else 0.0)
+    return ocp
+
+
+@cache
+def unmeasured(first: str, second: str, third: str) -> co.PhasesSolution:
+    """Three phases with what each measures, and the jump x+ = -0.8 x + noise before the second."""
+    measures = {"one": first, "two": second, "three": third}
+    one, two, three = (_quiet(name, measures=own) for name, own in measures.items())
+    phases = co.Phases([one, two, three])
+    phases.jump(two.states[0].symbol, TURN * one.states[0].symbol, noise=0.1)
+    return co.solve(phases, intervals=20, tolerance=1e-9, **QUIET)
+
+
+def _riccati(measures: list[bool]) -> tuple[np.ndarray, np.ndarray]:
+    """E where each of the 60 steps begins and S of each phase at its 21 nodes, by integrations of their own."""
+    E, S, errors, weights = 0.3, 4.0, [], np.zeros((3, 21))
+    t, accurate = np.linspace(0.0, 1.0, 21), {"rtol": 1e-11, "atol": 1e-13}
+    for k, seen in enumerate(measures):
+        W = 1.0 / SEEN if seen else 0.0
+        path = solve_ivp(lambda _, E, W=W: 2 * RATE * E + MOVED - E * W * E, (0, 1), [E], t_eval=t, **accurate).y[0]
+        errors.append(path[:-1])
+        E = TURN**2 * path[-1] + 0.1 if k == 0 else path[-1]
+    for k in (2, 1, 0):
+        path = solve_ivp(lambda _, S: 2 * RATE * S + 2.0 - S**2, (0, 1), [S], t_eval=t, **accurate).y[0]
+        weights[k] = path[::-1]
+        S = TURN**2 * path[-1] if k == 1 else path[-1]
+    return np.concatenate(errors), weights
+
+
+def _filtered(solution: co.PhasesSolution, measures: list[bool], readings: np.ndarray) -> np.ndarray:
+    """Control and estimate after each of 60 steps of 0.05 s: prediction alone in phases that measure nothing."""
+    errors, S = _riccati(measures)
+    phi, y, held, found = np.exp(RATE * SIDE), 0.0, float(solution[0]["u"][0]), []
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    for k, reading in enumerate(readings):
+        phase, begin = k // 20, (k % 20) * SIDE
+        inside = SIDE * (1.0 + nodes) / 2.0
+        forced = np.exp(RATE * (SIDE - inside)) * (held - solution[phase].at(begin + inside)["u"])
+        y = phi * y + SIDE / 2.0 * float(weights @ forced)
+        if measures[phase]:
+            P = phi**2 * errors[k] + SIDE * MOVED
+            L = SIDE * P / (SIDE * P + SEEN)
+            y += L * (reading - float(solution[phase]["x"][k % 20 + 1]) - y)
+        y *= TURN if k == 19 else 1.0
+        now, node = (phase + 1, 0) if k in (19, 39) else (phase, k % 20 + 1)
+        held = float(solution[now]["u"][node]) - S[now, node] * y
+        found.append([held, y])
+    return np.array(found)
+
+
+def _stepped(step: Any, readings: np.ndarray) -> np.ndarray:
+    """The same of a controller."""
+    step.init()
+    found = []
+    for k, reading in enumerate(readings):
+        found.append([float(step.step([reading], SIDE * (k + 1))[0]), float(step.estimate[0])])
+        assert step.status == "OK", k
+    return np.array(found)
+
+
+@pytest.mark.parametrize("silent", [0, 1, 2])
+def test_a_phase_that_measures_nothing_predicts_and_feeds_back(silent: int) -> None:
+    """C and Python as an independent filter, and as with a measurement of no information; what is given is ignored."""
+    seen = [k != silent for k in range(3)]
+    solution = unmeasured(*("position" if own else "nothing" for own in seen))
+    made = export_c(solution, FOLDER / f"silent_{silent}")
+    made.build(flags=STRICT)
+    assert made.check(200).ok
+    own = ("one", "two", "three")[silent]
+    assert f"in {own}: nothing" in (made.directory / f"silent_{silent}.h").read_text()
+    readings = np.concatenate([phase["x"][1:] for phase in solution]) + 0.4 + 0.2 * np.sin(np.arange(60.0))
+    given = readings.copy()
+    given[20 * silent : 20 * silent + 20] = np.resize([np.nan, np.inf, 1e200, -7.0], 20)
+    known = _filtered(solution, seen, readings)
+    if silent:
+        assert abs(known[20 * silent + 5, 1]) > 0.01  # the estimate of before goes on
+    for laws in (made.python(), made.reference()):
+        np.testing.assert_allclose(_stepped(laws["step"], given), known, rtol=1e-5, atol=1e-6)
+    said = unmeasured(*("position" if own else "no information" for own in seen))
+    other = export_c(said, FOLDER / f"said_{silent}").reference()["step"]
+    np.testing.assert_allclose(_stepped(other, readings), known, rtol=1e-5, atol=1e-6)
+
+
+def test_steps_across_a_phase_that_measures_nothing() -> None:
+    """From its inside and over all of it, as with a measurement of no information; its filter gain is zero."""
+    steps = [
+        export_c(unmeasured("position", own, "position"), FOLDER / name).reference()["step"]
+        for own, name in (("nothing", "over"), ("no information", "over_said"))
+    ]
+    for times in ((0.4, 0.93, 1.31, 2.2), (0.5, 2.3), (0.5, 1.0, 2.0, 2.5)):
+        for step in steps:
+            step.init()
+        for time in times:
+            controls = [float(step.step([0.7], time)[0]) for step in steps]
+            assert [step.status for step in steps] == ["OK", "OK"]
+            assert controls[0] == pytest.approx(controls[1], rel=1e-7)
+            assert float(steps[0].estimate[0]) == pytest.approx(float(steps[1].estimate[0]), rel=1e-7)
+            assert (float(np.sum(steps[0].state["filter_gain"])) == 0.0) == (1.0 <= time <= 2.0)
+
+
+def test_phases_none_of_which_measures_anything_have_no_controller() -> None:
+    solution = unmeasured("nothing", "nothing", "nothing")
+    with pytest.raises(co.ExportError, match="no phase measures anything") as caught:
+        export_c(solution, FOLDER / "refused")
+    assert "'one', 'two', 'three' without one" in str(caught.value)
+    with pytest.raises(co.ExportError, match="the problem measures nothing"):
+        export_c(solution["one"], FOLDER / "refused")
+    assert not (FOLDER / "refused").exists()

@@ -22,7 +22,7 @@ from covocp.export.compiled.folder import check_folder, check_names, package_fil
 from covocp.export.compiled.linking import Linking
 from covocp.export.compiled.package import CPackage
 from covocp.export.laws.controller import controller_law
-from covocp.export.laws.design import design_of
+from covocp.export.laws.design import check_measured, design_of
 from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
@@ -232,6 +232,7 @@ def _solution(
     if solution.loop is not None and feedback:
         check_begins(solution, "A controller")
         design = design_of(solution, limits)
+        check_measured([solution.name], [design])
         warn_outside(design.statement, design.limits, tables)
         if period is None:
             check_flight(interpolated_flight(solution), largest_spread, None)
@@ -267,6 +268,7 @@ def _phases(
                 remedy="load(path, phases) with the phases that were solved",
             )
         designs = [design_of(phase, own) for phase, own in zip(solution, limits_of_each(solution, limits), strict=True)]
+        check_measured([phase.name for phase in solution], designs)
         check_first_readings(solution, designs)
         for phase, design, own in zip(solution, designs, found.tables, strict=True):
             warn_outside(design.statement, design.limits, own)

@@ -298,6 +298,9 @@ def _corrected(
     model = design.model(x, u, t)
     expected, M, slope, U = model.h, model.M, model.H, model.U
     E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
+    if r == 0:  # a phase that measures nothing: prediction alone, which the feedback goes on acting on
+        gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C)])
+        return predicted[0], gain(now.x, now.u, now.e, time), ca.MX(n, 0), ca.MX(0)
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
     if design.always == r:

@@ -113,7 +113,7 @@ def design_of(solution: Solution, limits: Given) -> Design:
             (lower, upper).
 
     Raises:
-        ExportError: no problem, nothing measured, limits that mean nothing.
+        ExportError: no problem, limits that mean nothing.
     """
     statement = solution.statement
     if statement is None or statement.loop is None:
@@ -122,13 +122,6 @@ def design_of(solution: Solution, limits: Given) -> Design:
             expected="a solution with its problem",
             received=f"'{solution.name}', read from a file",
             remedy="load(path, problem=...) with the problem that was solved",
-        )
-    if statement.measurement is None and statement.samples is None:
-        raise ExportError(
-            "There is no controller: the problem measures nothing, so the feedback never acts.",
-            expected="a problem with measurement()",
-            received=f"'{solution.name}' without one",
-            remedy="add what is measured, or export the histories by feedback=False",
         )
     n, m = int(statement.loop.gain.size2_out(0)), int(statement.loop.gain.size1_out(0))
     symbolic: Any = statement.symbolic
@@ -159,6 +152,29 @@ def design_of(solution: Solution, limits: Given) -> Design:
         measured=measured_blocks(statement),
         instants=_instants(statement, solution.duration),
     )
+
+
+def check_measured(names: list[str], designs: list[Design]) -> None:
+    """Refuse what never measures anything: the estimate stays zero, so there is nothing to feed back.
+
+    One phase that measures is enough: the estimate goes on from it, and before it the feedback waits.
+
+    Args:
+        names: of the phases, or of the solution.
+        designs: of each of them.
+
+    Raises:
+        ExportError: names them.
+    """
+    if not any(design.sizes[2] for design in designs):
+        several = len(designs) > 1
+        raise ExportError(
+            f"There is no controller: {'no phase measures anything' if several else 'the problem measures nothing'}, "
+            "so the feedback never acts.",
+            expected="measurement() in one of the phases at least" if several else "a problem with measurement()",
+            received=f"{', '.join(map(repr, names))} without one",
+            remedy="add what is measured, or export the histories by feedback=False",
+        )
 
 
 def measured_blocks(statement: Statement) -> tuple[Block, ...]:

@@ -9,6 +9,9 @@ others as its nominal begins.
 A reading stands for the time before it. A step exactly where two phases meet takes that of the earlier one, which ends
 there, and gives out the control of the later one. A step across a junction takes that of the later phase, for the time
 since it began; what the earlier phase would have measured after the last step is not known then.
+
+A phase that measures nothing only predicts, and feeds back the estimate that came from before: what it is given as a
+reading is ignored.
 """
 
 from __future__ import annotations
