@@ -223,6 +223,10 @@ class _Simulation:
             np.less_equal(np.abs(moved, size), domain, inside)  # false for NaN
             if not inside.all():
                 self._leave(~inside.all(axis=0), plan.times[k])
+                if np.isfinite(self.left[: self.runs]).all():  # no run is followed further
+                    for place in (own for at, own in where.items() if at > k):
+                        self._store(place)
+                    break
             before[:] = moved
             if k + 1 in sampled:
                 self._sample(sampled[k + 1])
