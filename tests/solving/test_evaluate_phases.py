@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,14 @@ def test_a_decision_is_given_once_and_goes_on() -> None:
 def test_what_does_not_fit_is_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(co.ProblemError, match=words):
         co.evaluate(weighed(), **{"intervals": 5, **given})
+
+
+def test_a_truth_for_a_loop_that_was_lost_says_so() -> None:
+    """As where the last iterate of a failed run is not finite: its problem has an expected cost all the same."""
+    found = designed()
+    lost = replace(found, phases=(found.phases[0], replace(found.phases[1], loop=None)))
+    with pytest.raises(co.ProblemError, match="covariances of that of the phase 'two' are NaN or inf"):
+        co.evaluate(lost, truth={"q": 0.5})
 
 
 def test_a_nominal_that_leaves_the_domain_is_an_error_that_names_the_phase() -> None:

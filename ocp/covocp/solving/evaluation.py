@@ -30,7 +30,7 @@ from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
-from covocp.solving.missed import missed_by_loop, told
+from covocp.solving.missed import check_has_loop, missed_by_loop, told
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
@@ -312,6 +312,7 @@ def _not_given(kind: str, name: str, received: str) -> ProblemError:
 def _under(solution: Solution, truth: Given) -> Solution:
     """The solution with the covariances and the cost of other statistics, and the gains of its design."""
     if solution.loop is None:
+        check_has_loop(solution)
         raise ProblemError(
             "truth= needs a closed loop.",
             expected="a solution of a problem with minimize_expected()",

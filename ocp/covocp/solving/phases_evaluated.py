@@ -36,7 +36,7 @@ from covocp.solving.evaluation import (
     run_along,
     statistics_along,
 )
-from covocp.solving.missed import missed_by_loop, with_missed
+from covocp.solving.missed import check_has_loop, missed_by_loop, with_missed
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.unused import mention_idle_in
@@ -201,7 +201,10 @@ def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
             received=f"'{solution.name}', read from a file",
             remedy="load(path, phases) with the phases that were solved",
         )
-    if any(phase.loop is None for phase in solution):
+    open_loops = [phase for phase in solution if phase.loop is None]
+    if open_loops:
+        for phase in open_loops:
+            check_has_loop(phase, "the phase")
         raise ProblemError(
             "truth= needs a closed loop.",
             expected="a solution of phases with minimize_expected()",
