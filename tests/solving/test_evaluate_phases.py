@@ -274,6 +274,19 @@ def test_what_does_not_fit_is_refused(given: dict[str, Any], words: str) -> None
         co.evaluate(weighed(), **{"intervals": 5, **given})
 
 
+def test_a_jump_without_a_value_is_told_from_the_phases_it_joins() -> None:
+    """sqrt(-x) where x ends above zero, along a nominal at exp(-0.3); the phases themselves have values."""
+    one, two = (integrator(name, first=name == "one") for name in ("one", "two"))
+    phases = co.Phases([one, two], name="rooted")
+    phases.jump(two.states[0].symbol, ca.sqrt(-one.states[0].symbol))
+    words = "jump of x from 'one' to 'two' is nan for what 'one' ends with.*received: x = "
+    with pytest.raises(co.SolveError, match=f"(?s){words}0.7408, duration 1 s"):
+        co.evaluate(phases, nominal=[{"u": 0.0}, {"u": 0.0}], intervals=20)
+    with pytest.raises(co.ProblemError, match=f"(?s){words}") as caught:
+        co.solve(phases, intervals=5, **QUIET)
+    assert "steps" not in str(caught.value)
+
+
 def test_a_truth_for_a_loop_that_was_lost_says_so() -> None:
     """As where the last iterate of a failed run is not finite: its problem has an expected cost all the same."""
     found = designed()

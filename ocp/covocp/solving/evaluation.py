@@ -89,7 +89,7 @@ def evaluate(
 
     Raises:
         ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
-        SolveError: a phase becomes NaN or inf along the nominal.
+        SolveError: a phase, or what it gives to the next one, becomes NaN or inf along the nominal.
     """
     if isinstance(problem, (Solution, PhasesSolution)):
         _check_kept(nominal, intervals, parameters, options)
