@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +98,23 @@ def test_phases_that_were_solved_for_other_parameters_come_back(how: str, tmp_pa
         assert again.cost == pytest.approx(co.evaluate(solved, truth={"k": 1.7}).cost, rel=1e-12)
     with pytest.raises(co.ProblemError, match="value of 'k' differs"):
         co.load(path, with_parameter(1.3))
+
+
+@pytest.mark.parametrize("name", ["costate", "gains", "to_xarray", "trajectory"])
+def test_what_a_phase_has_is_asked_of_a_phase(solution: co.PhasesSolution, name: str) -> None:
+    assert hasattr(solution["fall"], name)
+    assert not hasattr(solution, name)
+    with pytest.raises(co.ProblemError, match=r"(?s)one of the phases 'fall', 'rise'.*index a phase first") as caught:
+        getattr(solution, name)
+    told = pickle.loads(pickle.dumps(caught.value))
+    assert (str(told), isinstance(told, AttributeError)) == (str(caught.value), True)
+
+
+def test_other_attributes_and_copies_are_as_of_any_object(solution: co.PhasesSolution) -> None:
+    with pytest.raises(AttributeError, match="no attribute 'colour'") as caught:
+        solution.colour  # noqa: B018
+    assert not isinstance(caught.value, co.ProblemError)
+    assert copy.copy(solution).cost == solution.cost
+    assert getattr(solution, "gains", None) is None
+    with pytest.raises(AttributeError, match="index a phase first"):  # before it has any, as while it is copied
+        co.PhasesSolution.__new__(co.PhasesSolution).gains  # noqa: B018

@@ -266,6 +266,7 @@ def test_a_decision_is_given_once_and_goes_on() -> None:
         ({"intervals": [3]}, "'intervals' has a value that does not apply"),
         ({"parameters": {"z": 1.0}}, "There is no parameter 'z'"),
         ({"refine": 1e-6}, "has no option 'refine'"),
+        ({"nominals": {}}, "(?s)one of .*intervals.*nominal.*parameters.*truth.*perhaps 'nominal' is meant"),
         ({"truth": {}}, "truth= needs a closed loop"),
     ],
 )

@@ -256,7 +256,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
     }  # nothing is imposed or solved here
     for name in options:
         if name not in known:
-            raise no_option("evaluate()", name, options[name], known, ARGUMENTS)
+            raise no_option("evaluate()", name, options[name], {*known, *ARGUMENTS})
     return options
 
 
