@@ -41,7 +41,7 @@ def test_other_phases_are_told_from_those_in_the_file(solution: co.PhasesSolutio
     plain = co.Phases(other.problems, name="bounce")  # without the jump of the speed
     with pytest.raises(co.ProblemError, match="other phases: the continuity of v"):
         co.load(path, plain)
-    one, two = co.Problem(1.0, name="one"), co.Problem(1.0, name="two")
+    one, two = co.Problem(1.0, name="fall"), co.Problem(1.0, name="rise")
     steered(one, two)
     with pytest.raises(co.ProblemError, match="of another problem"):
         co.load(path, co.Phases([one, two]))
@@ -118,3 +118,23 @@ def test_other_attributes_and_copies_are_as_of_any_object(solution: co.PhasesSol
     assert getattr(solution, "gains", None) is None
     with pytest.raises(AttributeError, match="index a phase first"):  # before it has any, as while it is copied
         co.PhasesSolution.__new__(co.PhasesSolution).gains  # noqa: B018
+
+
+def test_names_of_phases_are_compared(tmp_path: Path) -> None:
+    """By them the phases are asked for: a file of 'one' and 'two' knows no 'zwei'."""
+
+    def named(*names: str) -> co.Phases:
+        problems = []
+        for name in names:
+            ocp = co.Problem(1.0, name=name)
+            x, u = ocp.state("x", initial=None if problems else 1.0), ocp.control("u")
+            ocp.dynamics(x, u)
+            ocp.minimize(running=x**2 + u**2)
+            problems.append(ocp)
+        return co.Phases(problems, name="both")
+
+    path = co.solve(named("one", "two"), intervals=4, progress=False).save(tmp_path / "both.npz")
+    assert co.load(path, named("one", "two"))["two"].statement is not None
+    for other in (("one", "zwei"), ("two", "one")):
+        with pytest.raises(co.ProblemError, match=f"(?s)other phases.*one, two.*{', '.join(other)}"):
+            co.load(path, named(*other))
