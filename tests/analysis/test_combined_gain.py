@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
 import casadi as ca
@@ -216,3 +217,33 @@ def test_along_a_solution_its_mesh_is_kept_where_no_other_is_asked_for():
     best = co.solve(problem, intervals=14, progress=False)
     assert co.worth(problem, nominal=best).classical.mesh.intervals == best.mesh.intervals
     assert co.worth(problem, nominal=best, intervals=21).classical.mesh.intervals != best.mesh.intervals
+
+
+# --- no classical design ----------------------------------------------------------------------------------------------
+
+
+def blowing_up():
+    """x' = x^2 + u from 1: without control x = 1 / (1 - t), which has no value at t = 1."""
+    ocp = co.Problem(2.0, name="blow")
+    x, u = ocp.state("x", initial=1.0, variance=0.01), ocp.control("u", guess=-1.5)
+    ocp.dynamics(x, x**2 + u, noise=0.01)
+    ocp.measurement("m", x, noise=0.01)
+    ocp.minimize_expected(running=u**2 + x**2, terminal=x**2)
+    return ocp
+
+
+@pytest.mark.filterwarnings("error")
+def test_along_a_nominal_that_blows_up_there_is_nothing_to_compare_with():
+    evaluated = co.evaluate(blowing_up(), nominal={"u": 0.0})
+    assert np.isnan(evaluated.cost)
+    for nominal in ({"u": 0.0}, evaluated):
+        with pytest.raises(co.SolveError, match=r"classical design of 'blow'.*none.*becomes NaN or inf") as caught:
+            co.worth(blowing_up(), nominal=nominal)
+        assert not caught.value.solution.converged
+    assert co.worth(blowing_up(), nominal={"u": -1.5}, intervals=20).gain > 0  # finite: x stays below sqrt(1.5)
+
+
+def test_no_verdict_where_a_figure_is_no_number():
+    found = co.worth(without_deterministic_cost(), nominal={"u": 0.2}, intervals=5)
+    for changed in ({"gain": np.nan}, {"first_order": np.nan}, {"first_order": np.inf}):
+        assert dataclasses.replace(found, **changed).verdict == "not known: the figures are no numbers"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +41,7 @@ def test_other_phases_are_told_from_those_in_the_file(solution: co.PhasesSolutio
     plain = co.Phases(other.problems, name="bounce")  # without the jump of the speed
     with pytest.raises(co.ProblemError, match="other phases: the continuity of v"):
         co.load(path, plain)
-    one, two = co.Problem(1.0, name="one"), co.Problem(1.0, name="two")
+    one, two = co.Problem(1.0, name="fall"), co.Problem(1.0, name="rise")
     steered(one, two)
     with pytest.raises(co.ProblemError, match="of another problem"):
         co.load(path, co.Phases([one, two]))
@@ -96,3 +98,43 @@ def test_phases_that_were_solved_for_other_parameters_come_back(how: str, tmp_pa
         assert again.cost == pytest.approx(co.evaluate(solved, truth={"k": 1.7}).cost, rel=1e-12)
     with pytest.raises(co.ProblemError, match="value of 'k' differs"):
         co.load(path, with_parameter(1.3))
+
+
+@pytest.mark.parametrize("name", ["costate", "gains", "to_xarray", "trajectory"])
+def test_what_a_phase_has_is_asked_of_a_phase(solution: co.PhasesSolution, name: str) -> None:
+    assert hasattr(solution["fall"], name)
+    assert not hasattr(solution, name)
+    with pytest.raises(co.ProblemError, match=r"(?s)one of the phases 'fall', 'rise'.*index a phase first") as caught:
+        getattr(solution, name)
+    told = pickle.loads(pickle.dumps(caught.value))
+    assert (str(told), isinstance(told, AttributeError)) == (str(caught.value), True)
+
+
+def test_other_attributes_and_copies_are_as_of_any_object(solution: co.PhasesSolution) -> None:
+    with pytest.raises(AttributeError, match="no attribute 'colour'") as caught:
+        solution.colour  # noqa: B018
+    assert not isinstance(caught.value, co.ProblemError)
+    assert copy.copy(solution).cost == solution.cost
+    assert getattr(solution, "gains", None) is None
+    with pytest.raises(AttributeError, match="index a phase first"):  # before it has any, as while it is copied
+        co.PhasesSolution.__new__(co.PhasesSolution).gains  # noqa: B018
+
+
+def test_names_of_phases_are_compared(tmp_path: Path) -> None:
+    """By them the phases are asked for: a file of 'one' and 'two' knows no 'zwei'."""
+
+    def named(*names: str) -> co.Phases:
+        problems = []
+        for name in names:
+            ocp = co.Problem(1.0, name=name)
+            x, u = ocp.state("x", initial=None if problems else 1.0), ocp.control("u")
+            ocp.dynamics(x, u)
+            ocp.minimize(running=x**2 + u**2)
+            problems.append(ocp)
+        return co.Phases(problems, name="both")
+
+    path = co.solve(named("one", "two"), intervals=4, progress=False).save(tmp_path / "both.npz")
+    assert co.load(path, named("one", "two"))["two"].statement is not None
+    for other in (("one", "zwei"), ("two", "one")):
+        with pytest.raises(co.ProblemError, match=f"(?s)other phases.*one, two.*{', '.join(other)}"):
+            co.load(path, named(*other))

@@ -536,3 +536,15 @@ def test_conditions_that_a_better_truth_meets():
     worse = co.evaluate(design, truth=spread_limited(noise=0.08, measured=0.04)[0])
     assert set(worse.violations) == {"end", "path", "both"}
     assert co.evaluate(worse, truth=spread_limited(noise=0.01)[0]).violations == {}
+
+
+def test_a_truth_for_what_became_nan_says_so():
+    """x' = x^2 from 1 has no value at t = 1; the problem has an expected cost all the same."""
+    ocp = co.Problem(2.0, name="blow")
+    x, u = ocp.state("x", initial=1.0, variance=0.01), ocp.control("u")
+    ocp.dynamics(x, x**2 + u, noise=0.01)
+    ocp.measurement("m", x, noise=0.01)
+    ocp.minimize_expected(running=u**2 + x**2)
+    found = co.evaluate(ocp, nominal={"u": 0.0})
+    message = refused(lambda: co.evaluate(found, truth=ocp), "closed loop", "'blow'", "NaN or inf", "cost nan")
+    assert "deterministic" not in message

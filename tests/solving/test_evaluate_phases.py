@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -265,12 +266,34 @@ def test_a_decision_is_given_once_and_goes_on() -> None:
         ({"intervals": [3]}, "'intervals' has a value that does not apply"),
         ({"parameters": {"z": 1.0}}, "There is no parameter 'z'"),
         ({"refine": 1e-6}, "has no option 'refine'"),
+        ({"nominals": {}}, "(?s)one of .*intervals.*nominal.*parameters.*truth.*perhaps 'nominal' is meant"),
         ({"truth": {}}, "truth= needs a closed loop"),
     ],
 )
 def test_what_does_not_fit_is_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(co.ProblemError, match=words):
         co.evaluate(weighed(), **{"intervals": 5, **given})
+
+
+def test_a_jump_without_a_value_is_told_from_the_phases_it_joins() -> None:
+    """sqrt(-x) where x ends above zero, along a nominal at exp(-0.3); the phases themselves have values."""
+    one, two = (integrator(name, first=name == "one") for name in ("one", "two"))
+    phases = co.Phases([one, two], name="rooted")
+    phases.jump(two.states[0].symbol, ca.sqrt(-one.states[0].symbol))
+    words = "jump of x from 'one' to 'two' is nan for what 'one' ends with.*received: x = "
+    with pytest.raises(co.SolveError, match=f"(?s){words}0.7408, duration 1 s"):
+        co.evaluate(phases, nominal=[{"u": 0.0}, {"u": 0.0}], intervals=20)
+    with pytest.raises(co.ProblemError, match=f"(?s){words}") as caught:
+        co.solve(phases, intervals=5, **QUIET)
+    assert "steps" not in str(caught.value)
+
+
+def test_a_truth_for_a_loop_that_was_lost_says_so() -> None:
+    """As where the last iterate of a failed run is not finite: its problem has an expected cost all the same."""
+    found = designed()
+    lost = replace(found, phases=(found.phases[0], replace(found.phases[1], loop=None)))
+    with pytest.raises(co.ProblemError, match="covariances of that of the phase 'two' are NaN or inf"):
+        co.evaluate(lost, truth={"q": 0.5})
 
 
 def test_a_nominal_that_leaves_the_domain_is_an_error_that_names_the_phase() -> None:

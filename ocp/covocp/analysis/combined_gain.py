@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.checks import check_kind
-from covocp.base.errors import ProblemError
+from covocp.base.errors import ProblemError, SolveError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, distinct
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text
@@ -71,6 +71,8 @@ class Worth:
     @property
     def verdict(self) -> str:
         """What the numbers mean, a sentence."""
+        if not np.isfinite([self.gain, self.first_order]).all():
+            return "not known: the figures are no numbers"
         if self.gain >= MUCH:
             return f"worth solving: at least {100 * self.gain:.1f} % of the expected cost can be saved"
         if any(block.role == "decision" for block in self.classical.blocks):
@@ -116,7 +118,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = No
 
     Raises:
         ProblemError: no expected cost, constrained gains; decisions, or no deterministic cost, and no `nominal`.
-        SolveError: the deterministic problem was not solved.
+        SolveError: the deterministic problem was not solved, or something is NaN or inf along the nominal.
     """
     check_kind(problem, Problem, "worth(problem), with minimize_expected()")
     expected = problem.declarations.expected
@@ -139,6 +141,7 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = No
         classical = solve(problem, intervals=intervals, nominal="deterministic", progress=False, **options)
     else:
         classical = evaluate(problem, nominal=nominal, intervals=intervals, **options)
+    _check_numbers(classical)
     size, extremal = abs(classical.cost), classical.extremal
     mesh = Options(grid=distinct(extremal.mesh.nodes), control=classical.mesh.control)  # type: ignore[arg-type]
     if is_roundoff(size, extremal.statement, mesh, extremal.parameters):
@@ -154,6 +157,24 @@ def worth(problem: Problem, *, nominal: Given = None, intervals: int | None = No
         elif best:
             break
     return Worth(classical=classical, first_order=first, gain=gain, direction=direction, step=best)
+
+
+def _check_numbers(classical: Solution) -> None:
+    """There must be a classical design: else nothing could be gained over it, whatever the truth is.
+
+    Raises:
+        SolveError: the run along the nominal is not finite.
+    """
+    if not classical.converged or not np.isfinite(classical.cost):
+        told = "" if classical.converged else f": {classical.message}"
+        raise SolveError(
+            f"worth() compares with the classical design of '{classical.name}', which has none along this nominal"
+            f"{told}.",
+            expected="a nominal along which states, covariances, conditions and the expected cost are finite",
+            received=f"an expected cost of {classical.cost:g}",
+            remedy="give another nominal, or bounds that keep the model in its domain",
+            solution=classical,
+        )
 
 
 def _statistical_gradient(extremal: Extremal) -> tuple[Array, Array, Array]:

@@ -51,6 +51,10 @@ class OutsideDomainError(ProblemError):
     """A start lies where the model gives no numbers; another one may not."""
 
 
+class MissingAttributeError(ProblemError, AttributeError):
+    """An attribute that something else has, which can be had from this; `hasattr` sees that it is not here."""
+
+
 class SolveError(CovocpError, RuntimeError):
     """A solver ended without a solution.
 

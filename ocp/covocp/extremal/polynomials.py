@@ -45,9 +45,9 @@ class Dense:
         k = np.clip(np.searchsorted(self.knots, s, side=side) - 1, 0, self.knots.size - 2)
         h = (self.knots[k + 1] - self.knots[k])[:, None]
         c = np.where(h > 0, (s[:, None] - self.knots[k][:, None]) / lengths(h), float(not before))
-        return np.asarray(
-            hermite(self.values[k], self.values[k + 1], h * self.first[k], h * self.last[k], c), dtype=float
-        )
+        with np.errstate(invalid="ignore", over="ignore"):  # of what left the range of numbers: its status says so
+            first, last = h * self.first[k], h * self.last[k]
+            return np.asarray(hermite(self.values[k], self.values[k + 1], first, last, c), dtype=float)
 
 
 def lengths(h: Array) -> Array:

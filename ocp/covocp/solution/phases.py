@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from covocp.base.arguments import checked, one_of
-from covocp.base.errors import ProblemError, has_key, spelling
+from covocp.base.errors import MissingAttributeError, ProblemError, has_key, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Residual where phases meet from which on the printout worries about it.
 LARGE_LINK = 1e-4
+# What the solution of a phase has, beside what its class shows.
+OF_A_PHASE = tuple(field.name for field in fields(Solution))
 
 
 def check_whole(solution: Solution, what: str) -> None:
@@ -100,6 +102,25 @@ class PhasesSolution:
 
     # What functions say that take one problem or solution.
     instead = "give one of its phases, solution[name]; what concerns all phases together is not available here"
+
+    if not TYPE_CHECKING:  # else every attribute would pass for known
+
+        def __getattr__(self, name: str) -> Any:
+            """Say where to find what the solution of a phase has; only asked for what is not here.
+
+            Raises:
+                AttributeError: always.
+            """
+            kind = type(self).__name__
+            if name.startswith("_") or name in dir(type(self)) or name not in (*dir(Solution), *OF_A_PHASE):
+                raise AttributeError(f"'{kind}' object has no attribute '{name}'", name=name, obj=self)
+            phases = [phase.name for phase in vars(self).get("phases", ())]
+            raise MissingAttributeError(
+                f"'{name}' is that of one phase, and this is the solution of several.",
+                expected="one of the phases " + ", ".join(repr(phase) for phase in phases),
+                received=f".{name} of a {kind}",
+                remedy=f"index a phase first: solution[{phases[0] if phases else 'name'!r}].{name}",
+            )
 
     @property
     def cost(self) -> float:

@@ -30,8 +30,12 @@ from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
+<<<<<<< HEAD
 from covocp.solving.missed import missed_by_loop, told
 from covocp.solving.not_finite import with_shortest_steps
+=======
+from covocp.solving.missed import check_has_loop, missed_by_loop, told
+>>>>>>> 6561b5d2ec895ce0af00ce5cf5b1433454d65b1b
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
@@ -90,7 +94,7 @@ def evaluate(
 
     Raises:
         ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
-        SolveError: a phase becomes NaN or inf along the nominal.
+        SolveError: a phase, or what it gives to the next one, becomes NaN or inf along the nominal.
     """
     if isinstance(problem, (Solution, PhasesSolution)):
         _check_kept(nominal, intervals, parameters, options)
@@ -259,7 +263,7 @@ def _known(options: dict[str, Any]) -> dict[str, Any]:
     }  # nothing is imposed or solved here
     for name in options:
         if name not in known:
-            raise no_option("evaluate()", name, options[name], known, ARGUMENTS)
+            raise no_option("evaluate()", name, options[name], {*known, *ARGUMENTS})
     return options
 
 
@@ -315,6 +319,7 @@ def _not_given(kind: str, name: str, received: str) -> ProblemError:
 def _under(solution: Solution, truth: Given) -> Solution:
     """The solution with the covariances and the cost of other statistics, and the gains of its design."""
     if solution.loop is None:
+        check_has_loop(solution)
         raise ProblemError(
             "truth= needs a closed loop.",
             expected="a solution of a problem with minimize_expected()",

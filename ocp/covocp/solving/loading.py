@@ -89,7 +89,7 @@ def _of_phases(solution: PhasesSolution, phases: Problem | Phases | None) -> Pha
         )
     chain = phases.chain()
     statements = list(chain.statements)
-    if len(statements) != len(solution):
+    if [st.name for st in statements] != [phase.name for phase in solution]:
         raise ProblemError(
             "The stored solution is of other phases.",
             expected=f"{len(solution)} phases: " + ", ".join(phase.name for phase in solution),

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.errors import ProblemError
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.path_limits import NOTED, Passed
 from covocp.extremal.spread_limits import passed_by_spread, spread_names
@@ -71,3 +72,24 @@ def _marked(solution: Solution, passed: Iterable[Passed]) -> Solution:
     more = f" and {len(first) - LISTED} more" if len(first) > LISTED else ""
     message = f"{solution.message}; conditions are NaN or inf: {shown}{more}"
     return replace(solution, converged=False, message=message)
+
+
+def check_has_loop(solution: Solution, what: str = "the solution") -> None:
+    """Where an expected cost was stated, a loop is missing because its numbers are none, not because of the cost.
+
+    Args:
+        solution: one without a loop.
+        what: is lacking it, a word before the name.
+
+    Raises:
+        ProblemError: its problem has an expected cost.
+    """
+    stated = solution.statement
+    if stated is None or stated.loop is None:
+        return
+    raise ProblemError(
+        f"truth= needs a closed loop, and the covariances of that of {what} '{solution.name}' are NaN or inf.",
+        expected="a solution whose states, covariances and cost are finite",
+        received=f"cost {solution.cost:g}, {solution.status}",
+        remedy="use another nominal, more intervals, or bounds that keep the model in its domain",
+    )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import ProblemError, SolveError, evaluating, kind_and_name
+from covocp.base.errors import OutsideDomainError, ProblemError, SolveError, evaluating, kind_and_name
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
@@ -36,7 +36,7 @@ from covocp.solving.evaluation import (
     run_along,
     statistics_along,
 )
-from covocp.solving.missed import missed_by_loop, with_missed
+from covocp.solving.missed import check_has_loop, missed_by_loop, with_missed
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.unused import mention_idle_in
@@ -69,7 +69,7 @@ def evaluate_phases(
 
     Raises:
         ProblemError: what does not fit.
-        SolveError: a phase becomes NaN or inf along the nominal.
+        SolveError: a phase, or what it gives to the next one, becomes NaN or inf along the nominal.
     """
     if isinstance(phases, PhasesSolution):
         solution = phases
@@ -134,6 +134,8 @@ def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], val
         except ProblemError as error:
             raise in_phase(st, error) from error
         filled.append(value)
+        if i < len(chain.links):  # first: what the jump makes of deviations is part of this phase's own cost
+            _check_passes(chain, i, outcomes[-1], value, values[i + 1])
         _check_finite(st.name, outcomes[-1])
     for i in range(len(chain.links) - 1, -1, -1):
         link = chain.links[i]
@@ -145,6 +147,22 @@ def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], val
             outcomes[i] = run_along(chain.statements[i], nominals[i], fine[i], filled[i], linked)
             _check_finite(chain.statements[i].name, outcomes[i])
     return Runs(outcomes=tuple(outcomes), parameters=tuple(filled), options=tuple(fine))
+
+
+def _check_passes(chain: Chain, i: int, outcome: Outcome, parameters: Array, later: Array) -> None:
+    """What a phase gives to the next one has a value.
+
+    Raises:
+        SolveError: it has none, though the phase ends with numbers.
+    """
+    link, t = chain.links[i], outcome.extremal.trajectory
+    given = link.values(t.x[-1], t.e[-1], t.duration, parameters, later)
+    try:
+        link.check_finite(chain.statements[i], (t.x[-1], t.e[-1], t.duration), given)
+    except OutsideDomainError as error:  # of a nominal, not of a start that a solver could leave
+        raise SolveError(
+            error.problem, expected=error.expected, received=error.received, remedy=error.remedy
+        ) from error
 
 
 def _check_finite(name: str, outcome: Outcome) -> None:
@@ -201,7 +219,10 @@ def _under(solution: PhasesSolution, truth: Given) -> PhasesSolution:
             received=f"'{solution.name}', read from a file",
             remedy="load(path, phases) with the phases that were solved",
         )
-    if any(phase.loop is None for phase in solution):
+    open_loops = [phase for phase in solution if phase.loop is None]
+    if open_loops:
+        for phase in open_loops:
+            check_has_loop(phase, "the phase")
         raise ProblemError(
             "truth= needs a closed loop.",
             expected="a solution of phases with minimize_expected()",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.errors import CovocpError
+from covocp.base.errors import CovocpError, OutsideDomainError
 from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -213,12 +213,15 @@ class ChainRuns:
         return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
 
     def _drawn(self, options: tuple[Options, ...], count: int, seed: int, k: int) -> Guesses | None:
-        """One random start; None where a phase of it lies outside the domain of the model."""
+        """One random start; None where a phase or a jump of it lies outside the domain of the model."""
 
         def made(i: int, st: Statement, own: Options, mesh: Mesh, value: Array) -> Guess | None:
             return drawn_guess(st, mesh, value, count, phase_seed(seed, i), k)
 
-        found = self._forward(options, self._values, made)
+        try:
+            found = self._forward(options, self._values, made)
+        except OutsideDomainError:
+            return None
         return None if found is None else found.guesses
 
     def _begun(self, options: tuple[Options, ...], attempt: int = 0) -> Begun:
@@ -255,6 +258,9 @@ class ChainRuns:
 
         Returns:
             None where some phase has no guess.
+
+        Raises:
+            OutsideDomainError: what passes from a phase to the next is NaN or inf along a guess.
         """
         found: list[Guess] = []
         filled: list[Array] = []
@@ -263,9 +269,11 @@ class ChainRuns:
         for i, (st, own, value) in enumerate(zip(self._chain.statements, options, values, strict=True)):
             if i:
                 link, t = self._chain.links[i - 1], found[-1].trajectory
-                ends, sound = nearest_covariances(self._chain.statements[i - 1], t.e[-1])
+                before = self._chain.statements[i - 1]
+                ends, sound = nearest_covariances(before, t.e[-1])
                 covariances = covariances and sound
                 states, matrices = link.values(t.x[-1], ends, t.duration, filled[-1], value)
+                link.check_finite(before, (t.x[-1], ends, t.duration), (states, matrices))
                 value, st = link.filled(value, matrices), started_at(st, link, states)
             own = graded(st, own, value)
             fine.append(own if own.refine is None else with_layers(st, own, value))

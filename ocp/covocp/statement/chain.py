@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from covocp.base.errors import OutsideDomainError
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
+
+# States that an error lists.
+LISTED = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +48,36 @@ class Link:
         """The states and the half-vectors that are given, as numbers."""
         states, matrices = self.function(x, e, duration, parameters, later)
         return np.asarray(states.full()).ravel(), np.asarray(matrices.full()).ravel()
+
+    def check_finite(self, before: Statement, ends: tuple[Array, Array, float], given: tuple[Array, Array]) -> None:
+        """What is given must be numbers, where the statement before ends with numbers: else it is not the link's fault.
+
+        Args:
+            before: the statement that ends there.
+            ends: its state, half-vectors and duration there.
+            given: what `values` makes of them, states and half-vectors.
+
+        Raises:
+            OutsideDomainError: names what passes and is NaN or inf, and the states that it is made of.
+        """
+        x, e, duration = ends
+        known = (np.isfinite(x).all(), np.isfinite(x).all() and np.isfinite(e).all())
+        names = (self.names[: len(self.states)], self.names[len(self.states) :])
+        for output, (values, sound) in enumerate(zip(given, known, strict=True)):
+            wrong = np.flatnonzero(~np.isfinite(values))
+            if not sound or not wrong.size:
+                continue
+            rows, columns = self.function.jac_sparsity(output, 0).get_triplet()
+            of = [column for row, column in zip(rows, columns, strict=True) if row == wrong[0]]
+            shown = ", ".join(f"{before.state_names[k]} = {x[k]:.4g}" for k in of[:LISTED])
+            more = f" and {len(of) - LISTED} more" if len(of) > LISTED else ""
+            raise OutsideDomainError(
+                f"The {names[output][wrong[0]]} is {values[wrong[0]]:g} for what '{before.name}' ends with.",
+                expected="a jump whose value and slopes are finite there",
+                received=f"{shown}{more}{', ' if shown else ''}duration {duration:.4g} s",
+                remedy="correct the expression of the jump, or give a guess, a nominal or bounds that keep what it is "
+                "made of in its domain",
+            )
 
     def filled(self, later: Array, matrices: Array) -> Array:
         """The parameters of the later statement with the half-vectors at its start."""
