@@ -30,12 +30,8 @@ from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
-<<<<<<< HEAD
-from covocp.solving.missed import missed_by_loop, told
-from covocp.solving.not_finite import with_shortest_steps
-=======
 from covocp.solving.missed import check_has_loop, missed_by_loop, told
->>>>>>> 6561b5d2ec895ce0af00ce5cf5b1433454d65b1b
+from covocp.solving.not_finite import with_shortest_steps
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
