@@ -19,6 +19,7 @@ import numpy as np
 import covocp as co
 from covocp.models import mars_entry, mass_chain, unknown_lag
 from covocp.passage import library
+from covocp.passage.sweep import passed_by
 from covocp.transcription import shooting
 from covocp.transcription.mesh import Options
 from covocp.transcription.scales import choose_scales
@@ -45,7 +46,7 @@ def evaluations(size: int, rounds: int) -> list[float]:
     mesh = resolve_mesh(statement, Options(intervals=50), statement.values)
     trajectory = own_start(statement, mesh, statement.values).trajectory
     result = []
-    for passage in ("compiled", "plain"):
+    for passage in (passed_by, None):
         nlp = transcribe(statement, mesh, choose_scales(statement, mesh, trajectory, statement.values), passage)
         w, p = nlp.pack(trajectory), np.append(statement.values, 1.0)
         value = ca.Function("f", [nlp.w, nlp.p], [nlp.f])
