@@ -55,3 +55,15 @@ def test_a_model_that_blows_up_is_told_with_its_time(speed):
     solution = co.evaluate(ocp, nominal={"u": 0.0})
     assert not solution.converged
     assert f"the model becomes NaN or inf along this nominal, at t = {1 / speed:.4g} s" in solution.message
+
+
+def test_what_would_take_too_long_to_know_is_not_blamed_on_the_model():
+    """A free oscillation that becomes faster all the time is finite for ever; it has 8e6 periods here."""
+    ocp = co.Problem(100.0, name="fast")
+    x, s, u = ocp.state("x", 2, initial=[1.0, 0.0]), ocp.state("s", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, 1e4 * s * ca.vertcat(x[1], -x[0]))
+    ocp.dynamics(s, 1 + u)
+    ocp.minimize(running=u**2 + x[0] ** 2)
+    solution = co.evaluate(ocp, nominal={"u": 0.0})
+    assert not solution.converged
+    assert "whether by the model or by steps that are too long is not known" in solution.message

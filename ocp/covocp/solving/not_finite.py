@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Buffered
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.mesh_error import mesh_error
@@ -17,6 +19,14 @@ from covocp.transcription.mesh import LARGEST_SUBSTEPS, Options
 ACCURACY, MOST_CALLS, INFINITE = 1e-6, 50_000, 1e100
 # Largest relative error of the cost of a run with the shortest steps that is taken for one.
 TAKEN = 1e-2
+TOO_LONG = (
+    "the integration steps are too long for the model, which stays finite along this nominal: take more intervals "
+    "(grid= where it is fast), substeps= or step='rodas'"
+)
+NOT_KNOWN = (
+    "the run becomes NaN or inf along this nominal; whether by the model or by steps that are too long is not known: "
+    "try more intervals, substeps= or step='rodas'"
+)
 
 
 class _EnoughError(Exception):
@@ -30,10 +40,9 @@ def ends_at(extremal: Extremal) -> float:
         extremal: a trajectory whose controls and initial state count, of a nominal that does not depend on matrices.
 
     Returns:
-        The duration where it is finite all the way.
+        The duration where it is finite all the way; NaN where the model would have to be called too often to know.
     """
-    import casadi as ca
-    from scipy.integrate import LSODA
+    from scipy.integrate import LSODA  # here: few runs are lost, and importing covocp must not take long
 
     st, t, p = extremal.statement, extremal.trajectory, extremal.parameters
     assert st.nominal is not None
@@ -63,7 +72,9 @@ def ends_at(extremal: Extremal) -> float:
                     if not np.isfinite(solver.y).all() or np.abs(solver.y).max(initial=0.0) > INFINITE:
                         return known
                     known = float(solver.t)
-            except (_EnoughError, ValueError):
+            except _EnoughError:
+                return float(np.nan)
+            except ValueError:  # scipy's, of numbers that are none
                 return known
             if solver.status == "failed":
                 return known
@@ -84,16 +95,17 @@ def with_shortest_steps(outcome: Outcome, options: Options, run: Callable[[Optio
     if st.coupled or st.nominal is None or np.isfinite(extremal.trajectory.x).all():
         return outcome
     end = ends_at(extremal)
+    if np.isnan(end):
+        return replace(outcome, message=NOT_KNOWN)
     if end < duration:
         return replace(outcome, message=f"{outcome.message}, at t = {end:.4g} s")
     least, best = TAKEN, outcome
     for step in ("rodas", "rk4") if options.substeps == "auto" else ():
-        found = run(replace(options, step=step, substeps=LARGEST_SUBSTEPS))
+        try:
+            found = run(replace(options, step=step, substeps=LARGEST_SUBSTEPS))
+        except ProblemError:  # steps of this kind are too long as they are at the start
+            continue
         error = mesh_error(found.extremal, found.cost_terms["running"]) if found.converged else np.inf
         if error < least:
             least, best = error, found
-    message = (
-        "the integration steps are too long for the model, which stays finite along this nominal: take more intervals "
-        "(grid= where it is fast), substeps= or step='rodas'"
-    )
-    return best if best is not outcome else replace(outcome, message=message)
+    return best if best is not outcome else replace(outcome, message=TOO_LONG)
