@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -16,6 +17,9 @@ Given: TypeAlias = Any
 
 # Functions of tables begin so: what reads an expression finds them by it, and their limits in the last argument.
 TABLE = "covocp_table_"
+
+# Sequences of steps that are kept.
+SEQUENCES = 64
 
 
 def symbol_of(key: Given) -> Any:
@@ -32,3 +36,13 @@ def slopes_by(value: Expr, symbols: Sequence[Expr]) -> list[Any]:
         return [ca.reshape(part, *symbol.shape) for part, symbol in zip(parts, symbols, strict=True)]
     slopes = ca.reverse([value], list(symbols), [[ca.MX(1)]])[0]  # what the value is made of stands there once
     return [ca.densify(slope) for slope in slopes]
+
+
+@lru_cache(maxsize=SEQUENCES)
+def sequence_of(function: ca.Function, count: int) -> ca.Function:
+    """A function of a value and others, so many times in turn; to make it takes longer than to run it.
+
+    Returns:
+        (first value, columns of each of the others) -> columns of what the function gives; the function itself for one.
+    """
+    return function if count == 1 else function.mapaccum(f"{function.name()}_sequence", count)

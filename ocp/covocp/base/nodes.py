@@ -48,8 +48,3 @@ class Node(ca.Callback):
     def has_eval_buffer(self) -> bool:
         """Of CasADi."""
         return True
-
-
-def address(view: memoryview | None) -> int | None:
-    """Where the numbers of a buffer lie; None: there are none."""
-    return None if view is None else int(np.frombuffer(view).ctypes.data)

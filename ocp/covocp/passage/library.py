@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
 import importlib.util
 import platform
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 7
+VERSION = 8
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -44,7 +45,8 @@ def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
         version = _version(library)
         newer = _TWICE if version == VERSION and library.passage_newer() else ()
         functions = {name: getattr(library, f"{name}_newer" if name in newer else name) for name in _SIGNATURES}
-    except (OSError, AttributeError) as error:
+        functions["addresses"] = importlib.import_module(MODULE).addresses
+    except (ImportError, OSError, AttributeError) as error:
         return None, f"it cannot be loaded: {error}"
     if version != VERSION:
         return None, f"it was built from version {version} of its source, not {VERSION}: install covocp again"

@@ -14,7 +14,7 @@
 #include "written.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 7; }
+EXPORT int passage_version(void) { return 8; }
 
 /* Whether this processor can take the functions whose names end in _newer. */
 EXPORT int passage_newer(void) {
@@ -85,9 +85,39 @@ EXPORT void exported_slopes(
     written_slopes(shape, chosen, h1, h2, passed, seed, result);
 }
 
+/* Where the numbers of some buffers lie, None for none: each lives as long as the call of CasADi that it belongs to. */
+static PyObject *addresses(PyObject *module, PyObject *buffers) {
+    (void)module;
+    const Py_ssize_t count = PyTuple_Size(buffers);
+    PyObject *places = count < 0 ? NULL : PyTuple_New(count);
+    for (Py_ssize_t i = 0; places && i < count; ++i) {
+        PyObject *one = PyTuple_GetItem(buffers, i), *place = Py_None;
+        Py_buffer view;
+        if (one != Py_None) {
+            if (PyObject_GetBuffer(one, &view, PyBUF_SIMPLE)) {
+                Py_DECREF(places);
+                return NULL;
+            }
+            place = PyLong_FromVoidPtr(view.buf);
+            PyBuffer_Release(&view);
+        } else
+            Py_INCREF(place);
+        if (!place || PyTuple_SetItem(places, i, place)) {
+            Py_DECREF(places);
+            return NULL;
+        }
+    }
+    return places;
+}
+
+static PyMethodDef methods[] = {
+    {"addresses", addresses, METH_O, "Where the numbers of a tuple of buffers lie; None stays None."},
+    {NULL, NULL, 0, NULL},
+};
+
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_passage", "The compiled passage of a covariance; called by its C names.", -1,
-    NULL, NULL, NULL, NULL, NULL,
+    methods, NULL, NULL, NULL, NULL,
 };
 
 PyMODINIT_FUNC PyInit__passage(void) { return PyModule_Create(&definition); }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import casadi as ca
@@ -13,7 +13,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
-from covocp.base.nodes import Buffers, Node, address
+from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
@@ -21,6 +21,8 @@ from covocp.passage.shape import Pattern, shape
 KEPT_BYTES = 50_000_000
 
 Given = Mapping[str, Any]
+# Where numbers lie, None where there are none.
+Addresses = tuple[int | None, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,15 @@ class Told:
     columns: Any
 
 
-def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None) -> Any:
+def passed_by(
+    first: Expr,
+    points: Sequence[Expr],
+    size: int,
+    kicks: Expr = None,
+    told: Told | None = None,
+    *,
+    lean: bool = False,
+) -> Any:
     """Half-vectors of a covariance after each step: Gauss steps, and readings between them.
 
     Args:
@@ -45,18 +55,22 @@ def passed_by(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None
         size: of the covariance.
         kicks: added to the half-vectors as they pass, a column for each step; None: nothing.
         told: what is read; None: nothing.
+        lean: for values alone, of which no steps are kept; so it is where numbers are given.
 
     Returns:
-        A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps),
-        but its sparsity is not seen: no Jacobians of it.
+        A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps;
+        not where it is lean), but its sparsity is not seen: no Jacobians of it.
     """
     pattern, given = entries(points, size)
     steps, height = ((), 0) if told is None else (told.steps, told.rows)
     numbers = isinstance(first, ca.DM) and all(isinstance(point, ca.DM) for point in points)
     count = given[0].shape[1] + len(steps)
-    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, numbers)
+    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, lean or numbers)
     others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
     return sweep(first, *given, *others)
+
+
+values_by = partial(passed_by, lean=True)
 
 
 def entries(points: Sequence[Expr], size: int) -> tuple[Pattern, list[Any]]:
@@ -161,14 +175,18 @@ class _Sweep(Node):
             raise MemoryError(f"no memory for the covariances of {self.count} steps")
         return int(memory)
 
-    def padded(self, addresses: list[int | None]) -> list[int | None]:
+    def padded(self, addresses: Addresses) -> Addresses:
         """With places for what is read and for the kicks, which the library has always."""
-        known = addresses if self.reads else [*addresses[:3], None, *addresses[3:]]
-        return known if self.kicked else [*known, None]
+        known = addresses if self.reads else (*addresses[:3], None, *addresses[3:])
+        return known if self.kicked else (*known, None)
 
-    def direction(self, addresses: list[int | None], k: int) -> list[int | None]:
+    def direction(self, addresses: Addresses, k: int) -> Addresses:
         """Where the part of direction k begins, of all arguments."""
-        return [None if at is None else at + k * length for at, length in zip(addresses, self._lengths, strict=True)]
+        if not k:
+            return addresses
+        return tuple(
+            None if at is None else at + k * length for at, length in zip(addresses, self._lengths, strict=True)
+        )
 
     def seed(self, address: int | None, k: int) -> int | None:
         """The same of results."""
@@ -176,12 +194,12 @@ class _Sweep(Node):
 
     def tangent(
         self,
-        given: list[int | None],
+        given: Addresses,
         seed: int | None,
-        moved: list[int | None],
+        moved: Addresses,
         moved_seed: int | None,
         after: int | None,
-        slopes: list[int | None],
+        slopes: Addresses,
     ) -> None:
         """One direction: tangents of the arguments -> of the result, of its slopes, where there is a place for them."""
         longest = max(self.half, self.entries * self.moves, self.telling * self.reads)
@@ -195,9 +213,10 @@ class _Sweep(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        given = self.padded([address(argument) for argument in arguments])
+        library = needed()
+        given = self.padded(library["addresses"](arguments))
         memory = _WORKSPACES.take(self)
-        needed()["passage_forward"](memory, *given, address(results[0]))
+        library["passage_forward"](memory, *given, *library["addresses"](results))
         _WORKSPACES.give(self, memory)
         return 0
 
@@ -238,13 +257,13 @@ class _Slopes(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([address(argument) for argument in arguments[:count]])
-        seeds, slopes = address(arguments[count + 1]), [address(result) for result in results]
+        sweep, count, library = self._sweep, self._sweep.get_n_in(), needed()
+        places, slopes = library["addresses"](arguments), library["addresses"](results)
+        given, seeds = sweep.padded(places[:count]), places[count + 1]
         memory = _WORKSPACES.take(sweep)
         for k in range(self._directions):
             own = sweep.padded(sweep.direction(slopes, k))
-            needed()["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
+            library["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
         _WORKSPACES.give(sweep, memory)
         return 0
 
@@ -272,12 +291,11 @@ class _Tangents(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([address(argument) for argument in arguments[:count]])
-        moved = [address(argument) for argument in arguments[count + 1 :]]
+        sweep, count, library = self._sweep, self._sweep.get_n_in(), needed()
+        places, (result,) = library["addresses"](arguments), library["addresses"](results)
+        given, moved = sweep.padded(places[:count]), places[count + 1 :]
         for k in range(self._tangents):
-            after = sweep.seed(address(results[0]), k)
-            sweep.tangent(given, None, sweep.direction(moved, k), None, after, [None] * 5)
+            sweep.tangent(given, None, sweep.direction(moved, k), None, sweep.seed(result, k), (None,) * 5)
         return 0
 
 
@@ -294,11 +312,10 @@ class _MovedSlopes(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        sweep, count = self._sweep, self._sweep.get_n_in()
-        given = sweep.padded([address(argument) for argument in arguments[:count]])
-        seeds = address(arguments[count + 1])
-        moved = [address(argument) for argument in arguments[2 * count + 2 : 3 * count + 2]]
-        moved_seeds, slopes = address(arguments[-1]), [address(result) for result in results]
+        sweep, count, library = self._sweep, self._sweep.get_n_in(), needed()
+        places, slopes = library["addresses"](arguments), library["addresses"](results)
+        given, seeds = sweep.padded(places[:count]), places[count + 1]
+        moved, moved_seeds = places[2 * count + 2 : 3 * count + 2], places[-1]
         for t in range(self._tangents):
             along = sweep.direction(moved, t)
             for k in range(self._directions):

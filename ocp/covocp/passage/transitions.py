@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.nodes import Buffers, Node, address
+from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import needed
 
 STAGES = 4
@@ -88,8 +88,7 @@ class _Passed(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        out = address(results[0])
-        if out is None:
+        if results[0] is None:
             return 0
-        given = self.filled(arguments)
-        return int(self._run(*self._arguments, *map(address, given), out))
+        places = needed()["addresses"]((*self.filled(arguments), *results))
+        return int(self._run(*self._arguments, *places))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
-from covocp.base.nodes import Buffers, Node, address
+from covocp.base.nodes import Buffers, Node
 from covocp.base.short_repr import short_repr
 from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
@@ -154,10 +154,11 @@ class _Evaluated(Node):
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
-        given, result = self.filled(arguments), address(results[0])
+        if results[0] is None:
+            return 0
         chosen = np.empty(2 * int(self._shape[0]), dtype=np.intc)
-        if result is not None:
-            self._run(self._shape.ctypes.data, chosen.ctypes.data, *map(address, given), result)
+        places = needed()["addresses"]((*self.filled(arguments), *results))
+        self._run(self._shape.ctypes.data, chosen.ctypes.data, *places)
         return 0
 
 

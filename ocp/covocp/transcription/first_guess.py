@@ -14,7 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, pack, unpack
 from covocp.base.quadrature import interpolated
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import values_by
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.shooting import interval_columns, matrices_along
@@ -299,12 +299,12 @@ def simulate_matrices(
 def matrices_function(statement: Statement, mesh: Mesh) -> ca.Function:
     """(states at the nodes, controls, T, parameters) -> half-vectors at the nodes, running cost of the intervals.
 
-    Each interval starts at the given node of the nominal; only the matrices run in sequence.
+    Without derivatives. Each interval starts at the given node of the nominal; only the matrices run in sequence.
     """
     x = ca.MX.sym("x", statement.nx, mesh.intervals + 1)
     u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
     duration, p = ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     common = interval_columns(mesh, u, duration, p)
     _, states, cost = nominal_interval(statement, mesh.substeps, mesh.step).map(mesh.intervals)(x[:, :-1], *common)
-    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, passage=passed_by)
+    e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, passage=values_by)
     return ca.Function("matrices", [x, u, duration, p], [e, cost + matrix_cost])

@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
+from covocp.base.expressions import sequence_of
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import values_by
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import NUMERIC_RUN
-from covocp.transcription.shooting import interval_columns, shoot
+from covocp.transcription.shooting import compiled_steps, interval_columns, shoot
+from covocp.transcription.steering import nominal_states
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.trajectory import Trajectory
+
+# Meshes whose functions are kept.
+MESHES = 4
+# Runs before these are made.
+FEW = 2
+# What starts the segments, and what is wanted of them, by the names of `shoot`.
+_STARTS = ("x", "e", "u", "duration", "parameters")
+_GIVEN = ("gap_x", "gap_e", "x", "e", "cost")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,42 +66,81 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
         parameters: of the statement.
         parts: parts of each interval.
     """
-    starts, (divided, u) = list(mesh.starts), _divided(mesh, trajectory.u, parts)
-    start = SimpleNamespace(
-        x=ca.DM(trajectory.x[starts].T),
-        e=ca.DM(trajectory.e[starts].T),
-        u=ca.DM(u.T),
-        duration=ca.DM(trajectory.duration),
-        parameters=ca.DM(parameters),
-    )
-    values = shoot(statement, divided, start, passage=passed_by)
-    jumps = np.hstack([np.asarray(ca.DM(values[name]).full()).T for name in ("gap_x", "gap_e")])
-    states, matrices = (np.asarray(ca.DM(values[name][:, ::parts]).full()).T for name in ("x", "e"))
-    costs = np.asarray(ca.DM(values["cost"]).full()).reshape(mesh.intervals, parts).sum(axis=1)
+    starts, runs = list(mesh.starts), _runs(statement, mesh, parts)
+    t, u = trajectory, _divided(mesh, trajectory.u, parts)
+    values = runs.segments(t.x[starts].T, t.e[starts].T, u.T, np.array([[t.duration]]), parameters[:, None])
+    gap_x, gap_e, x, e, cost = values
+    costs = cost.reshape(mesh.intervals, parts).sum(axis=1)
     return Refined(
-        jumps=jumps, running=float(ca.DM(ca.sum2(values["cost"]))), costs=costs, states=states, matrices=matrices
+        jumps=np.hstack([gap_x.T, gap_e.T]),
+        running=float(cost.sum()),
+        costs=costs,
+        states=x[:, ::parts].T,
+        matrices=e[:, ::parts].T,
     )
 
 
 def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Array:
     """The state at the end, (nx,), of one run from the start along the same controls with shorter steps."""
-    divided, u = _divided(mesh, trajectory.u, parts)
-    common = interval_columns(divided, ca.DM(u.T), trajectory.duration, ca.DM(parameters))
-    advance = nominal_interval(statement, mesh.substeps, mesh.step)
-    value: Any = ca.DM(trajectory.x[0])
-    count = divided.intervals
-    lengths = [min(NUMERIC_RUN, count - first) for first in range(0, count, NUMERIC_RUN)]
-    runs = {length: advance.mapaccum("run", length) for length in set(lengths)}
-    pieces = [ca.horzsplit(ca.DM(column), NUMERIC_RUN) for column in common]
-    for length, *columns in zip(lengths, *pieces, strict=True):
-        value = runs[length](value, *columns)[0][:, -1]
-    return np.asarray(ca.DM(value).full()).ravel()
+    runs, u = _runs(statement, mesh, parts), _divided(mesh, trajectory.u, parts)
+    return runs.end(trajectory.x[0], u, trajectory.duration, parameters)
 
 
-def _divided(mesh: Mesh, u: Array, parts: int) -> tuple[Mesh, Array]:
-    """The mesh with each interval in equal parts, and the same controls on it."""
-    c, divided = np.arange(parts) / parts, mesh.divided(parts)
+class _Runs:
+    """Runs on one mesh, each of its intervals in some parts; those that come often by functions that are kept.
+
+    To make these takes as long as some runs do without.
+    """
+
+    def __init__(self, statement: Statement, mesh: Mesh, parts: int) -> None:
+        self._statement, self._mesh = statement, mesh.divided(parts)
+        self._made: Matrices | None = None
+        self._asked: Counter[str] = Counter()
+
+    def segments(self, *start: Array) -> list[Array]:
+        """Run all segments: `_GIVEN` from `_STARTS`."""
+        st, mesh = self._statement, self._mesh
+        kept = not st.matrices or compiled_steps(mesh)  # a long sequence of CasADi's steps takes memory for all of it
+        if not kept or not self._often("segments"):
+            return [np.asarray(ca.DM(v).full()) for v in self._shot([ca.DM(array) for array in start])]
+        if self._made is None:
+            symbols = [ca.MX.sym(name, *array.shape) for name, array in zip(_STARTS, start, strict=True)]
+            self._made = Matrices(ca.Function("runs", symbols, self._shot(symbols)))
+        return self._made.evaluated(*start)
+
+    def _shot(self, start: list[Any]) -> list[Any]:
+        variables = SimpleNamespace(**dict(zip(_STARTS, start, strict=True)))
+        values = shoot(self._statement, self._mesh, variables, passage=values_by)
+        return [values[name] for name in _GIVEN]
+
+    def _often(self, name: str) -> bool:
+        self._asked[name] += 1
+        return self._asked[name] > FEW
+
+    def end(self, x: Array, u: Array, duration: float, parameters: Array) -> Array:
+        """The state after all intervals, run from a state."""
+        st, mesh, count = self._statement, self._mesh, self._mesh.intervals
+        if self._often("end"):
+            return np.asarray(nominal_states(st, mesh, x, u, duration, parameters)[-1])
+        common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
+        advance = nominal_interval(st, mesh.substeps, mesh.step)
+        value: Any = ca.DM(x)
+        lengths = [min(NUMERIC_RUN, count - first) for first in range(0, count, NUMERIC_RUN)]
+        pieces = [ca.horzsplit(ca.DM(column), NUMERIC_RUN) for column in common]
+        for length, *columns in zip(lengths, *pieces, strict=True):
+            value = sequence_of(advance, length)(value, *columns)[0][:, -1]
+        return np.asarray(ca.DM(value).full()).ravel()
+
+
+@lru_cache(maxsize=MESHES)
+def _runs(statement: Statement, mesh: Mesh, parts: int) -> _Runs:
+    return _Runs(statement, mesh, parts)
+
+
+def _divided(mesh: Mesh, u: Array, parts: int) -> Array:
+    """The same controls on the mesh with each interval in equal parts."""
+    c = np.arange(parts) / parts
     if mesh.control == "constant":
-        return divided, np.repeat(u, parts, axis=0)
+        return np.repeat(u, parts, axis=0)
     between = u[:-1, None, :] + c[None, :, None] * np.diff(u, axis=0)[:, None, :]
-    return divided, np.vstack([between.reshape(mesh.intervals * parts, u.shape[1]), u[-1:]])
+    return np.vstack([between.reshape(mesh.intervals * parts, u.shape[1]), u[-1:]])

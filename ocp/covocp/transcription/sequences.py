@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, sequence_of
 from covocp.base.matrices import half_length
 from covocp.passage.sweep import Told
 from covocp.statement.statement import Statement
@@ -190,13 +190,11 @@ def _columns(argument: Any, begin: int, length: int, count: int) -> Any:
 def _accumulated(step: ca.Function, first: Expr, arguments: list[Any], count: int) -> list[Any]:
     """What a step function gives in sequence; numbers in short runs, because a long one takes memory for all of it."""
     if not isinstance(arguments[0], ca.DM):
-        run = step if count == 1 else step.mapaccum("propagate", count)
-        return run.call([first, *arguments])
+        return sequence_of(step, count).call([first, *arguments])
     lengths = [min(NUMERIC_RUN, count - begin) for begin in range(0, count, NUMERIC_RUN)]
-    runs = {length: step if length == 1 else step.mapaccum("propagate", length) for length in set(lengths)}
     parts = [ca.horzsplit(argument, NUMERIC_RUN * (argument.shape[1] // count)) for argument in arguments]
     value, passed = first, []
     for length, *columns in zip(lengths, *parts, strict=True):
-        passed.append(runs[length].call([value, *columns]))
+        passed.append(sequence_of(step, length).call([value, *columns]))
         value = passed[-1][0][:, -1]
     return [ca.horzcat(*values) for values in zip(*passed, strict=True)]

@@ -13,10 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, sequence_of
 from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.passage.library import functions
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import passed_by, values_by
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
@@ -122,7 +122,7 @@ def _segments(mesh: Mesh, advance: ca.Function, start: Expr, intervals: Interval
     first_segment = first_interval = 0
     for length in sorted(set(mesh.segments), reverse=True):
         count = mesh.segments.count(length)
-        function = advance if length == 1 else advance.mapaccum("segment", length)
+        function = sequence_of(advance, length)
         function = function.map(count) if count > 1 else function
         span = slice(first_interval, first_interval + count * length)
         outputs = function(start[:, first_segment : first_segment + count], *(column[:, span] for column in intervals))
@@ -195,7 +195,7 @@ def passages(
         ends, halves, cost = _runge_kutta_along(statement, mesh, e0, starts, intervals)
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     columns = _substeps(statement, mesh, x, fine, intervals)
-    own = None if passage is passed_by and not compiled_steps(mesh) else passage
+    own = None if passage in (passed_by, values_by) and not compiled_steps(mesh) else passage
     sequence = partial(in_sequence, statement, mesh, own)
     first = e0[statement.entries(statement.ahead)]
     groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
@@ -328,11 +328,11 @@ def single_shooting(statement: Statement, mesh: Mesh, u: Expr, start: tuple[Any,
     intervals = interval_columns(mesh, u, duration, p)
     if statement.coupled:
         interval = full_interval(statement, mesh.substeps, mesh.step)
-        ends, _, cost = interval.mapaccum("run", mesh.intervals)(ca.vertcat(x0, e0), *intervals)
+        ends, _, cost = sequence_of(interval, mesh.intervals)(ca.vertcat(x0, e0), *intervals)
         nodes = ca.horzcat(ca.vertcat(x0, e0), ends)
         return nodes[: statement.nx, :], nodes[statement.nx :, :], cost
     nominal = nominal_interval(statement, mesh.substeps, mesh.step)
-    ends, fine, cost = nominal.mapaccum("run", mesh.intervals)(x0, *intervals)
+    ends, fine, cost = sequence_of(nominal, mesh.intervals)(x0, *intervals)
     x = ca.horzcat(x0, ends)
     if not statement.matrices:
         return x, ca.MX(0, mesh.intervals + 1), cost

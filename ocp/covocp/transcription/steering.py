@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import Matrices
+from covocp.base.expressions import sequence_of
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
@@ -98,7 +99,7 @@ def _along(statement: Statement, mesh: Mesh) -> ca.Function:
     """(start, controls, T, p) -> states at the ends of the intervals, integral of the running cost."""
     x0, duration, p = ca.MX.sym("x0", statement.nx), ca.MX.sym("T"), ca.MX.sym("p", statement.np)
     u = ca.MX.sym("u", statement.nu, mesh.control_nodes)
-    run = nominal_interval(statement, mesh.substeps, mesh.step).mapaccum("simulate", mesh.intervals)
+    run = sequence_of(nominal_interval(statement, mesh.substeps, mesh.step), mesh.intervals)
     ends, _, cost = run(x0, *interval_columns(mesh, u, duration, p))
     return ca.Function("along", [x0, u, duration, p], [ends, ca.sum2(cost)])
 
