@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, half_indices
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
@@ -38,8 +38,9 @@ LOOKED_AGAIN = 3.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
-# Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
-LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
+# Range of what hardly varies, in its magnitude, and of a covariance between two that are hardly correlated, in their
+# deviations; magnitude of what is zero but for roundoff, in the largest one.
+LEAST_RANGE, LEAST_CORRELATION, ROUNDOFF = 1e-3, 0.03, 1e-12
 
 
 def mesh_error(extremal: Extremal, running: float, within: Within | None = None) -> float:
@@ -103,13 +104,14 @@ def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
     return refined_run(statement, mesh, trajectory, np.array(parameters))
 
 
-def node_error(extremal: Extremal) -> float:
+def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
     """Largest change of a state or of an entry of a matrix at a node by halving the steps, relative to its range.
 
     What is a variable where a segment starts changes inside the segments and by the jumps at their ends, summed up.
 
     Args:
         extremal: the trajectory.
+        gaps: at the ends of the segments with its own steps, (segments, variables there): those of a guess.
 
     Returns:
         The largest of them; nan where the run is not finite.
@@ -117,10 +119,15 @@ def node_error(extremal: Extremal) -> float:
     t, finer = extremal.trajectory, _halved(extremal)
     scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
-    least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
+    shares = np.full(magnitude.size, LEAST_RANGE)
+    for block in extremal.statement.matrices:
+        rows, columns = half_indices(block.size)
+        own = shares[scales.x.size :][block.span]
+        own[rows != columns] = LEAST_CORRELATION
+    least = np.maximum(shares * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
     size = np.maximum(np.ptp(values, axis=0), least)
     with np.errstate(over="ignore", invalid="ignore"):
-        moved, inside = np.cumsum(finer.jumps, axis=0), np.hstack([finer.states, finer.matrices]) - values
+        moved, inside = np.cumsum(finer.jumps - gaps, axis=0), np.hstack([finer.states, finer.matrices]) - values
         total = np.abs(inside).max(axis=0)
         total[: moved.shape[1]] += np.abs(moved).max(axis=0)
         return float((total / size).max(initial=0.0))
@@ -153,10 +160,11 @@ def _divided(
     running: float | None = None,
     most: float = MOST_TIMES,
     margin: float = MARGIN,
+    gaps: Array | float = 0.0,
 ) -> Options | None:
     """`finer_steps`, of at most so many times as many, for so many times less change."""
     statement, mesh = extremal.statement, extremal.mesh
-    times = node_error(extremal) / allowed
+    times = node_error(extremal, gaps) / allowed
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
     if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
@@ -194,7 +202,7 @@ def steps_along(
         trajectory = replace(guess, x=own.states, e=own.matrices)
         without = Multipliers.zero(statement, mesh)
         along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=without)
-        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin)
+        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=own.jumps)
         if finer is None:
             return found
         found, times = finer, int(finer.substeps) / mesh.substeps
