@@ -16,7 +16,7 @@ from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpac
 from covocp.base.quadrature import gauss_matrix, riccati_step
 from covocp.models import mars_entry, mass_chain
 from covocp.passage import library
-from covocp.passage.sweep import passed_by
+from covocp.passage.sweep import depends, passed_by, values_by
 from covocp.transcription import shooting
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -39,19 +39,19 @@ def systems(
     return prior * (A @ A.T + np.eye(n)), *(np.hstack([one() for _ in range(STEPS)]) for _ in range(2))
 
 
-def node(n: int, *, kicked: bool = False) -> tuple[list[ca.MX], ca.MX]:
-    """Arguments and result of the compiled passage."""
+def node(n: int, *, kicked: bool = False, every: int = 1) -> tuple[list[ca.MX], ca.MX]:
+    """Arguments and result of the compiled passage, which gives and takes something every so many steps."""
     arguments = [
         ca.MX.sym("e", half_length(n)),
         ca.MX.sym("h1", 2 * n, 2 * n * STEPS),
         ca.MX.sym("h2", 2 * n, 2 * n * STEPS),
     ]
     if kicked:
-        arguments.append(ca.MX.sym("kicks", half_length(n), STEPS))
-    return arguments, passed_by(arguments[0], arguments[1:3], n, *arguments[3:])
+        arguments.append(ca.MX.sym("kicks", half_length(n), STEPS // every))
+    return arguments, passed_by(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
 
 
-def by_casadi(n: int, arguments: list[ca.MX]) -> ca.MX:
+def by_casadi(n: int, arguments: list[ca.MX], every: int = 1) -> ca.MX:
     """The same by CasADi's operations."""
     e, h1, h2 = ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", 2 * n, 2 * n), ca.MX.sym("h2", 2 * n, 2 * n)
     D = gauss_matrix((h1, h2), n, LINEAR_SOLVER)
@@ -60,7 +60,10 @@ def by_casadi(n: int, arguments: list[ca.MX]) -> ca.MX:
     if len(arguments) > 3:
         inputs.append(ca.MX.sym("kick", half_length(n)))
         after = after + inputs[-1]
-    return ca.Function("step", inputs, [after]).mapaccum("steps", STEPS)(*arguments)
+        kicks = ca.MX(half_length(n), STEPS)
+        kicks[:, every - 1 :: every] = arguments[3]
+        arguments = [*arguments[:3], kicks]
+    return ca.Function("step", inputs, [after]).mapaccum("steps", STEPS)(*arguments)[:, every - 1 :: every]
 
 
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
@@ -105,21 +108,22 @@ def test_a_long_passage_is_the_differential_equation():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.2)
 
 
+@pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize("asked", ["last entry", "all"])
 @pytest.mark.parametrize("n", SIZES)
-def test_values_and_slopes_are_those_of_casadi(n, asked):
+def test_values_and_slopes_are_those_of_casadi(n, asked, every):
     """One entry at the end has slopes of low rank; with kicks and seeds everywhere they are full."""
     rng = np.random.default_rng(n)
     E, h1, h2 = systems(n, n)
-    arguments, passed = node(n, kicked=True)
-    weights = np.zeros((half_length(n), STEPS))
+    arguments, passed = node(n, kicked=True, every=every)
+    weights = np.zeros((half_length(n), STEPS // every))
     weights[-1, -1] = 1.0
     if asked == "all":
         weights = rng.normal(size=weights.shape)
     given = (pack(E), h1, h2, 1e-3 * rng.normal(size=weights.shape))
     found, known = (
         ca.Function("f", arguments, [result, *(ca.gradient(ca.dot(weights, result), v) for v in arguments)])(*given)
-        for result in (passed, by_casadi(n, arguments))
+        for result in (passed, by_casadi(n, arguments, every))
     )
     for own, other in zip(found, known, strict=True):
         assert np.abs(np.asarray(own - other)).max() <= 1e-11 * np.abs(np.asarray(other)).max()
@@ -149,19 +153,20 @@ def test_slopes_against_finite_differences(n):
         assert slope == pytest.approx(difference, rel=1e-7, abs=1e-7 * abs(float(f(*given)[0])))
 
 
+@pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize("kicked", [False, True])
 @pytest.mark.parametrize("n", [1, 2, 5, 12])
-def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked):
+def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked, every):
     """Along directions of the form of H, Q and W symmetric."""
     rng = np.random.default_rng(n)
     E, h1, h2 = systems(n, n)
-    shape = (half_length(n), STEPS)
+    shape = (half_length(n), STEPS // every)
     weights, moved = rng.normal(size=shape), systems(n, n + 100)[1:]
     directions = [rng.normal(size=shape[0]), *moved, rng.normal(size=shape)][: 4 if kicked else 3]
     given = [pack(E), h1, h2, 1e-3 * rng.normal(size=shape)][: len(directions)]
-    arguments, passed = node(n, kicked=kicked)
+    arguments, passed = node(n, kicked=kicked, every=every)
     found = []
-    for result in (passed, by_casadi(n, arguments)):
+    for result in (passed, by_casadi(n, arguments, every)):
         value = ca.dot(weights, result) + ca.sumsqr(result) / 2
         slopes = ca.Function("slopes", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
         t = ca.MX.sym("t")
@@ -170,6 +175,25 @@ def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked):
         found.append([np.asarray(v.full()) for v in tangent(0, *given)])
     for own, other in zip(*found, strict=True):
         assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
+
+
+@pytest.mark.parametrize("kicked", [False, True])
+@pytest.mark.parametrize("every", [1, 2, STEPS])
+def test_values_alone_are_those_that_have_slopes(kicked, every):
+    """No steps are kept of them; their sparsity is that of what stands for them."""
+    n = 4
+    E, h1, h2 = systems(n, 4)
+    arguments, passed = node(n, kicked=kicked, every=every)
+    alone = values_by(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
+    seen = depends(arguments[0], arguments[1:3], n, *arguments[3:], every=every)
+    assert seen.shape == alone.shape == passed.shape == (half_length(n), STEPS // every)
+    given = [pack(E), h1, h2, 1e-3 * np.ones(passed.shape)][: len(arguments)]
+    one, other = ca.Function("f", arguments, [passed, alone])(*given)
+    np.testing.assert_array_equal(one.full(), other.full())
+    last = ca.which_depends(seen[:, 0], ca.veccat(*arguments), 1, True)
+    assert all(last)
+    first = ca.Function("first", arguments, [seen[0, 0]]).jac_sparsity(0, 1).get_col()
+    assert max(first) < 4 * n * n * every  # what comes after it changes nothing
 
 
 def test_tangents_of_several_entries_at_once():

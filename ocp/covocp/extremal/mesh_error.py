@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from covocp.base.matrices import Array, half_indices
+from covocp.base.matrices import Array
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
@@ -38,9 +38,8 @@ LOOKED_AGAIN = 3.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
-# Range of what hardly varies, in its magnitude, and of a covariance between two that are hardly correlated, in their
-# deviations; magnitude of what is zero but for roundoff, in the largest one.
-LEAST_RANGE, LEAST_CORRELATION, ROUNDOFF = 1e-3, 0.03, 1e-12
+# Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
+LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
 
 def mesh_error(extremal: Extremal, running: float, within: Within | None = None) -> float:
@@ -119,12 +118,7 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
     t, finer = extremal.trajectory, _halved(extremal)
     scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
-    shares = np.full(magnitude.size, LEAST_RANGE)
-    for block in extremal.statement.matrices:
-        rows, columns = half_indices(block.size)
-        own = shares[scales.x.size :][block.span]
-        own[rows != columns] = LEAST_CORRELATION
-    least = np.maximum(shares * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
+    least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
     size = np.maximum(np.ptp(values, axis=0), least)
     with np.errstate(over="ignore", invalid="ignore"):
         moved, inside = np.cumsum(finer.jumps - gaps, axis=0), np.hstack([finer.states, finer.matrices]) - values

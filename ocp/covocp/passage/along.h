@@ -131,7 +131,7 @@ static void tangents(
     known &= same(&last, d1, nnz * p->moves);
     known &= same(&last, d2, nnz * p->moves);
     known &= same(&last, d_told, telling(p) * p->reads);
-    known &= same(&last, d_kicks, half * p->count);
+    known &= same(&last, d_kicks, half * p->ends);
     if (known) return;
     kept->along = d_kicks ? 2 : 1;
     double *E = p->work + 14 * n * n, *next = p->work + 15 * n * n, *spare = p->work + 6 * n * n, *dE = p->work + 16 * n * n;
@@ -139,24 +139,28 @@ static void tangents(
     spread(d_first, n, dE);
     for (int k = 0; k < p->count; ++k) {
         const double *after = p->after + k * half;
+        const int wanted = at_end(p, k);
+        const size_t column = k / p->every * half;
         spread(after, n, next);
-        if (kept->known == 2)
+        if (kept->known == 2 && wanted)
             for (int j = 0, t = 0; j < n; ++j)
-                for (int i = j; i < n; ++i, ++t) next[i * n + j] = next[j * n + i] = after[t] - kept->kicks[k * half + t];
+                for (int i = j; i < n; ++i, ++t)
+                    next[i * n + j] = next[j * n + i] = after[t] - kept->kicks[column + t];
         const int place = p->place[k];
         if (place < 0)
             tangent_reading(kept, n, -1 - place, E, d_told + (-1 - place) * telling(p), dE);
         else
             tangent_step(kept, n, place, E, next, d1 + place * nnz, d2 + place * nnz, dE, spare);
         spread(after, n, E);
+        if (!wanted) continue;
         if (d_kicks)
             for (int j = 0, t = 0; j < n; ++j)
                 for (int i = j; i < n; ++i, ++t) {
-                    dE[i * n + j] += d_kicks[k * half + t];
-                    if (i != j) dE[j * n + i] += d_kicks[k * half + t];
+                    dE[i * n + j] += d_kicks[column + t];
+                    if (i != j) dE[j * n + i] += d_kicks[column + t];
                 }
         for (int j = 0, t = 0; j < n; ++j)
-            for (int i = j; i < n; ++i, ++t) d_after[k * half + t] = dE[i * n + j];
+            for (int i = j; i < n; ++i, ++t) d_after[column + t] = dE[i * n + j];
     }
 }
 
@@ -205,10 +209,13 @@ static void back_tangents(
     memset(P, 0, sizeof(double) * 2 * n * n);
     for (int at = p->count - 1; at >= 0; --at) {
         const int k = p->place[at];
-        add_seed(n, seed + at * half, P);
-        if (d_seed) add_seed(n, d_seed + at * half, dP);
+        const size_t column = at / p->every * half;
         Slopes s = {0, 1, dP, NULL, NULL};
-        if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + at * half);
+        if (at_end(p, at)) {
+            add_seed(n, seed + column, P);
+            if (d_seed) add_seed(n, d_seed + column, dP);
+            if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + column);
+        }
         if (k < 0) {
             back_reading_tangent(kept, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
             continue;

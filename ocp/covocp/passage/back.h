@@ -191,8 +191,10 @@ static void back(
     Slopes s = {0, 0, p->work, p->work + n * n, p->work + 2 * n * n};
     for (int at = p->count - 1; at >= 0; --at) {
         const int k = p->place[at];
-        join(&s, n, p->chosen, seed + at * half);
-        if (by_kicks) pack_slopes(&s, n, spare, by_kicks + at * half);
+        if (at_end(p, at)) {
+            join(&s, n, p->chosen, seed + at / p->every * half);
+            if (by_kicks) pack_slopes(&s, n, spare, by_kicks + at / p->every * half);
+        }
         if (k < 0) {
             double *own = by_told ? by_told + (-1 - k) * tells : NULL;
             if (s.any)

@@ -8,14 +8,16 @@
 #include "along.h"
 #include "transitions.h"
 
-/* Half-vectors after each step, from the first one; kicks are added to them as they pass, NULL: none. */
+/* Half-vectors that are wanted, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT void NAME(passage_forward)(
     Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
     double *after
 ) {
     const Passage *p = &k->p;
     run(k, p->n, first, h1, h2, told, kicks);
-    if (after) memcpy(after, p->after, sizeof(double) * ((size_t)p->n * (p->n + 1) / 2) * p->count);
+    const size_t half = (size_t)p->n * (p->n + 1) / 2, apart = p->lean ? 1 : p->every;
+    for (size_t k = 0; after && k < (size_t)p->ends; ++k)
+        memcpy(after + k * half, p->after + ((k + 1) * apart - 1) * half, sizeof(double) * half);
 }
 
 /* Slopes of seed . after by the arguments; those that are NULL are left out. */
@@ -40,7 +42,7 @@ EXPORT int NAME(passage_tangent)(
 ) {
     const Passage *p = &k->p;
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
-    const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->count, d = sizeof(double);
+    const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->ends, d = sizeof(double);
     if (!k->moved) k->moved = room((size_t)p->moves * 5 * square, d);
     if (!k->turned) k->turned = room((size_t)p->reads * turned, d);
     if (!k->direction) k->direction = calloc(numbers(p), d); /* compared before it is first written */

@@ -155,6 +155,9 @@ static void reading(Passage *p, int n, int j, double *RESTRICT E) {
     memcpy(after, E, sizeof(double) * square);
 }
 
+/* Whether what is after step k is wanted. */
+INLINE int at_end(const Passage *p, int k) { return (k + 1) % p->every == 0; }
+
 /* The passage from the first half-vector on, at p->h1, p->h2, p->told; kicks are added to what passes, NULL: nothing. */
 static void passes(Passage *p, int n, const double *first, const double *kicks) {
     const size_t half = (size_t)n * (n + 1) / 2;
@@ -166,11 +169,13 @@ static void passes(Passage *p, int n, const double *first, const double *kicks) 
             reading(p, n, -1 - place, E);
         else
             step(p, n, place, E);
-        double *after = p->after + k * half;
+        const int wanted = at_end(p, k);
+        if (p->lean && !wanted) continue;
+        double *after = p->after + (p->lean ? k / p->every : k) * half;
         for (int j = 0, t = 0; j < n; ++j)
             for (int i = j; i < n; ++i, ++t) after[t] = E[i * n + j];
-        if (!kicks) continue;
-        for (size_t t = 0; t < half; ++t) after[t] += kicks[k * half + t];
+        if (!kicks || !wanted) continue;
+        for (size_t t = 0; t < half; ++t) after[t] += kicks[k / p->every * half + t];
         spread(after, n, E);
     }
 }

@@ -16,7 +16,7 @@ static void *room(size_t count, size_t size) { return count > SIZE_MAX / size ? 
 /* Numbers of a point, with kicks. */
 static size_t numbers(const Passage *p) {
     const size_t half = (size_t)p->n * (p->n + 1) / 2;
-    return half + 2 * (size_t)p->nnz * p->moves + telling(p) * p->reads + half * p->count;
+    return half + 2 * (size_t)p->nnz * p->moves + telling(p) * p->reads + half * p->ends;
 }
 
 /* Whether the passage at this point is known. */
@@ -27,7 +27,7 @@ static int here(
     const size_t half = sizeof(double) * p->n * (p->n + 1) / 2, all = sizeof(double) * (size_t)p->nnz * p->moves;
     if (!k->known || memcmp(k->first, first, half) || memcmp(k->h1, h1, all) || memcmp(k->h2, h2, all)) return 0;
     if (p->reads && memcmp(k->told, told, sizeof(double) * telling(p) * p->reads)) return 0;
-    return kicks ? !memcmp(k->kicks, kicks, half * p->count) : k->known == 1;
+    return kicks ? !memcmp(k->kicks, kicks, half * p->ends) : k->known == 1;
 }
 
 static void run(
@@ -41,7 +41,7 @@ static void run(
     memcpy(k->h1, h1, all);
     memcpy(k->h2, h2, all);
     if (p->reads) memcpy(k->told, told, sizeof(double) * telling(p) * p->reads);
-    if (kicks) memcpy(k->kicks, kicks, sizeof(double) * half * p->count);
+    if (kicks) memcpy(k->kicks, kicks, sizeof(double) * half * p->ends);
     passes(p, n, first, kicks);
     k->known = kicks ? 2 : 1;
 }

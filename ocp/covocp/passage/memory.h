@@ -52,11 +52,12 @@ static const double MUCH = 100.0;
 
 /* Steps of a covariance and where their numbers lie.
  *
- * Everything whole is told by one array, `shape`: n, nonzeros of H, steps, r, and whether there is an order of
- * elimination; then, one after the other, the arrays below that are marked so.
+ * Everything whole is told by one array, `shape`: n, nonzeros of H, steps, r, whether there is an order of elimination,
+ * and `every`; then, one after the other, the arrays below that are marked so.
  */
 typedef struct {
     int n, nnz, count, r, moves, reads;
+    int every, ends;  /* half-vectors are wanted, kicks and seeds given, after every so many steps: `ends` columns */
     int lean;         /* nothing is kept of the steps: no slopes */
     const int *place; /* of each step among those that move, or -1 - that among those that read; of shape */
     const int *row, *col; /* nonzeros of H, column by column; of shape */
@@ -67,7 +68,7 @@ typedef struct {
     const int *order, *rank, *left, *right, *before, *facing, *behind;
     int *chosen;                  /* 2n to work in */
     const double *h1, *h2, *told; /* the point */
-    double *after;                /* half-vectors there */
+    double *after;                /* half-vectors there, after all steps; where it is lean only those that are wanted */
     double *stage1, *stage2;      /* of every step, 2n x n, row by row */
     double *factor, *swaps;       /* of every X', n x n, and the rows that were exchanged for each */
     double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */

@@ -14,7 +14,7 @@
 #include "written.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 8; }
+EXPORT int passage_version(void) { return 9; }
 
 /* Whether this processor can take the functions whose names end in _newer. */
 EXPORT int passage_newer(void) {
@@ -66,7 +66,7 @@ EXPORT size_t passage_bytes(const int *shape, int lean) {
     p.lean = lean;
     const size_t n = p.n, square = n * n, own = keeps(&p, NULL) + works(&p, NULL) + numbers(&p);
     const size_t moved = 5 * square * p.moves + (p.r * n + 2 * square) * p.reads;
-    return sizeof(double) * (own + (lean ? 0 : moved + numbers(&p) + n * (n + 1) / 2 * p.count));
+    return sizeof(double) * (own + (lean ? 0 : moved + numbers(&p) + n * (n + 1) / 2 * p.ends));
 }
 
 /* What exported code computes, by the same operations: not those for newer processors. */

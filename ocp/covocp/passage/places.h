@@ -4,7 +4,8 @@ static void described(Passage *p, const int *shape) {
     const int filled = shape[4], m = 2 * shape[0];
     memset(p, 0, sizeof *p);
     p->n = shape[0], p->nnz = shape[1], p->count = shape[2], p->r = shape[3];
-    p->place = shape + 5;
+    p->every = shape[5], p->ends = p->count / p->every;
+    p->place = shape + 6;
     for (int k = 0; k < p->count; ++k) p->place[k] < 0 ? ++p->reads : ++p->moves;
     p->row = p->place + p->count, p->col = p->row + p->nnz;
     p->begin = p->col + p->nnz, p->across = p->begin + m + 1, p->which = p->across + p->nnz;
@@ -25,7 +26,7 @@ static double *placed(double *memory, size_t *used, size_t count) {
 static size_t keeps(Passage *p, double *memory) {
     const size_t n = p->n, square = n * n, steps = p->lean && p->moves ? 1 : (size_t)p->moves, reads = p->reads;
     size_t used = 0;
-    p->after = placed(memory, &used, n * (n + 1) / 2 * p->count);
+    p->after = placed(memory, &used, n * (n + 1) / 2 * (p->lean ? p->ends : p->count));
     p->stage1 = placed(memory, &used, steps * 2 * square), p->stage2 = placed(memory, &used, steps * 2 * square);
     p->factor = placed(memory, &used, steps * square), p->swaps = placed(memory, &used, steps * n);
     p->gain = placed(memory, &used, reads * p->r * n), p->keep = placed(memory, &used, reads * square);

@@ -14,7 +14,9 @@ Pattern = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 @cache
-def shape(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], height: int) -> NDArray[np.intc]:
+def shape(
+    size: int, pattern: Pattern, count: int, reads: tuple[int, ...], height: int, every: int = 1
+) -> NDArray[np.intc]:
     """The array that memory.h describes.
 
     Args:
@@ -23,6 +25,7 @@ def shape(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], heigh
         count: steps, with those that read.
         reads: which of them read.
         height: rows that are read at once.
+        every: steps after which something is wanted or given.
     """
     rows, columns = (np.array(part, dtype=np.intc) for part in pattern)
     place = np.empty(count, dtype=np.intc)
@@ -32,7 +35,7 @@ def shape(size: int, pattern: Pattern, count: int, reads: tuple[int, ...], heigh
     by_rows = np.lexsort((columns, rows))
     begin = np.searchsorted(rows[by_rows], np.arange(2 * size + 1))
     own = ordering(size, *(list(part) for part in pattern))
-    head = (size, rows.size, count, height, int(own is not None))
+    head = (size, rows.size, count, height, int(own is not None), every)
     parts = [head, place, rows, columns, begin, columns[by_rows], by_rows, *([] if own is None else _factors(own))]
     return np.concatenate([np.asarray(part, dtype=np.intc) for part in parts])
 

@@ -45,27 +45,29 @@ def passed_by(
     kicks: Expr = None,
     told: Told | None = None,
     *,
+    every: int = 1,
     lean: bool = False,
 ) -> Any:
-    """Half-vectors of a covariance after each step: Gauss steps, and readings between them.
+    """Half-vectors of a covariance after steps: Gauss steps, and readings between them.
 
     Args:
         first: half-vector at the start.
         points: h H of all Gauss steps side by side, at the first and at the second point, of one sparsity each step.
         size: of the covariance.
-        kicks: added to the half-vectors as they pass, a column for each step; None: nothing.
+        kicks: added to the half-vectors as they pass, a column for each of those that are returned; None: nothing.
         told: what is read; None: nothing.
+        every: after how many steps, each time, a half-vector is wanted; a share of their number.
         lean: for values alone, of which no steps are kept; so it is where numbers are given.
 
     Returns:
-        A column for each step. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps;
+        A column for each of them. It can be differentiated twice (reverse sweeps, tangents, tangents of reverse sweeps;
         not where it is lean), but its sparsity is not seen: no Jacobians of it.
     """
     pattern, given = entries(points, size)
     steps, height = ((), 0) if told is None else (told.steps, told.rows)
     numbers = isinstance(first, ca.DM) and all(isinstance(point, ca.DM) for point in points)
     count = given[0].shape[1] + len(steps)
-    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, lean or numbers)
+    sweep = _sweep(size, pattern, count, kicks is not None, steps, height, lean or numbers, every)
     others = [*([] if told is None else [told.columns]), *([] if kicks is None else [kicks])]
     return sweep(first, *given, *others)
 
@@ -83,7 +85,9 @@ def entries(points: Sequence[Expr], size: int) -> tuple[Pattern, list[Any]]:
     return (tuple(rows), tuple(columns)), given
 
 
-def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None) -> Any:
+def depends(
+    first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None, *, every: int = 1
+) -> Any:
     """Something that depends on what `passed_by` depends on, by operations whose sparsity CasADi sees."""
     moves = points[0].shape[1] // (2 * size)
     each: Any = sum(ca.sum1(ca.reshape(ca.sum1(point), 2 * size, moves)) for point in points)
@@ -91,6 +95,8 @@ def depends(first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, 
         both = ca.horzcat(each, ca.sum1(told.columns))
         order = np.argsort([*(k for k in range(both.shape[1]) if k not in set(told.steps)), *told.steps])
         each = both[:, order.tolist()]
+    if every > 1:
+        each = ca.sum1(ca.reshape(each, every, each.shape[1] // every))
     if kicks is not None:
         each = each + ca.sum1(kicks)
     return ca.repmat(ca.sum1(first) + ca.cumsum(each, 1), half_length(size), 1)
@@ -141,32 +147,41 @@ _WORKSPACES = _Workspaces()
 
 @cache
 def _sweep(
-    size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool
+    size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool, every: int
 ) -> _Sweep:
     """A sweep; CasADi's expressions do not keep what Python makes, so all of them stay. They are small."""
-    return _Sweep(size, pattern, count, kicked, reads, height, lean)
+    return _Sweep(size, pattern, count, kicked, reads, height, lean, every)
 
 
 class _Sweep(Node):
     """(half-vector at the start, entries of h H at both points[, what is read][, kicks]) -> half-vectors."""
 
     def __init__(
-        self, size: int, pattern: Pattern, count: int, kicked: bool, reads: tuple[int, ...], height: int, lean: bool
+        self,
+        size: int,
+        pattern: Pattern,
+        count: int,
+        kicked: bool,
+        reads: tuple[int, ...],
+        height: int,
+        lean: bool,
+        every: int,
     ) -> None:
         """Keep what the library is told; `lean`: for values alone, of which no steps are kept."""
         self._lean = lean
         self.half, self.entries, self.count, self.kicked = half_length(size), len(pattern[0]), count, kicked
+        self.ends = count // every
         self.moves, self.reads, self.telling = count - len(reads), len(reads), height * size + half_length(height)
-        self._shape = shape(size, pattern, count, reads, height)
+        self._shape = shape(size, pattern, count, reads, height, every)
         self.bytes = int(needed()["passage_bytes"](self._shape.ctypes.data, int(lean)))
         self._reverse: dict[int, _Slopes] = {}
         self._forward: dict[int, _Tangents] = {}
         sizes = [(self.half, 1), (self.entries, self.moves), (self.entries, self.moves)]
         sizes += [(self.telling, self.reads)] if self.reads else []
-        sizes += [(self.half, count)] if kicked else []
+        sizes += [(self.half, self.ends)] if kicked else []
         self.shapes = [ca.Sparsity.dense(*size) for size in sizes]
         self._lengths = [8 * shape.nnz() for shape in self.shapes]
-        super().__init__("passage", self.shapes, [ca.Sparsity.dense(self.half, count)])
+        super().__init__("passage", self.shapes, [ca.Sparsity.dense(self.half, self.ends)])
 
     def new_memory(self) -> int:
         """Memory of the library for one call at a time."""
@@ -190,7 +205,7 @@ class _Sweep(Node):
 
     def seed(self, address: int | None, k: int) -> int | None:
         """The same of results."""
-        return None if address is None else address + 8 * k * self.half * self.count
+        return None if address is None else address + 8 * k * self.half * self.ends
 
     def tangent(
         self,

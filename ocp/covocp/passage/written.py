@@ -85,9 +85,16 @@ class Tape:
         self._unwritten: dict[str, tuple[Any, ...]] = {}
 
     def passed_by(
-        self, first: Expr, points: Sequence[Expr], size: int, kicks: Expr = None, told: Told | None = None
+        self,
+        first: Expr,
+        points: Sequence[Expr],
+        size: int,
+        kicks: Expr = None,
+        told: Told | None = None,
+        *,
+        every: int = 1,
     ) -> Any:
-        """What `covocp.passage.sweep.passed_by` returns, as a symbol."""
+        """What `covocp.passage.sweep.passed_by` returns, of a symbol."""
         assert kicks is None  # nothing that is exported has them, nor readings
         assert told is None
         pattern, given = entries(points, size)
@@ -100,7 +107,7 @@ class Tape:
             assert np.array_equal(known, own)  # the names of different shapes differ
         after = ca.MX.sym(f"after_{len(self.calls)}", half_length(size), count)
         self.calls.append(Call(arguments=[first, *given], after=after, forward=forward, slopes=slopes))
-        return after
+        return after[:, every - 1 :: every] if every > 1 else after
 
     def written(self) -> Written:
         """The C code of all of them, in the form that is written."""

@@ -25,7 +25,7 @@ NUMERIC_RUN = 10
 # of which CasADi sees no sparsity (slopes along directions, no Jacobians); or by what has the same arguments.
 Passage = Callable[..., Any] | None
 
-# (value, arguments, count) -> what a sequence of steps gives, a column for each step.
+# (value, arguments, count) -> what a sequence of steps gives, a column for each step, or for those that are wanted.
 Run = Callable[[Any, list[Any], int], list[Any]]
 
 
@@ -37,31 +37,55 @@ def in_sequence(
     first: Expr,
     columns: tuple[Any, ...],
     kicks: Expr,
+    every: int,
 ) -> tuple[Any, Any]:
-    """Half-vectors of some matrices after each substep, in the order of travel: before and after the kicks."""
+    """Half-vectors of some matrices after substeps, in the order of travel: before and after the kicks.
+
+    Args:
+        statement: the problem.
+        mesh: of it.
+        passage: how they pass.
+        positions: of the matrices.
+        first: half-vectors where they start.
+        columns: states before and after each substep, and the substeps.
+        kicks: added at the ends of the intervals, a column each; None: nothing.
+        every: 1: after each substep; mesh.substeps: at the ends of the intervals.
+    """
     count = mesh.intervals * mesh.substeps
     reads = _reads(mesh) if mesh.step != "rk4" and read_by(statement, positions) else []
     if reads and passage is not None and len(positions) == 1:
-        return _reading_passage(statement, mesh, passage, positions[0], first, columns, kicks)
+        return _chosen(every, *_reading_passage(statement, mesh, passage, positions[0], first, columns, kicks))
+    at_once = passage is not None and not reads and not (fed(statement, positions) and mesh.step != "rk4")
+    own = every if at_once else 1
     moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
     chosen = [column[:, moving] for column in columns] if reads else columns
-    matrices, run = _steps(statement, mesh, passage, positions, kicks is not None)(chosen, count - len(reads))
+    matrices, run = _steps(statement, mesh, passage, positions, kicks is not None, own)(chosen, count - len(reads))
     read = read_step(statement, positions) if reads else None
     at_reads = [columns[0], *columns[2:]]
     if kicks is None:
         values = _stretches(run, read, first, (matrices, at_reads), reads, count)[0]
-        return values, values
-    at_nodes = ca.MX(first.shape[0], count)
-    at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
+        return _chosen(every // own, values, values)
+    at_nodes = kicks
+    if own < mesh.substeps:
+        at_nodes = ca.MX(first.shape[0], count)
+        at_nodes[:, mesh.substeps - 1 :: mesh.substeps] = kicks
     given = ([*matrices, at_nodes[:, moving]], [*at_reads, at_nodes])
     passed, before = _stretches(run, None if read is None else _kicked(read), first, given, reads, count)
-    return before, passed
+    return _chosen(every // own, before, passed)
+
+
+def _chosen(every: int, before: Any, passed: Any) -> tuple[Any, Any]:
+    """Every so many columns, the last of them each time."""
+    return (before, passed) if every == 1 else (before[:, every - 1 :: every], passed[:, every - 1 :: every])
 
 
 def _steps(
-    statement: Statement, mesh: Mesh, passage: Passage, positions: tuple[int, ...], kicked: bool
+    statement: Statement, mesh: Mesh, passage: Passage, positions: tuple[int, ...], kicked: bool, every: int
 ) -> Callable[[Any, int], tuple[list[Any], Run]]:
-    """What makes, from the columns of some steps, the arguments of a sequence of them and the sequence."""
+    """What makes, from the columns of some steps, the arguments of a sequence of them and the sequence.
+
+    Every so many values are wanted of it where it passes in compiled code.
+    """
     kinds: list[ca.Function]
     if fed(statement, positions) and mesh.step != "rk4":  # steps of one that depend on another
         step = moving_step(statement, positions, mesh.step, mesh.linear_solver)
@@ -70,7 +94,7 @@ def _steps(
     if passage is not None:
         sizes = [statement.matrices[i].size for i in positions]
         kinds = [gauss_points(statement, i, mesh.step) for i in positions]
-        run = partial(_compiled, passage, sizes, kicked)
+        run = partial(_compiled, passage, sizes, kicked, every)
         return lambda columns, count: ([h for kind in kinds for h in kind.map(count).call(list(columns))], run)
     if mesh.step == "rk4":
         step = runge_kutta_step(statement, positions)
@@ -83,7 +107,13 @@ def _steps(
 
 
 def _compiled(
-    passing: Callable[..., Any], sizes: list[int], kicked: bool, first: Expr, arguments: list[Any], count: int
+    passing: Callable[..., Any],
+    sizes: list[int],
+    kicked: bool,
+    every: int,
+    first: Expr,
+    arguments: list[Any],
+    count: int,
 ) -> list[Any]:
     """What `_accumulated` gives, by the compiled passage: arguments are h H of each matrix at both Gauss points."""
     kicks = arguments[-1] if kicked else None
@@ -91,7 +121,7 @@ def _compiled(
     parts = []
     for k, (size, (i, j)) in enumerate(zip(sizes, pairwise(ends), strict=True)):
         own = None if kicks is None else kicks[i:j, :]
-        parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own))
+        parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own, every=every))
     passed = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
     return [passed] if kicks is None else [passed, passed - kicks]
 

@@ -89,7 +89,7 @@ def shoot(
         return result | {"e": nodes[nx:, :]}
     e0 = None if variables.e is None else variables.e[:, 0]
     given = (result["x"], fine, intervals, variables.parameters, e0)
-    at_nodes, halves, matrix_cost = passages(statement, mesh, *given, passage=passage)
+    at_nodes, halves, matrix_cost = passages(statement, mesh, *given, passage=passage, inside=bool(inside))
     if inside:
         result["e_inside"] = halves[:, inside]
     return result | {"e": at_nodes, "cost": cost + matrix_cost}
@@ -186,8 +186,12 @@ def passages(
     kicks: Expr = None,
     *,
     passage: Passage = None,
+    inside: bool = False,
 ) -> tuple[Any, Any, Any]:
-    """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps)."""
+    """What `matrices_along` returns, and between it the half-vectors at the ends of all substeps (ne, N substeps).
+
+    Unless they are wanted inside the intervals these may be those at the ends of the intervals alone, (ne, N).
+    """
     n = mesh.intervals
     e0 = statement.started(x[:, 0], parameters)[1] if e0 is None else e0
     starts = x[:, :n]
@@ -196,7 +200,8 @@ def passages(
         return ca.horzcat(e0, ends), halves, cost if statement.running_uses_matrices else ca.DM.zeros(1, n)
     columns = _substeps(statement, mesh, x, fine, intervals)
     own = None if passage in (passed_by, values_by) and not compiled_steps(mesh) else passage
-    sequence = partial(in_sequence, statement, mesh, own)
+    everywhere = inside or statement.running_uses_matrices or bool(statement.summed)
+    sequence = partial(in_sequence, statement, mesh, own, every=1 if everywhere else mesh.substeps)
     first = e0[statement.entries(statement.ahead)]
     groups = [_forward(statement, mesh, sequence, first, columns, _of(kicks, statement, statement.ahead))]
     if statement.matrix_end is not None:
@@ -229,7 +234,7 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
     columns = _substeps(statement, mesh, _node_values(mesh, variables.x, ends), fine, intervals)
     assert statement.matrix_end is not None
     last = statement.matrix_end(variables.x[:, -1], variables.duration, variables.parameters)
-    sequence = partial(in_sequence, statement, mesh, None)
+    sequence = partial(in_sequence, statement, mesh, None, every=mesh.substeps)
     return _backward(statement, mesh, sequence, last, columns, None)[0][:, 0]
 
 
@@ -260,13 +265,17 @@ def _forward(
     columns: tuple[Any, ...],
     kicks: Expr,
 ) -> tuple[Any, ...]:
-    """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps."""
-    n, m = mesh.intervals, mesh.substeps
+    """The matrices that run forward: half-vectors at the nodes, at the starts of the intervals, after the substeps.
+
+    After the intervals alone where the sequence gives no more.
+    """
+    n = mesh.intervals
     later = None
     if kicks is not None:
         first, later = first + kicks[:, 0], kicks[:, 1:]
     arrived, passed = sequence(statement.ahead, first, columns, later)
-    nodes = ca.horzcat(first, passed[:, m - 1 :: m])
+    each = passed.shape[1] // n
+    nodes = ca.horzcat(first, passed[:, each - 1 :: each])
     return nodes, nodes[:, :n], arrived
 
 
@@ -313,8 +322,10 @@ def _backward(
     if kicks is not None:
         last, kicks = last + kicks[:, n], kicks[:, list(range(n - 1, -1, -1))]
     arrived, passed = sequence(statement.behind, last, turned, kicks)
+    each = passed.shape[1] // n
+    order = list(range(n * each - 1, -1, -1))
     points = ca.horzcat(passed[:, order], last)
-    return points[:, ::m], arrived[:, order][:, ::m], points[:, 1:]
+    return points[:, ::each], arrived[:, order][:, ::each], points[:, 1:]
 
 
 def compiled_steps(mesh: Mesh) -> bool:
