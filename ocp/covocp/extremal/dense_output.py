@@ -27,6 +27,7 @@ from covocp.extremal.polynomials import Dense, joined, lengths, rows_of, semidef
 from covocp.statement.interval import one_sided, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.scales import magnitudes
 from covocp.transcription.steps import joint_interval, matrices_step, nominal_interval
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
@@ -34,6 +35,8 @@ from covocp.transcription.steps import joint_interval, matrices_step, nominal_in
 OF_RANGE, OF_DEVIATIONS = 1e-5, 1e-3
 # An entry that hardly varies is known to this share of its size; what is below the second share is roundoff.
 OF_SIZE, ROUNDOFF = 1e-6, 1e-11
+# A state that is no more than this share of its magnitude, such as its deviation, is zero but for roundoff.
+NOTHING = 1e-12
 # Share of what its rate would move it by in a step by which an entry that is the same at all nodes is thought to move,
 # and by how much less it moves between them to be the same.
 OF_MOVE, SAME_AT_NODES = 1e-3, 1e-12
@@ -138,7 +141,7 @@ class _Steps:
     def of(extremal: Extremal, coarse: Dense, rows: list[int], states: Dense | None) -> _Steps:
         """The steps of these entries."""
         st = extremal.statement
-        backward = rows[0] - st.nx in st.entries(st.behind)
+        backward, moving = rows[0] - st.nx in st.entries(st.behind), sum(row < st.nx for row in rows)
         values = coarse.values[:, rows]
         step = np.diff(coarse.knots)[:, None] / extremal.mesh.substeps
         moved = np.abs(step * coarse.first[:, rows]).max(axis=0)
@@ -146,6 +149,8 @@ class _Steps:
         still &= ~_varying(values, pairs)
         moved = np.where(still, OF_MOVE * moved, 0.0)
         size = np.maximum(np.abs(values).max(axis=0), moved)
+        known = magnitudes(st, extremal.trajectory, extremal.parameters).x
+        size[:moving] = np.where(size[:moving] > NOTHING * known[:moving], size[:moving], known[:moving])
         ends = (values[1:], values[:-1]) if backward else (values[:-1], values[1:])
         return _Steps(
             extremal=extremal,
@@ -410,11 +415,14 @@ def _table(steps: _Steps, pieces: _Pieces) -> Dense:
     if steps.backward:
         places, low, high, first, last = places[::-1], high, low, -last, -first
     order = np.argsort(places[0], kind="stable")
+    instant = np.isin(k[order], steps.extremal.mesh.instants)
+    kept = np.flatnonzero(instant | (places[1][order] > places[0][order]))  # the others are shorter than roundoff
+    begins, order_kept = order[np.append(0, kept[:-1] + 1)], order[kept]
     return Dense(
-        knots=np.append(places[0][order], nodes[n]),
-        values=np.vstack([low[order], high[order[-1]]]),
-        first=first[order],
-        last=last[order],
+        knots=np.append(places[0][order_kept], nodes[n]),
+        values=np.vstack([low[begins], high[order[-1]]]),
+        first=first[order_kept],
+        last=last[order_kept],
     )
 
 

@@ -90,7 +90,8 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
     if st.behind:  # what the phases before a link cost by what runs backward, at the start
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
-    return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x)
+    least = LEAST_RANGE * magnitudes(st, t, extremal.parameters).x
+    return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x, least)
 
 
 def _halved(extremal: Extremal) -> Refined:
@@ -205,13 +206,12 @@ def steps_along(
         options, mesh, margin = finer, replace(mesh, substeps=int(finer.substeps)), 1.0 / BEFORE
 
 
-def _moved(jumps: Array, x: Array) -> float:
-    """Largest change of a state over a segment, relative to its range; where nothing moves, to its size.
+def _moved(jumps: Array, x: Array, least: Array) -> float:
+    """Largest change of a state over a segment, relative to its range, which counts as no less than given.
 
     A rate that jumps inside an interval, which steps cannot see, need not change the cost.
     """
-    size = np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), np.abs(x).max(axis=0))
-    return float((np.abs(jumps).max(axis=0) / np.where(size > 0, size, 1.0)).max(initial=0.0))
+    return float((np.abs(jumps).max(axis=0) / np.maximum(np.ptp(x, axis=0), least)).max(initial=0.0))
 
 
 def _missed(extremal: Extremal, jumps: Array, parts: int) -> float:
