@@ -16,17 +16,18 @@ from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import apply
+from covocp.blocks.reachability import balance, lost_modes, nearness, slow_modes, weighted_directions
+from covocp.blocks.scaling import diagonal_scales, over, semidefinite_part, semidefinite_root
+from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, symmetrised, weight
 
 Array = NDArray[np.float64]
 Modes = NDArray[np.complex128]
 
-# A mode is out of reach where the smallest singular value of [A - mode I, B], both blocks of size 1, is below this.
-UNREACHABLE = 1e-10
-# A mode counts as marginal, neither stable nor unstable, this close to the boundary, relative to the size of A.
-MARGINAL = 1e-9
 # Largest relative residual of a Riccati equation that counts as solved.
 RESIDUAL = 1e-7
+# A mode of the closed loop on the boundary is one of A within this share of the size of A.
+NEAR = 1e-6
 # Most Newton steps after scipy's solution: where that is off by a tenth, five reach rounding.
 STEPS = 8
 
@@ -92,7 +93,9 @@ def lyapunov(A: Expr, Q: Expr, *, discrete: bool = False) -> Any:
         return _linear_lyapunov(a, q, discrete)
     from scipy import linalg
 
-    transition, right = a.full(), q.full()
+    # The solver rotates the states, after which small entries would be known to rounding of the largest only.
+    transition, units = balance(a.full())
+    right = q.full() / units[:, None] / units
     values = np.linalg.eigvals(transition)
     pairs = values[:, None] * values[None, :] - 1.0 if discrete else values[:, None] + values[None, :]
     scale = max(1.0, np.abs(values).max(initial=0.0) ** 2) if discrete else np.abs(values).max(initial=0.0)
@@ -109,7 +112,7 @@ def lyapunov(A: Expr, Q: Expr, *, discrete: bool = False) -> Any:
     solution = np.asarray(solve(transition, right if discrete else -right), dtype=float)
     if np.array_equal(right, right.T):
         solution = symmetrised(solution)
-    return restored(solution, A)
+    return restored(solution * units[:, None] * units, A)
 
 
 @checked(discrete=truth)
@@ -137,7 +140,7 @@ def undetectable(A: Expr, H: Expr, *, discrete: bool = False) -> Modes:
 
     Args:
         A: shape (n, n).
-        H: shape (m, n).
+        H: shape (m, n), or (n,) for one measurement.
         discrete: stable means inside the unit circle, not in the left half plane.
 
     Returns:
@@ -147,31 +150,7 @@ def undetectable(A: Expr, H: Expr, *, discrete: bool = False) -> Modes:
         ProblemError: expressions, shapes that do not fit.
     """
     a = numeric("A", square("A", A))
-    return lost_modes(a.T, numeric("H", matrix("H", H, (None, a.shape[0]))).T, discrete=discrete)
-
-
-def lost_modes(A: Array, B: Array, *, discrete: bool, marginal: bool = False) -> Modes:
-    """Modes of A that are not stable (`marginal`: on the boundary) and that B does not reach."""
-    from scipy import linalg
-
-    size = A.shape[0]
-    if not size:
-        return np.zeros(0, dtype=complex)
-    balanced, (scaling, _) = linalg.matrix_balance(A, permute=False, separate=True)
-    columns = B / np.asarray(scaling)[:, None]
-    norms = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(norms > 0.0, norms, 1.0)
-    values = np.linalg.eigvals(balanced)
-    excess = np.abs(values) - 1.0 if discrete else values.real
-    tolerance = MARGINAL * (1.0 if discrete else max(float(np.abs(values).max()), np.finfo(float).tiny))
-    chosen = np.abs(excess) <= tolerance if marginal else excess >= -tolerance
-    lost = []
-    for value in values[chosen]:
-        shifted = balanced - value * np.eye(size)
-        pencil = np.hstack([shifted / max(float(np.linalg.norm(shifted, 2)), np.finfo(float).tiny), columns])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] <= UNREACHABLE:
-            lost.append(value)
-    return np.asarray(lost, dtype=complex)
+    return lost_modes(a.T, numeric("H", row_matrix("H", H, a.shape[0])).T, discrete=discrete)
 
 
 def mode_text(mode: complex) -> str:
@@ -183,9 +162,8 @@ def mode_text(mode: complex) -> str:
 
 
 def root(weights: Array) -> Array:
-    """Symmetric square root of a positive semidefinite matrix."""
-    values, vectors = np.linalg.eigh(weights)
-    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+    """Square root of a positive semidefinite matrix, X with X X' = weights, each row to rounding of itself."""
+    return semidefinite_root(weights)
 
 
 def lost_mode(modes: Modes, pair: str, needed: str, remedy: str, why: str = "") -> ProblemError:
@@ -259,32 +237,48 @@ def stabilising(
     Raises:
         ProblemError: a mode that is not reached, or has no weight and is marginal or must be detectable; no solution.
     """
-    from scipy import linalg
-
     reached = lost_modes(A, B, discrete=discrete)
     if reached.size:
         raise lost_mode(reached, *words.reach)
     back = np.linalg.solve(R, N.T)
-    cost = root(symmetrised(Q - N @ back))
-    unseen = lost_modes((A - B @ back).T, cost, discrete=discrete, marginal=not detectable)
+    seen = weighted_directions(symmetrised(Q - N @ back))
+    unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable)
     if unseen.size:
         raise lost_mode(unseen, *words.see)
     # In units of R: scipy's pencil, with R beside A and Q, is off by up to a tenth where their sizes are far apart.
     # A power of two changes no digit of the numbers.
     unit = 2.0 ** np.round(np.log2(np.linalg.norm(R, 2))) if R.size else 1.0
     Q, R, N = Q / unit, R / unit, N / unit
-    solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
+    if not len(A):
+        return np.zeros((0, 0))
     try:
-        start = np.asarray(solve(A, B, Q, R, s=N), dtype=float)
+        solution, residual = _corrected(A, B, Q, R, N, discrete)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise _unsolved(str(error)) from error
-    solution, residual = _newton(A, B, Q, R, N, symmetrised(start), discrete)
+    closed = A - B @ gain_of(A, B, R, N, solution, discrete=discrete)
+    left = slow_modes(closed, discrete=discrete)
+    if left.size and np.abs(np.linalg.eigvals(A) - left[0]).min() <= NEAR * np.linalg.norm(A, 2):
+        # lost within rounding only: named by the pair that is nearer to losing it
+        hardly = nearness(A, B, left[0]) <= nearness((A - B @ back).T, seen, left[0])
+        raise lost_mode(left, *(words.reach if hardly else words.see))
+    if left.size or not residual <= RESIDUAL:
+        raise _unsolved("the closed loop is not stable" if left.size else f"a relative residual of {residual:.3g}")
+    return semidefinite_part(solution) * unit
+
+
+def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool) -> tuple[Array, float]:
+    """Scipy's solution and its relative residual, corrected by Newton's method with the diagonal scaled to one."""
+    from scipy import linalg
+
+    solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
+    start = symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float))
+    units = diagonal_scales(start)
+    A, B = A * units[:, None] / units, B * units[:, None]
+    Q, N, start = over(Q, units), N / units[:, None], over(start, units)
+    solution, residual = _newton(A, B, Q, R, N, start, discrete)
     scale = max(np.abs(Q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(A).max(initial=0.0))
-    if not residual <= RESIDUAL * scale:
-        raise _unsolved(
-            f"a residual of {residual * unit:.3g}" if np.isfinite(residual) else "the closed loop is not stable"
-        )
-    return solution * unit
+    relative = 0.0 if residual == 0.0 else residual / max(scale, np.finfo(float).tiny)
+    return np.asarray(solution * units[:, None] * units), float(relative)
 
 
 def _unsolved(received: str) -> ProblemError:
@@ -316,12 +310,6 @@ def sorted_modes(A: Array) -> Modes:
     return result
 
 
-def is_stable(A: Array, *, discrete: bool) -> bool:
-    """Whether all the modes are strictly inside."""
-    values = np.linalg.eigvals(A)
-    return bool(np.all(np.abs(values) < 1.0) if discrete else np.all(values.real < 0.0))
-
-
 def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, float]:
     """Kleinman's iteration until rounding ends its quadratic convergence, and the residual that is left.
 
@@ -331,7 +319,7 @@ def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete
     left = _residual(A, B, Q, R, N, S, discrete)
     for _ in range(STEPS):
         closed = A - B @ gain_of(A, B, R, N, S, discrete=discrete)
-        if not is_stable(closed, discrete=discrete):
+        if slow_modes(closed, discrete=discrete).size:
             break
         # S and a correction from the residual, not S anew: a closed loop of large norm rounds much coarser than A
         S = S + np.asarray(lyapunov(closed.T, symmetrised(left), discrete=discrete))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
+from covocp.blocks.scaling import diagonal_scales, over, semidefinite_part
 from covocp.blocks.values import is_symbolic
 
 Array = NDArray[Any]
@@ -111,9 +112,12 @@ def definite_solve(matrix: Expr, right: Expr, what: str) -> Any:
         ProblemError: numbers that are not positive definite.
     """
     if isinstance(matrix, np.ndarray):
+        units = diagonal_scales(matrix)
+        scaled = over(matrix, units)
         try:
-            np.linalg.cholesky(matrix)
-            return np.linalg.solve(matrix, right)
+            np.linalg.cholesky(scaled)
+            # With unit diagonal the order of the pivots, and so the rounding, does not depend on units.
+            return np.linalg.solve(scaled, right / units[:, None]) / units[:, None]
         except np.linalg.LinAlgError as error:
             raise _indefinite(what, matrix) from error
     entries, upper, order = ca.ldl(matrix)
@@ -142,13 +146,21 @@ def unit_triangular(matrix: Expr, what: str) -> tuple[Any, Any]:
 def triangular_solve(lower: Expr, right: Expr) -> Any:
     """lower^-1 right for a unit lower triangular matrix, by substitution."""
     if isinstance(lower, np.ndarray):
-        return np.linalg.solve(lower, right)
+        return substituted(lower, right)
     rows = [right[i, :] for i in range(lower.shape[0])]
     for i in range(lower.shape[0]):
         for j in range(i):
             if lower.sparsity().has_nz(i, j):
                 rows[i] = rows[i] - lower[i, j] * rows[j]
     return ca.vertcat(*rows)
+
+
+def substituted(lower: Array, right: Array) -> Array:
+    """lower^-1 right of numbers; no pivots, which would depend on the units of the rows."""
+    solved = np.zeros_like(right)
+    for i in range(len(lower)):
+        solved[i] = (right[i] - lower[i, :i] @ solved[:i]) / lower[i, i]
+    return solved
 
 
 def is_there(reading: Expr) -> Any:
@@ -165,14 +177,14 @@ def where(condition: Expr, value: Expr) -> Any:
     return ca.if_else(condition, value, 0)
 
 
-def semidefinite(value: Expr) -> Any:
-    """A covariance without the negative eigenvalues that rounding can leave; expressions as they are."""
-    if not isinstance(value, np.ndarray) or not value.size:
-        return value
-    values, vectors = np.linalg.eigh(value)
-    if values[0] >= 0.0:
-        return value
-    return symmetric((vectors * np.clip(values, 0.0, None)) @ vectors.T)
+def semidefinite(value: Expr, before: Expr = None) -> Any:
+    """A covariance without the negative eigenvalues that rounding can leave; expressions as they are.
+
+    Args:
+        value: shape (n, n).
+        before: the covariance that it was computed from, shape (n, n); see `scaling.semidefinite_part`.
+    """
+    return value if not isinstance(value, np.ndarray) or not value.size else semidefinite_part(value, before)
 
 
 def _indefinite(what: str, matrix: Array) -> ProblemError:

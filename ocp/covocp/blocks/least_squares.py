@@ -17,6 +17,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.blocks import values
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric, unit
+from covocp.blocks.scaling import scales
 from covocp.blocks.updates import Missing, check_choice, reading, updating
 
 Array = NDArray[np.float64]
@@ -130,7 +131,9 @@ def diffuse_start(size: int, alpha: float = 1e6) -> tuple[Array, Array]:
 
 
 def _solved(rows: Array, right: Array, size: int) -> tuple[Array, Array]:
-    """Least squares and (rows' rows)^-1."""
+    """Least squares and (rows' rows)^-1; the rank with columns of similar size, whatever the units."""
+    units = scales(np.linalg.norm(rows, axis=0))
+    rows = rows / units
     rank = int(np.linalg.matrix_rank(rows)) if rows.size else 0
     if rank < size:
         raise ProblemError(
@@ -141,6 +144,7 @@ def _solved(rows: Array, right: Array, size: int) -> tuple[Array, Array]:
         )
     orthogonal, triangle = np.linalg.qr(rows)
     inverse = np.linalg.solve(triangle, np.eye(size))
+    inverse = inverse / units[:, None]
     return inverse @ (orthogonal.T @ right), inverse @ inverse.T
 
 

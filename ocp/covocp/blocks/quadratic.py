@@ -18,7 +18,7 @@ from covocp.base.arguments import checked, whole
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length
 from covocp.base.short_repr import short_repr
-from covocp.blocks.arithmetic import apply, precision, semidefinite
+from covocp.blocks.arithmetic import apply, precision
 from covocp.blocks.updates import time_update
 from covocp.blocks.values import array, is_symbolic, matrix, restored, weight, wrong_argument
 
@@ -165,8 +165,7 @@ def transport(estimate: Expr, covariance: Expr, step: Expr, *, noise: Expr = 0) 
     W = spread("noise", noise, layout.size)
 
     def moved(x: Expr, P: Expr, d: Expr, W: Expr) -> tuple[Any, Any]:
-        x, P = time_update(x, P, transition(d), W, 0 * x)
-        return x, semidefinite(P)
+        return time_update(x, P, transition(d), W, 0 * x)
 
     kind = precision(estimate, covariance, step, noise)
     point, around = apply(moved, x, P, d, W, precision=kind)

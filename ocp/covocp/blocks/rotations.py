@@ -34,7 +34,8 @@ from covocp.blocks.rotation_series import (
     sine_remainder,
     versine,
 )
-from covocp.blocks.values import ROUNDOFF, is_symbolic, wrong_argument
+from covocp.blocks.scaling import ROUNDOFF
+from covocp.blocks.values import is_symbolic, wrong_argument
 
 
 def cross(vector: Expr) -> Any:

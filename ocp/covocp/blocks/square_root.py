@@ -24,11 +24,14 @@ from covocp.blocks.arithmetic import (
     diagonal,
     is_there,
     precision,
+    substituted,
+    symmetric,
     triangular_solve,
     unit_triangular,
     where,
     zeros,
 )
+from covocp.blocks.scaling import semidefinite_part, semidefinite_root
 from covocp.blocks.updates import Missing, check_choice, check_divisor, reading, row_matrix, shift
 from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
 
@@ -52,8 +55,11 @@ def factor(covariance: Expr) -> Any:
     P = weight("covariance", covariance)
     if is_symbolic(P):
         return apply(_definite_factor, P)[0]
-    values, vectors = np.linalg.eigh(P.full())
-    (lower,) = apply(lambda roots: (triangular(roots),), ca.DM(vectors * np.sqrt(np.clip(values, 0.0, None))))
+    numbers = symmetric(P.full())
+    try:
+        lower = np.linalg.cholesky(numbers)
+    except np.linalg.LinAlgError:  # singular: any root, made triangular
+        lower = triangular(semidefinite_root(semidefinite_part(numbers)))
     return restored(lower.astype(precision(covariance)), covariance)
 
 
@@ -235,7 +241,7 @@ def _substituted(lower: Expr, right: Expr) -> Any:
                 received=f"a smallest entry of its factor of {np.diag(lower).min():.3g}",
                 remedy="give every measurement some noise, and no measurement twice without noise",
             )
-        return np.linalg.solve(lower, right)
+        return substituted(lower, right)
     rows: list[Any] = []
     for i in range(lower.shape[0]):
         known = sum((lower[i, j] * rows[j] for j in range(i)), ca.SX(1, 1))

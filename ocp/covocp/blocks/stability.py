@@ -11,7 +11,9 @@ from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.short_repr import short_repr
-from covocp.blocks.algebraic import frozen, lost_modes, lyapunov, mode_text, root
+from covocp.blocks.algebraic import frozen, lyapunov, mode_text
+from covocp.blocks.reachability import lost_modes, slow_modes
+from covocp.blocks.scaling import ROUNDOFF, RUBBLE, diagonal_scales, over
 from covocp.blocks.values import numeric, square, symmetrised, weight, wrong_argument
 
 Array = NDArray[np.float64]
@@ -81,25 +83,42 @@ def lyapunov_certificate(
 
 
 def _symmetric(numbers: Array) -> Array:
-    if np.abs(numbers - numbers.T).max(initial=0.0) > 1e-9 * np.abs(numbers).max(initial=0.0):
-        difference = f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}"
-        raise wrong_argument("matrix", "a symmetric matrix", difference, "V = x'matrix x has a symmetric one")
+    sizes = np.sqrt(np.abs(np.diag(numbers)))
+    difference = np.abs(numbers - numbers.T)
+    rounding = RUBBLE * len(numbers) * np.finfo(float).eps * np.abs(numbers).max(initial=0.0)
+    if (difference > np.maximum(ROUNDOFF * np.outer(sizes, sizes), rounding)).any():
+        given = f"an asymmetry of {difference.max():.3g}"
+        raise wrong_argument("matrix", "a symmetric matrix", given, "V = x'matrix x has a symmetric one")
     return np.asarray(symmetrised(numbers))
 
 
 def _verdict(A: Array, V: Array, D: Array, discrete: bool) -> tuple[bool, str]:
-    """Whether V proves stability, and why; positive means by more than the rounding."""
-    growth = np.linalg.norm(A, 2) if A.size else 0.0
-    unit = ROUNDING * len(A) * np.finfo(float).eps * (np.linalg.norm(V, 2) if V.size else 0.0)
+    """Whether V proves stability, and why; positive means by more than the rounding.
+
+    All is judged in units of the states in which V has unit diagonal, for a congruence changes no sign; the modes have
+    the last word, since what V proves must hold for them.
+    """
+    if not len(A):
+        return True, "V is positive definite and decreases everywhere but at x = 0"
+    units = diagonal_scales(V)
+    A, V, D = A * units[:, None] / units, over(V, units), over(D, units)
+    growth = np.linalg.norm(A, 2)
+    unit = ROUNDING * len(A) * np.finfo(float).eps * np.linalg.norm(V, 2)
     rounding_v, rounding_d = float(unit), float(unit * (1.0 + growth**2 if discrete else 2.0 * growth))
-    least_v, least_d = (float(np.linalg.eigvalsh(entry).min(initial=np.inf)) for entry in (V, D))
+    least_v, least_d = (float(np.linalg.eigvalsh(entry)[0]) for entry in (V, D))
     if least_v < -rounding_v:
         return False, f"V is negative somewhere: its smallest eigenvalue is {least_v:.3g}"
     if least_d < -rounding_d:
         return False, f"V grows somewhere: the smallest eigenvalue of its decrease is {least_d:.3g}"
+    slow = slow_modes(A, discrete=discrete)
     if least_v > rounding_v and least_d > rounding_d:
+        if slow.size:
+            return False, f"V decreases, but not by more than the rounding of the mode {mode_text(slow[0])}"
         return True, "V is positive definite and decreases everywhere but at x = 0"
-    hidden = lost_modes(A.T, root(np.asarray(D)), discrete=discrete)
+    values, vectors = np.linalg.eigh(D)
+    seen = (vectors * np.sqrt(np.where(values > rounding_d, values, 0.0))) @ vectors.T
+    hidden = lost_modes(A.T, np.asarray(seen), discrete=discrete)
+    hidden = hidden if hidden.size else slow
     if hidden.size:
         return False, f"V does not decrease along the mode {mode_text(hidden[0])}, which is not stable"
     kind = "definite" if least_v > rounding_v else "semidefinite"

@@ -66,7 +66,7 @@ def shift(drift: Expr, size: int) -> Any:
 
 def time_update(x: Expr, P: Expr, phi: Expr, noise: Expr, drift: Expr) -> tuple[Any, Any]:
     """Item 3; all are matrices of one kind."""
-    return phi @ x + drift, symmetric(phi @ P @ phi.T + noise)
+    return phi @ x + drift, semidefinite(symmetric(phi @ P @ phi.T + noise))
 
 
 def update(
@@ -197,7 +197,7 @@ def updating(form: Form, missing: Missing) -> Callable[..., tuple[Any, Any]]:
     def measurement_update(x: Expr, P: Expr, y: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
         residual, rows, noise = present(y - H @ x, y, H, R) if missing == "skip" else (y - H @ x, H, R)
         step, spread = correct(P, residual, rows, noise)
-        return x + step, semidefinite(spread)
+        return x + step, semidefinite(spread, P)
 
     return measurement_update
 

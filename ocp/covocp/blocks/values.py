@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from covocp.base.errors import ProblemError, shown
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import real_numbers
+from covocp.blocks.scaling import RUBBLE, diagonal_scales, over, roundoff, rubble
 
 SYMBOLIC = (ca.SX, ca.MX)
-# Relative asymmetry, and relative size of a negative eigenvalue, that count as roundoff.
-ROUNDOFF = 1e-9
-SINGLE_ROUNDOFF = 1e-5  # in arrays of float32
 
 
 def is_symbolic(*values: Any) -> bool:
@@ -87,17 +85,42 @@ def weight(name: str, value: Given, size: int | None = None, *, definite: bool =
     result = square(name, value, size)
     if not isinstance(result, ca.DM):
         return result
-    numbers = result.full()
-    single = getattr(value, "dtype", None) == np.float32
-    tolerance = (SINGLE_ROUNDOFF if single else ROUNDOFF) * float(np.abs(numbers).max(initial=0.0))
-    if np.abs(numbers - numbers.T).max(initial=0.0) > tolerance:
-        raise wrong_argument(name, "a symmetric matrix", f"an asymmetry of {np.abs(numbers - numbers.T).max():.3g}")
-    if numbers.size:
-        smallest = float(np.linalg.eigvalsh(numbers)[0])
-        if smallest < -tolerance or (definite and smallest <= 0.0):
-            kind = "positive definite" if definite else "positive semidefinite"
-            raise wrong_argument(name, f"a {kind} matrix", f"a smallest eigenvalue of {smallest:.3g}")
+    kind = np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64
+    problem = _not_semidefinite(result.full(), kind, definite)
+    if problem.startswith("an asymmetry"):
+        raise wrong_argument(name, "a symmetric matrix", problem)
+    if problem:
+        raise wrong_argument(name, f"a positive {'definite' if definite else 'semidefinite'} matrix", problem)
     return result
+
+
+def _not_semidefinite(numbers: NDArray[np.float64], kind: Any, definite: bool) -> str:
+    """What a matrix has that a symmetric positive (semi)definite one has not, whatever the units of its rows; or ""."""
+    if not numbers.size:
+        return ""
+    spreads = np.diag(numbers)
+    tolerance = roundoff(kind)
+    rounding = RUBBLE * len(numbers) * float(np.finfo(kind).eps) * float(np.abs(numbers).max())
+    sizes = np.sqrt(np.abs(spreads))
+    difference = np.abs(numbers - numbers.T)
+    if (difference > np.maximum(tolerance * np.outer(sizes, sizes), rounding)).any():
+        return f"an asymmetry of {difference.max():.3g}"
+    kept = np.full(len(numbers), True) if definite else ~rubble(numbers, kind)
+    smallest = float(np.linalg.eigvalsh(numbers)[0])
+    plain = f"a smallest eigenvalue of {smallest:.3g}"
+    if smallest < -tolerance * float(np.abs(numbers).max()) or (definite and not spreads.all()):
+        return plain
+    bare = (spreads < 0.0) | ((spreads == 0.0) & numbers.any(axis=1))
+    if (bare & kept).any():
+        i = int(np.flatnonzero(bare & kept)[0])
+        return f"{spreads[i]:.3g} in place {i} of the diagonal" + ("" if spreads[i] else ", beside other entries")
+    positive = kept & (spreads > 0.0)
+    part = numbers[np.ix_(positive, positive)]
+    least = float(np.linalg.eigvalsh(over(part, diagonal_scales(part)))[0]) if part.size else 1.0
+    if least < -tolerance or (definite and least <= 0.0):
+        singular = least >= -tolerance and smallest <= 0.0
+        return plain if singular else f"a smallest eigenvalue of {least:.3g}, its diagonal scaled to one"
+    return ""
 
 
 def numeric(name: str, value: Given) -> NDArray[np.float64]:
