@@ -520,3 +520,13 @@ BAD_PAIRS = [
 def test_bad_input_names_what_is_wrong(call, message):
     with pytest.raises(ProblemError, match=message):
         call()
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_regulators_without_inputs_or_states(discrete):
+    A = np.diag([-0.5, -0.25])
+    regulator = riccati.lqr(A, np.zeros((2, 0)), np.eye(2), np.zeros((0, 0)), discrete=discrete)
+    np.testing.assert_allclose(regulator.cost, riccati.lyapunov(A, np.eye(2), discrete=discrete), rtol=1e-12)
+    assert regulator.gain.shape == (0, 2)
+    empty = riccati.lqr(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((0, 0)), 1.0, discrete=discrete)
+    assert empty.gain.shape == (1, 0)
