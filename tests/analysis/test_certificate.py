@@ -534,6 +534,16 @@ def test_conditions_that_fail_are_named(reason: str, changes: dict[str, Any]) ->
     assert reason in why_not(statement, statement.values)
 
 
+@pytest.mark.parametrize(("metres", "share"), [(1.0, 1.0), (1e7, 1e-6), (1e-7, 1e6)])
+def test_the_start_is_judged_by_correlations(metres: float, share: float) -> None:
+    """The same start in other units of state and parameter."""
+    units = np.outer([metres, share], [metres, share])
+    for correlation, reason in ((0.0, ""), (0.01, "correlated at the start"), (-0.9, "correlated at the start")):
+        initial = np.array([[1.0, correlation], [correlation, 1.0]]) * units
+        statement = variant(initial=initial).statement()
+        assert (reason in why_not(statement, statement.values)) if reason else not why_not(statement, statement.values)
+
+
 def test_a_cost_that_is_convex_in_the_control_at_round_times_only_is_refused() -> None:
     ocp = co.Problem(5.0)
     x = ocp.state("x", initial=0.0, variance=1.0)

@@ -175,3 +175,8 @@ def test_rate_as_c_code(tmp_path):
     code = compile_function(function, tmp_path)
     value = np.array([[0.4, -0.1], [-0.1, 2.0]])
     np.testing.assert_allclose(code(value, 0.7)[0], function(value, 0.7), rtol=1e-14)
+
+
+def test_a_transition_that_overflows_is_refused():
+    with pytest.raises(ProblemError, match="shorter steps"):
+        kalman.discretise([[1.0]], [[1.0]], 1000.0)

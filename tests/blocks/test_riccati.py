@@ -435,6 +435,43 @@ def test_reference_input():
         riccati.reference_input([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0, 1.0])
 
 
+STEADY_CASES = [
+    *(([[-a]], [2 * a], [1.0], 0.5) for a in (1e-6, 1e-12, 1e-17)),
+    *(([[0, 1.0], [-w * w, -w]], [0, w * w], [1.0, 0], 1.0) for w in (1e2, 1e6)),
+    *(
+        ([[-a, a, 0], [0, 0, 1], [0, -w * w, -1.4 * w]], [0, 0, w * w], [1.0, 0, 0], 1.0)
+        for a, w in ((1e-4, 1e4), (1e-6, 1e6))
+    ),
+    *(([[-2.0]], [3.0], [s], 2 / 3 / s) for s in (1e9, 1e-9, 1e-17)),
+]
+
+
+@pytest.mark.parametrize(("A", "B", "output", "control"), STEADY_CASES)
+def test_steady_states_in_any_units(A, B, output, control):
+    reference = riccati.reference_input(A, B, output)
+    np.testing.assert_allclose(reference.control, [[control]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 6.68e-12, 1e12])
+def test_a_steady_speed_is_none_in_any_units(unit):
+    """A position in astronomical units, its speed in m/s."""
+    with pytest.raises(ProblemError, match="no steady state"):
+        riccati.reference_input([[0.0, unit], [0.0, 0.0]], [0.0, 1.0], [0.0, 1.0])
+
+
+def test_two_controls_share_a_steady_state_by_their_norm():
+    reference = riccati.reference_input([[-1.0]], [[3.0, 4.0]], [1.0])
+    np.testing.assert_allclose(reference.control, [[0.12], [0.16]], rtol=1e-13)
+
+
+def test_gains_of_another_shape_have_no_feedforward():
+    reference = riccati.reference_input([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    np.testing.assert_allclose(reference.law([3.0, 2.0]), [[3.0]])
+    for gain in (np.ones((2, 2)), [1.0]):
+        with pytest.raises(ProblemError, match="'gain'"):
+            reference.law(gain)
+
+
 @pytest.mark.parametrize("step", [None, T])
 def test_integral_states_remove_a_constant_disturbance(step):
     A, B = (PHI, GAMMA) if step else (np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]))
@@ -483,3 +520,13 @@ BAD_PAIRS = [
 def test_bad_input_names_what_is_wrong(call, message):
     with pytest.raises(ProblemError, match=message):
         call()
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_regulators_without_inputs_or_states(discrete):
+    A = np.diag([-0.5, -0.25])
+    regulator = riccati.lqr(A, np.zeros((2, 0)), np.eye(2), np.zeros((0, 0)), discrete=discrete)
+    np.testing.assert_allclose(regulator.cost, riccati.lyapunov(A, np.eye(2), discrete=discrete), rtol=1e-12)
+    assert regulator.gain.shape == (0, 2)
+    empty = riccati.lqr(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((0, 0)), 1.0, discrete=discrete)
+    assert empty.gain.shape == (1, 0)

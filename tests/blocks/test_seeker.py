@@ -345,6 +345,7 @@ def test_covariance_is_semidefinite_whatever_comes(readings, single, reuse):
         ({"largest_step": None}, "'largest_step'"),
         ({"smallest_curvature": None}, "'smallest_curvature'"),
         ({"newton": "plain"}, "'descent_gain'"),
+        ({"descent_gain": 0.5}, "'descent_gain' means nothing"),
         ({"newton": "sometimes"}, "'newton'"),
         ({"switch": 0.1}, "'switch'"),
         ({"newton": "never", "descent_gain": 1.0, "switch": 0.1}, "'switch'"),

@@ -459,3 +459,16 @@ def test_benchmarks_are_factored_rightly():
             ),
         }[name.removesuffix("_split")]
         theta_d.check_factorisation(x, system.A0, system.A, f)
+
+
+@pytest.mark.parametrize("state", [[0.4], 0.4, [0.4, 0.4, 0.4], np.ones((3, 2)), [np.nan, 1.0]])
+def test_state_dependent_laws_check_the_state(state):
+    """One number would stand for all the components, and NaN would look like a pair that is not stabilisable."""
+    x = ca.SX.sym("x", 2)
+    A0, A = np.array([[0.0, 1.0], [-1.0, -0.2]]), ca.blockcat([[0, 0], [ca.sin(x[0]), x[1] ** 2]])
+    with pytest.raises(co.ProblemError, match="'state'"):
+        sdre.regulator(x, A0, A, [0.0, 1.0], np.eye(2), 1.0)(state, 0.0)
+    with pytest.raises(co.ProblemError, match="'state'"):
+        sdre.solution(x, A0, A, [0.0, 1.0], np.eye(2), 1.0)(state)
+    with pytest.raises(co.ProblemError, match="'estimate'"):
+        sdre.filter_gain(x, A0, A, [1.0, 0.0], np.eye(2), 1.0)(state, 0.0)

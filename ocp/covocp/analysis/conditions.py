@@ -15,10 +15,10 @@ import numpy as np
 from covocp.analysis.kinks import kinked
 from covocp.analysis.reduction import Parts, parts
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, is_semidefinite, unpack, unpack_costate
+from covocp.base.matrices import Array, is_semidefinite, standard_deviations, unpack, unpack_costate
 from covocp.statement.statement import Conditions, Statement
 
-# A correlation at the start, or a weight outside E_bb, counts as none below this share of the largest entry.
+# A correlation at the start counts as none below this, a weight outside E_bb below this share of the largest entry.
 NEGLIGIBLE = 1e-12
 # Times at which the running cost must be strictly convex in the control, a prime number of intervals so that few waves
 # fall between them all, and the least values between which lower ones are looked for.
@@ -77,9 +77,12 @@ def _start(statement: Statement, parameters: Array) -> str:
     if np.isnan(e0).any():
         return "the initial covariance is free"
     nx, E0 = statement.nx, unpack(e0, statement.matrices[0].size)
-    if np.abs(E0[:nx, nx:]).max() > NEGLIGIBLE * np.abs(E0).max():
+    # Of correlations: covariances of a state in metres and a parameter in radians have no size in common.
+    spreads = standard_deviations(E0)
+    if (np.abs(E0[:nx, nx:]) > NEGLIGIBLE * np.outer(spreads[:nx], spreads[nx:])).any():
         return "state and parameters are correlated at the start"
-    values = np.linalg.eigvalsh(E0[nx:, nx:])
+    units = np.where(spreads[nx:] > 0.0, spreads[nx:], 1.0)
+    values = np.linalg.eigvalsh(E0[nx:, nx:] / units[:, None] / units)
     if values[0] <= NEGLIGIBLE * values[-1]:
         return "the initial covariance of the parameters is singular (a parameter, or a combination, is known)"
     return ""

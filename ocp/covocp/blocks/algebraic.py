@@ -271,7 +271,10 @@ def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool)
     from scipy import linalg
 
     solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
-    start = symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float))
+    if B.shape[1]:
+        start = symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float))
+    else:  # no input: the equation is linear
+        start = np.atleast_2d(lyapunov(A.T, Q, discrete=discrete))
     units = diagonal_scales(start)
     A, B = A * units[:, None] / units, B * units[:, None]
     Q, N, start = over(Q, units), N / units[:, None], over(start, units)

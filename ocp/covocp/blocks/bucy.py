@@ -15,7 +15,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.gains import weighted
 from covocp.base.riccati_rates import riccati_rate
-from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
+from covocp.blocks.arithmetic import apply, definite_solve, precision, semidefinite, symmetric
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
 
@@ -94,14 +94,24 @@ def discretise(A: Expr, Q: Expr, step: Expr) -> tuple[Any, Any]:
         Phi and the covariance, shapes (n, n).
 
     Raises:
-        ProblemError: shapes that do not fit, Q not positive semidefinite, a step that is not positive.
+        ProblemError: shapes that do not fit, Q not positive semidefinite, a step that is not positive or over which
+            the transition overflows.
     """
     a = square("A", A)
     q, h = weight("Q", Q, a.shape[0]), time_step(step)
     if is_symbolic(a, q, h):
         transition, noise = apply(_series, a, q, h)
     else:
-        transition, noise = _van_loan(a.full(), q.full(), float(h))
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+            transition, noise = _van_loan(a.full(), q.full(), float(h))
+        if not (np.isfinite(transition).all() and np.isfinite(noise).all()):
+            raise ProblemError(
+                "The transition over the step is larger than any number.",
+                expected="a step over which the modes of A grow less",
+                received=f"a step of {float(h):g} with |A| step = {np.linalg.norm(a.full(), 1) * float(h):.3g}",
+                remedy="take shorter steps",
+            )
+        noise = semidefinite(noise)
     return restored(transition, A), restored(noise, Q)
 
 

@@ -17,12 +17,18 @@ from covocp.blocks import bucy
 from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.duality import Control, dual
+from covocp.blocks.scaling import scales
 from covocp.blocks.steady import Filter, steady_state
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import is_symbolic, matrix, numeric, restored, square, weight
 
 Array = NDArray[np.float64]
 Modes = NDArray[np.complex128]
+
+# Largest relative error of a steady state, passes that scale its equations, and that refine their solution.
+STEADY = 1e-9
+EQUILIBRATIONS = 30
+REFINEMENTS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,8 +82,16 @@ class ReferenceInput:
     __repr__ = short_repr
 
     def law(self, gain: Expr) -> Array:
-        """Feedforward N of u = -gain x + N r, which is u = control r - gain (x - state r), shape (m, p)."""
-        return np.asarray(self.control + numeric("gain", matrix("gain", gain)) @ self.state)
+        """Feedforward N of u = -gain x + N r, which is u = control r - gain (x - state r), shape (m, p).
+
+        Args:
+            gain: K, shape (m, n), or (n,) for one control.
+
+        Raises:
+            ProblemError: an expression, another shape.
+        """
+        rows = matrix("gain", row_matrix("gain", gain, len(self.state)), (len(self.control), len(self.state)))
+        return np.asarray(self.control + numeric("gain", rows) @ self.state)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -244,19 +258,55 @@ def reference_input(A: Expr, B: Expr, output: Expr, *, discrete: bool = False) -
     size = a.shape[0]
     b = numeric("B", matrix("B", B, (size, None)))
     c = numeric("output", row_matrix("output", output, size))
-    count = c.shape[0]
-    system = np.block([[a - np.eye(size) if discrete else a, b], [c, np.zeros((count, b.shape[1]))]])
+    count, inputs = c.shape[0], b.shape[1]
+    system = np.block([[a - np.eye(size) if discrete else a, b], [c, np.zeros((count, inputs))]])
     right = np.vstack([np.zeros((size, count)), np.eye(count)])
-    solution = np.linalg.lstsq(system, right, rcond=None)[0]
-    error = np.abs(system @ solution - right).max(initial=0.0)
-    if error > 1e-9:
+    solution, error = _least_norm(system, right)
+    if not error <= STEADY:
         raise ProblemError(
             "There is no steady state for every reference.",
             expected="as many controls as outputs, and no zero at rest",
-            received=f"{b.shape[1]} controls, {count} outputs, an error of {error:.2g} in the best steady state",
+            received=f"{inputs} controls, {count} outputs, a relative error of {error:.2g} in the best steady state",
             remedy="track fewer outputs, or use integral_states",
         )
     return ReferenceInput(state=frozen(solution[:size]), control=frozen(solution[size:]))
+
+
+def _least_norm(system: Array, right: Array) -> tuple[Array, float]:
+    """The solution of least norm, and the largest error of a row relative to its terms.
+
+    Rows and columns are scaled to entries of size 1 first: which rows depend on each other does not follow from units.
+    """
+    if not system.size:
+        return np.zeros((system.shape[1], right.shape[1])), 0.0 if not right.size else np.inf
+    known = system != 0.0
+    logs = np.log2(np.where(known, np.abs(system), 1.0))
+    rows, columns = np.zeros(len(system)), np.zeros(system.shape[1])
+    for _ in range(EQUILIBRATIONS):  # so that the mean of the logarithms is zero in each row and column
+        rows = _mean(logs - columns, known, 1)
+        columns = _mean(logs - rows[:, None], known, 0)
+    rows, columns = np.exp2(np.round(rows)), np.exp2(np.round(columns))
+    scaled = system / rows[:, None] / columns
+    # each reference in a unit of its own as well: its size follows from that of its row
+    wanted = right / rows[:, None]
+    units = scales(np.abs(wanted).max(axis=0))
+    wanted = wanted / units
+    left, values, turned = np.linalg.svd(scaled)
+    rank = int(np.count_nonzero(values > max(scaled.shape) * np.finfo(float).eps * values[0]))
+    found = np.zeros((system.shape[1], right.shape[1]))
+    for _ in range(REFINEMENTS):  # small components of a solution are known to rounding of themselves
+        found += turned[:rank].T @ ((left[:, :rank].T @ (wanted - scaled @ found)) / values[:rank, None])
+    terms = np.abs(scaled).sum(axis=1, keepdims=True) * np.abs(found).max(axis=0) + np.abs(wanted)
+    error = np.abs(scaled @ found - wanted) / np.where(terms > 0.0, terms, 1.0)
+    solution, free = found * units / columns[:, None], turned[rank:].T / columns[:, None]
+    if free.size:
+        solution = solution - free @ np.linalg.lstsq(free, solution, rcond=None)[0]
+    return solution, float(error.max(initial=0.0))
+
+
+def _mean(logs: Array, known: NDArray[np.bool_], axis: int) -> Array:
+    """Means of the entries that are known, zero where there are none."""
+    return np.asarray(np.where(known, logs, 0.0).sum(axis=axis) / np.maximum(known.sum(axis=axis), 1))
 
 
 def integral_states(A: Expr, B: Expr, output: Expr, *, step: Expr = None) -> Augmented:

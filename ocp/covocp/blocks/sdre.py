@@ -63,7 +63,7 @@ def regulator(x: Expr, A0: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> StateLaw
     riccati, feedback = _regulator(x, A0, A, B, Q, R)
 
     def law(state: ArrayLike, time: float = 0.0) -> Array:
-        given = np.asarray(state, dtype=float).ravel()
+        given = _state("state", state, feedback.shape[1])
         return np.asarray(-feedback @ riccati(given) @ given)
 
     return law
@@ -97,7 +97,7 @@ def filter_gain(x: Expr, A0: Expr, A: Expr, H: Expr, W: Expr, V: Expr) -> StateL
     seen = weighted(rows, v)
 
     def gain(estimate: ArrayLike, time: float = 0.0) -> Array:
-        return np.asarray(riccati(estimate) @ seen)
+        return np.asarray(riccati(_state("estimate", estimate, size)) @ seen)
 
     return gain
 
@@ -121,7 +121,7 @@ def _solution(rest: tuple[Any, Any], A0: Array, B: Array, Q: Array, R: Array) ->
     def riccati(state: ArrayLike) -> Array:
         from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
-        given = np.asarray(state, dtype=float).ravel()
+        given = _state("state", state, len(A0))
         factor = A0 + evaluate(given).full()
         try:
             first = np.asarray(solve_continuous_are(factor, B, Q, R))
@@ -135,6 +135,16 @@ def _solution(rest: tuple[Any, Any], A0: Array, B: Array, Q: Array, R: Array) ->
             raise _unsolved(given, _reason(factor, B, Q, R) or str(error)) from error
 
     return riccati
+
+
+def _state(name: str, value: Expr, size: int) -> Array:
+    """A state as numbers, (n,): another size would be repeated for all the components.
+
+    Raises:
+        ProblemError: an expression, another size, NaN or inf.
+    """
+    numbers = value if values.is_symbolic(value) else values.array(name, value).ravel()
+    return values.numeric(name, values.matrix(name, numbers, (size, 1))).ravel()
 
 
 def _reason(A: Array, B: Array, Q: Array, R: Array) -> str:

@@ -312,6 +312,13 @@ def _check_step(
                 received="None",
                 remedy=f"give {name}=, in the units of your function and positions",
             )
+    if newton == "modified" and descent_gain is not None:
+        raise ProblemError(
+            "The argument 'descent_gain' means nothing to the step newton='modified'.",
+            expected="descent_gain= with newton='plain' or 'never' only",
+            received=f"descent_gain={descent_gain:g}",
+            remedy="leave descent_gain= out, or choose newton='plain'",
+        )
     for name, given in (("switch", switch is not None), ("definite", not definite)):
         if given and newton != "plain":
             raise ProblemError(
