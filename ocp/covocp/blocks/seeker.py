@@ -316,7 +316,7 @@ def _check_step(
         raise ProblemError(
             "The argument 'descent_gain' means nothing to the step newton='modified'.",
             expected="descent_gain= with newton='plain' or 'never' only",
-            received=f"descent_gain={descent_gain:g}",
+            received=f"descent_gain={descent_gain}",
             remedy="leave descent_gain= out, or choose newton='plain'",
         )
     for name, given in (("switch", switch is not None), ("definite", not definite)):
