@@ -472,3 +472,14 @@ def test_state_dependent_laws_check_the_state(state):
         sdre.solution(x, A0, A, [0.0, 1.0], np.eye(2), 1.0)(state)
     with pytest.raises(co.ProblemError, match="'estimate'"):
         sdre.filter_gain(x, A0, A, [1.0, 0.0], np.eye(2), 1.0)(state, 0.0)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6])
+def test_functions_that_differ_in_small_states_are_not_joined(unit):
+    """Two saturations of different width: beyond it they are the same number."""
+    x = ca.SX.sym("x", 2)
+    A0 = np.array([[0.0, 1.0], [-1.0, -0.2]])
+    A = ca.blockcat([[0, 0], [ca.tanh(x[0] / unit), ca.tanh(3 * x[0] / unit)]])
+    laws = [theta_d.regulator(x, A0, A, [0.0, 1.0], np.eye(2), 1.0, form=f) for f in ("polynomial", "operator")]
+    state = np.array([0.3, 0.1]) * unit
+    assert float(laws[0](state, 0)) == pytest.approx(float(laws[1](state, 0)), rel=1e-12)

@@ -275,12 +275,14 @@ def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
         changes: those that differ.
 
     Returns:
-        All of them, without `switch` and `definite` of the settings where the step is no plain one any more.
+        All of them, without `switch`, `definite` and `descent_gain` of the settings where the step has no use for them.
     """
     merged = dict(settings) | dict(changes)
     if merged.get("newton", "modified") != "plain":
         for name in {"switch", "definite"} - set(changes):
             merged.pop(name, None)
+    if merged.get("newton", "modified") == "modified" and "descent_gain" not in changes:
+        merged.pop("descent_gain", None)
     return merged
 
 

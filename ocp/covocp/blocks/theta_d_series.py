@@ -35,7 +35,7 @@ Polynomial = dict[Monomial, Array]
 
 # Scales of the random states at which entries of A(x) are compared, and the relative error up to which they count as
 # linearly dependent: what agrees at all these scales is the same function.
-SCALES = (0.03, 0.3, 1.0, 3.0, 1e2, 1e4, 1e6)
+SCALES = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 0.03, 0.3, 1.0, 3.0, 1e2, 1e4, 1e6)
 DEPENDENCE_TOLERANCE = 1e-11
 # Coefficients of such combinations, of entries of size 1, that are none.
 ROUNDOFF = 1e-13
