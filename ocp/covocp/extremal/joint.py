@@ -238,7 +238,8 @@ def _joint_points(statement: Statement, density: ca.Function) -> ca.Function:
         z, u, t = hermite(za, zb, h * fa, h * fb, c), common.control(c), common.time(c)
         F, G = loop.slopes(z[:nx], u, t, duration, p)[:2]
         C = loop.gain(z[:nx], u, z[nx:], t, duration, p)
-        K, M = _filter(statement, z[:nx], u, unpack_symbolic(z[nx:][statement.estimation.span], size), (t, duration, p))
+        E = unpack_symbolic(z[nx:][statement.estimation.span], size)
+        K, M = filter_of(statement, z[:nx], u, E, (t, duration, p))
         noise, measured = density(z[:nx], u, t, duration, q)
         drift = ca.blockcat([[F - K @ M, symbolic(size, size)], [-K @ M, F - G @ C]])
         spread = K @ measured @ K.T
@@ -247,7 +248,7 @@ def _joint_points(statement: Statement, density: ca.Function) -> ca.Function:
     return ca.Function("joint_points", [za, zb, *common, q], points)
 
 
-def _filter(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+def filter_of(statement: Statement, x: Expr, u: Expr, E: Expr, rest: tuple[Any, ...]) -> tuple[Any, Any]:
     """Gain K = E M' U^-1 of the design, and M; no rows without measurements."""
     if statement.measurement is None:
         return E[:, :0], E[:0, :]

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -25,16 +25,22 @@ from covocp.base.expressions import Expr
 from covocp.base.gains import kalman_gain
 from covocp.base.matrices import Array, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.extremal.around import Around, bend, seen_by, side, spread_of
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.grown_noise import Grown, grown_noise
 from covocp.extremal.readings import Readings, readings_along
-from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 
 # Entries among the stats of a file, and their types.
 NOTE = "mean_effect_"
-MEAN_EFFECT: dict[str, Any] = {NOTE + "mean": Array, NOTE + "estimate": Array, NOTE + "cost": float}
+MEAN_EFFECT: dict[str, Any] = {
+    NOTE + "mean": Array,
+    NOTE + "estimate": Array,
+    NOTE + "cost": float,
+    NOTE + "noise_cost": float,
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,11 +49,13 @@ class MeanEffect:
 
     mean: of the deviation of the augmented state at the nodes, (K, n); estimate: of its estimate, (K, n).
     cost: what it adds to the expected cost, to second order; not part of what was optimised.
+    noise_cost: the same of noise densities that vary with state and control, whose mean is not that of the nominal.
     """
 
     mean: Annotated[Array, "nodes augmented"]
     estimate: Annotated[Array, "nodes augmented"]
     cost: float
+    noise_cost: float
 
     __repr__ = short_repr
 
@@ -63,11 +71,13 @@ def noted(effect: MeanEffect | None) -> dict[str, Any]:
     return {} if effect is None else {NOTE + f.name: getattr(effect, f.name) for f in fields(MeanEffect)}
 
 
-def mean_effect(extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array] | None = None) -> MeanEffect | None:
-    """The effect of the rates' and measurements' curvature along a solution.
+def mean_effect(
+    extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array] | None = None, grown: Grown | None = None
+) -> MeanEffect | None:
+    """The effect of the rates' and measurements' curvature along a solution, and what its deviations add to the noise.
 
     None where rates contain a matrix, where the loop leaves the range of numbers or a step cannot be solved. `start` is
-    what d and y begin with where a phase went before; None: zero.
+    what d and y begin with where a phase went before; None: zero. `grown` is what the noise adds where it is known.
     """
     st = extremal.statement
     if st.nominal is None or st.loop is None:
@@ -100,7 +110,12 @@ def mean_effect(extremal: Extremal, loop: ClosedLoop, start: tuple[Array, Array]
     at_end = st.loop.terminal.jacobian()(*end, *st.loop.terminal(*end))
     unknowns = [i for b in st.of_kind("unknown") for i in range(b.span.start, b.span.stop)]
     slope = np.hstack([np.asarray(at_end[0].full())[0, : n - len(unknowns)], np.asarray(at_end[2].full())[0, unknowns]])
-    return MeanEffect(mean=states[:, :n], estimate=states[:, n:], cost=cost + float(slope @ states[-1, :n]))
+    return MeanEffect(
+        mean=states[:, :n],
+        estimate=states[:, n:],
+        cost=cost + float(slope @ states[-1, :n]),
+        noise_cost=(grown_noise(extremal, loop) if grown is None else grown).cost,
+    )
 
 
 def _bent_readings(extremal: Extremal, loop: ClosedLoop) -> list[tuple[Readings, Array]]:
@@ -110,7 +125,7 @@ def _bent_readings(extremal: Extremal, loop: ClosedLoop) -> list[tuple[Readings,
         return []
     function = _curved_readings(extremal.statement)
     columns = [np.asarray(column) for column in extremal.columns()]
-    spread = _spread(loop)
+    spread = spread_of(loop)
     return [
         (
             entry,
@@ -122,51 +137,15 @@ def _bent_readings(extremal: Extremal, loop: ClosedLoop) -> list[tuple[Readings,
     ]
 
 
-def _spread(loop: ClosedLoop) -> Array:
-    """< (d, y)(d, y)' > at the nodes, (K, 2n, 2n)."""
-    with_estimate = loop.Xhat - loop.Z  # <d y'> of the deviation d = y - e
-    return np.concatenate(
-        [np.dstack([loop.X, with_estimate]), np.dstack([with_estimate.transpose(0, 2, 1), loop.Xhat])], 1
-    )
-
-
 def _evaluated(extremal: Extremal, loop: ClosedLoop, end: int) -> tuple[Array, Array, Array]:
     """Drift (N, 2n, 2n) of (d, y), its forcing (N, 2n), slope (N, 2n) of L by it, at one end of all intervals."""
     st, count = extremal.statement, extremal.mesh.intervals
     n = len(st.augmented)
-    part = slice(end, count + end)
-    x, u, e, t, duration, p = extremal.columns()
-    held = extremal.mesh.control == "constant"
-    columns = [np.asarray(value)[:, part] for value in (x, u, e, t, duration, p)]
-    if held:
-        columns[1] = np.asarray(u)[:, :count]
-    spread = _spread(loop)
-    values = _curved(st).map(count)(*columns, spread[part].transpose(1, 0, 2).reshape(2 * n, -1))
+    spread = spread_of(loop)
+    own = spread[end : count + end].transpose(1, 0, 2).reshape(2 * n, -1)
+    values = _curved(st).map(count)(*side(extremal, end), own)
     drift, forcing, slope = (stacked(v, count) for v in values)
     return drift, forcing[:, :, 0], slope[:, :, 0]
-
-
-class _Around(NamedTuple):
-    """Symbols z of the augmented state and the controls that are fed back, and the arguments of the model in them."""
-
-    six: list[Any]
-    z: Any
-    at: tuple[Any, ...]
-    value: Any
-
-    @classmethod
-    def of(cls, st: Statement, m: int) -> _Around:
-        """Of m controls that are fed back; `value` is z on the trajectory."""
-        n, unknowns = len(st.augmented), st.unknowns
-        symbolic: Any = st.symbolic
-        x, u, _, t, duration, p = six = model_symbols(st)
-        z = symbolic.sym("z", n + m)
-        states, own, fed = ca.vertsplit(z, [0, n - unknowns, n, n + m])
-        state = ca.vertcat(states, ca.vertsplit(x, [0, n - unknowns, st.nx])[1])
-        control = ca.vertcat(fed, ca.vertsplit(u, [0, m, st.nu])[1])
-        known, means = ca.vertsplit(p, [0, st.np - unknowns, st.np])
-        value = ca.vertcat(ca.vertsplit(x, [0, n - unknowns, st.nx])[0], means, ca.vertsplit(u, [0, m, st.nu])[0])
-        return cls(six, z, (state, control, t, duration, ca.vertcat(known, own)), value)
 
 
 @lru_cache(maxsize=KEPT)
@@ -176,17 +155,11 @@ def _curved_readings(st: Statement) -> ca.Function:
     assert st.loop is not None
     assert st.samples is not None
     n, m = len(st.augmented), int(st.loop.gain.size1_out(0))
-    around, spread = _Around.of(st, m), symbolic.sym("spread", 2 * n, 2 * n)
-    seen = _seen(st.loop.gain(*around.six), symbolic)
-    bent = _bend(st.samples.measurement(*around.at)[0], around.z, seen @ spread @ seen.T) / 2
+    around, spread = Around.of(st, m), symbolic.sym("spread", 2 * n, 2 * n)
+    seen = seen_by(st.loop.gain(*around.six), symbolic)
+    bent = bend(st.samples.measurement(*around.at)[0], around.z, seen @ spread @ seen.T) / 2
     inner = ca.Function("bent", [around.z, *around.six, spread], [ca.densify(bent)])
     return ca.Function("bent", [*around.six, spread], [inner(around.value, *around.six, spread)])
-
-
-def _seen(gain: Expr, symbolic: Any) -> Any:
-    """z of (d, y): the augmented state, and the controls that the estimate moves."""
-    m, n = gain.shape
-    return ca.blockcat([[symbolic.eye(n), symbolic.zeros(n, n)], [symbolic.zeros(m, n), -gain]])
 
 
 @lru_cache(maxsize=KEPT)
@@ -198,7 +171,7 @@ def _curved(st: Statement) -> ca.Function:
     assert st.nominal is not None
     m = int(loop.gain.size1_out(0))
     spread = symbolic.sym("spread", 2 * n, 2 * n)
-    six, z, at, value = _Around.of(st, m)
+    six, z, at, value = Around.of(st, m)
     e = six[2]
     rate = ca.vertcat(st.nominal(*at)[0][: n - unknowns], symbolic.zeros(unknowns))
     measured, M, U = symbolic.zeros(0), symbolic.zeros(0, n), symbolic.zeros(0, 0)
@@ -207,9 +180,9 @@ def _curved(st: Statement) -> ca.Function:
     E = unpack_symbolic(e[st.estimation.span], n)
     K = kalman_gain(E, M, U)
     C = loop.gain(*six)
-    seen = _seen(C, symbolic)
+    seen = seen_by(C, symbolic)
     both = ca.vertcat(rate, measured)
-    bent = _bend(both, z, seen @ spread @ seen.T) / 2
+    bent = bend(both, z, seen @ spread @ seen.T) / 2
     of_rate, of_measured = ca.vertsplit(ca.jacobian(both, z), [0, n, n + measured.shape[0]])
     F, G = _columns(of_rate, n, m)
     H, _ = _columns(of_measured, n, m)
@@ -227,13 +200,3 @@ def _columns(slopes: Expr, states: int, controls: int) -> tuple[Any, Any]:
     """Slopes by the augmented state and by the controls that are fed back."""
     by_state, by_control = ca.horzsplit(slopes, [0, states, states + controls])
     return by_state, by_control
-
-
-def _bend(values: Expr, z: Expr, covariance: Expr) -> Any:
-    """tr(v_zz Z) of each of some values v, Z being their arguments' covariance."""
-    size = z.shape[0]
-    unit = ca.DM.eye(size)
-    return sum(
-        (ca.jtimes(ca.jtimes(values, z, covariance[:, j]), z, type(z)(unit[:, j])) for j in range(size)),
-        type(z).zeros(values.shape[0]),
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -12,6 +12,7 @@ from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.extremal.closed_loop import ClosedLoop, close_loop, design_statistics
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.grown_noise import Grown, grown_noise
 from covocp.extremal.joint import Statistics
 from covocp.extremal.mean_effect import MeanEffect, mean_effect
 from covocp.statement.chain import Link
@@ -26,12 +27,14 @@ class PhaseLoop:
     handed: 1/2 tr S Xhat where it begins, less that where the next one begins. The form of the cost that is optimised
         has it in the phase where the deviations arise, the expected cost in the one where they are paid for.
     mean: what curved rates, measurements and jumps do to its mean, with what came before; None where unknown.
+    grown: what noise that varies adds, with what came before; None without a loop.
     """
 
     loop: ClosedLoop | None
     start: Array
     handed: float
     mean: MeanEffect | None
+    grown: Grown | None
 
     __repr__ = short_repr
 
@@ -62,42 +65,43 @@ def phase_loops(
     first = (design_statistics(extremals[0]) if truth is None else truth.phases[0]).initial
     start: Array = np.asarray(np.kron(np.diag([1.0, 0.0]), first), dtype=float)
     means: tuple[Array, Array] | None = (np.zeros(first.shape[0]), np.zeros(first.shape[0]))
+    more: Array = np.zeros_like(start)
     result: list[PhaseLoop] = []
     for k, extremal in enumerate(extremals):
         own = None if truth is None else truth.phases[k]
         loop = close_loop(extremal, own, start) if not k or result[-1].loop is not None else None
-        mean = mean_effect(extremal, loop, means) if loop is not None and means is not None else None
-        result.append(PhaseLoop(loop=loop, start=start, handed=0.0, mean=mean))
+        grown = None if loop is None else grown_noise(extremal, loop, more)
+        mean = mean_effect(extremal, loop, means, grown) if loop is not None and means is not None else None
+        result.append(PhaseLoop(loop=loop, start=start, handed=0.0, mean=mean, grown=grown))
         if k < len(links):
             behind = extremals[k + 1]
             added = _added(links[k], extremal, extremal.parameters, behind.parameters)
             if truth is not None:
                 added = _added(truth.links[k], extremal, *(own.parameters for own in truth.phases[k : k + 2]))
-            start, means = _passed(links[k], extremal, behind, result[-1], added)
+            start, means, more = _passed(links[k], extremal, behind, result[-1], added)
     fed = [_fed(extremal, entry.start) for extremal, entry in zip(extremals, result, strict=True)]
     after = [*fed[1:], 0.0]
-    return tuple(
-        PhaseLoop(loop=entry.loop, start=entry.start, handed=own - later, mean=entry.mean)
-        for entry, own, later in zip(result, fed, after, strict=True)
-    )
+    return tuple(replace(entry, handed=own - later) for entry, own, later in zip(result, fed, after, strict=True))
 
 
 def _passed(
     link: Link, before: Extremal, after: Extremal, ended: PhaseLoop, added: Array
-) -> tuple[Array, tuple[Array, Array] | None]:
-    """[E Z; Z' Xhat] behind a link that adds variances, and the means of the deviations and of their estimate."""
+) -> tuple[Array, tuple[Array, Array] | None, Array]:
+    """[E Z; Z' Xhat] behind a link that adds variances, the means of (d, y), and what noise added to their spread."""
     size, t = len(after.statement.augmented), before.trajectory
-    if ended.loop is None or link.deviations is None:
-        return np.full((2 * size, 2 * size), np.nan), None
+    if ended.loop is None or ended.grown is None or link.deviations is None:
+        return np.full((2 * size, 2 * size), np.nan), None, np.zeros((2 * size, 2 * size))
     X = ended.loop.X[-1]
     given = link.deviations(t.x[-1], t.e[-1], t.duration, before.parameters, after.parameters, X)
     J, _, bent = (np.asarray(value.full()) for value in given)
     E, Z, Xhat = ended.loop.E[-1], ended.loop.Z[-1], ended.loop.Xhat[-1]
     crossed = J @ Z @ J.T
     start = np.block([[J @ E @ J.T + added, crossed], [crossed.T, J @ Xhat @ J.T]])
+    both = np.kron(np.eye(2), J)
+    more = both @ ended.grown.end @ both.T
     if ended.mean is None:
-        return start, None
-    return start, (J @ ended.mean.mean[-1] + bent.ravel(), J @ ended.mean.estimate[-1])
+        return start, None, more
+    return start, (J @ ended.mean.mean[-1] + bent.ravel(), J @ ended.mean.estimate[-1]), more
 
 
 def _added(link: Link, before: Extremal, parameters: Array, later: Array) -> Array:

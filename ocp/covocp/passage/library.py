@@ -43,13 +43,13 @@ def _loaded() -> tuple[dict[str, Callable[..., Any]] | None, str]:
     try:
         library = ctypes.CDLL(found.origin)
         version = _version(library)
-        newer = _TWICE if version == VERSION and library.passage_newer() else ()
+        if version != VERSION:
+            return None, f"it was built from version {version} of its source, not {VERSION}: install covocp again"
+        newer = _TWICE if library.passage_newer() else ()
         functions = {name: getattr(library, f"{name}_newer" if name in newer else name) for name in _SIGNATURES}
         functions["addresses"] = importlib.import_module(MODULE).addresses
     except (ImportError, OSError, AttributeError) as error:
         return None, f"it cannot be loaded: {error}"
-    if version != VERSION:
-        return None, f"it was built from version {version} of its source, not {VERSION}: install covocp again"
     for name, (result, arguments) in _SIGNATURES.items():
         functions[name].restype, functions[name].argtypes = result, arguments
     return functions, found.origin

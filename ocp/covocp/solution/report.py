@@ -162,23 +162,30 @@ def _costs(solution: Solution) -> Section:
 
 
 def _left_out(solution: Solution) -> Section:
-    """What the curvature of rates and measurements adds, which the linear covariance equations do not have."""
+    """What the linear equations along the nominal do not have: curved rates and measurements, noise that grows."""
     effect = solution.mean_effect
-    if effect is None or not abs(effect.cost) > NEGLIGIBLE * abs(solution.cost):
+    if effect is None:
         return []
-    share = f" ({100 * abs(effect.cost / solution.cost):.2g} %)" if solution.cost else ""
-    names = [name for b in solution.blocks if b.kind == "state" and b.role == "moving" for name in error_names((b,))]
-    spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
-    worst = int(np.argmax(moved))
-    return [
-        Sentence(
-            f"not in the cost: rates and measurements bend, which adds {effect.cost:+.2g}{share} through the mean "
-            f"of the deviations; at the end that of {names[worst]} is {effect.mean[-1, worst]:+.2g}, "
-            f"{moved[worst]:.2g} of its root mean square"
-        )
-    ]
+    parts: list[Part] = []
+    least = NEGLIGIBLE * abs(solution.cost)
+    if abs(effect.cost) > least:
+        names = [n for b in solution.blocks if b.kind == "state" and b.role == "moving" for n in error_names((b,))]
+        spread = standard_deviations(solution.loop.X)[-1] if solution.loop is not None else np.zeros(0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = np.nan_to_num(np.abs(effect.mean[-1]) / spread)[: len(names)]
+        worst = int(np.argmax(moved))
+        text = f"rates and measurements bend, which adds {_added(effect.cost, solution)} through the mean of the "
+        text += f"deviations; at the end that of {names[worst]} is {effect.mean[-1, worst]:+.2g}, "
+        parts.append(Sentence(f"not in the cost: {text}{moved[worst]:.2g} of its root mean square"))
+    if abs(effect.noise_cost) > least:
+        text = f"noise that varies with state and control adds {_added(effect.noise_cost, solution)} by the deviations"
+        parts.append(Sentence(f"not in the cost: {text}"))
+    return parts
+
+
+def _added(cost: float, solution: Solution) -> str:
+    """What is added to the cost, and its share of it."""
+    return f"{cost:+.2g}" + (f" ({100 * abs(cost / solution.cost):.2g} %)" if solution.cost else "")
 
 
 def _gained(solution: Solution) -> Section:
