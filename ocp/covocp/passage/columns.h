@@ -5,13 +5,12 @@
 /* Columns that are worked on together. */
 enum { LANES = 32 };
 
-/* Operations by the numbers that columns.py gives them. */
+/* CasADi's operations of scalars by the numbers that columns.py gives them. */
 enum {
-    ASSIGN, ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATE, EXPONENTIAL, LOGARITHM, POWER, ROOT, SQUARE, TWICE, SINE, COSINE,
-    TANGENT, ARCSINE, ARCCOSINE, ARCTANGENT, BELOW, AT_MOST, EQUAL, UNEQUAL, NOT, AND, OR, FLOOR, CEILING, REMAINDER,
-    MAGNITUDE, SIGN, COPY_SIGN, WHERE, ERROR_FUNCTION, LEAST, LARGEST, INVERSE, HYPERBOLIC_SINE, HYPERBOLIC_COSINE,
-    HYPERBOLIC_TANGENT, AREA_SINE, AREA_COSINE, AREA_TANGENT, ARCTANGENT_OF_TWO, CONSTANT, INPUT, OUTPUT, LOGARITHM_1P,
-    EXPONENTIAL_M1, HYPOTENUSE
+    OP_ASSIGN, OP_ADD, OP_SUB, OP_MUL, OP_DIV, OP_NEG, OP_EXP, OP_LOG, OP_POW, OP_SQRT, OP_SQ, OP_TWICE, OP_SIN,
+    OP_COS, OP_TAN, OP_ASIN, OP_ACOS, OP_ATAN, OP_LT, OP_LE, OP_EQ, OP_NE, OP_NOT, OP_AND, OP_OR, OP_FLOOR, OP_CEIL,
+    OP_FMOD, OP_FABS, OP_SIGN, OP_COPYSIGN, OP_IF_ELSE_ZERO, OP_ERF, OP_FMIN, OP_FMAX, OP_INV, OP_SINH, OP_COSH,
+    OP_TANH, OP_ASINH, OP_ACOSH, OP_ATANH, OP_ATAN2, OP_CONST, OP_INPUT, OP_OUTPUT, OP_LOG1P, OP_EXPM1, OP_HYPOT
 };
 
 #define EACH(value) \
@@ -21,53 +20,53 @@ enum {
 /* One operation on all lanes; inputs and outputs are no such. */
 INLINE void operate(int kind, double constant, const double *a, const double *b, double *own) {
     switch (kind) {
-    case ASSIGN: EACH(a[l]);
-    case ADD: EACH(a[l] + b[l]);
-    case SUBTRACT: EACH(a[l] - b[l]);
-    case MULTIPLY: EACH(a[l] * b[l]);
-    case DIVIDE: EACH(a[l] / b[l]);
-    case NEGATE: EACH(-a[l]);
-    case EXPONENTIAL: EACH(exp(a[l]));
-    case LOGARITHM: EACH(log(a[l]));
-    case POWER: EACH(pow(a[l], b[l]));
-    case ROOT: EACH(sqrt(a[l]));
-    case SQUARE: EACH(a[l] * a[l]);
-    case TWICE: EACH(2.0 * a[l]);
-    case SINE: EACH(sin(a[l]));
-    case COSINE: EACH(cos(a[l]));
-    case TANGENT: EACH(tan(a[l]));
-    case ARCSINE: EACH(asin(a[l]));
-    case ARCCOSINE: EACH(acos(a[l]));
-    case ARCTANGENT: EACH(atan(a[l]));
-    case BELOW: EACH(a[l] < b[l]);
-    case AT_MOST: EACH(a[l] <= b[l]);
-    case EQUAL: EACH(a[l] == b[l]);
-    case UNEQUAL: EACH(a[l] != b[l]);
-    case NOT: EACH(!a[l]);
-    case AND: EACH(a[l] && b[l]);
-    case OR: EACH(a[l] || b[l]);
-    case FLOOR: EACH(floor(a[l]));
-    case CEILING: EACH(ceil(a[l]));
-    case REMAINDER: EACH(fmod(a[l], b[l]));
-    case MAGNITUDE: EACH(fabs(a[l]));
-    case SIGN: EACH(a[l] < 0 ? -1.0 : a[l] > 0 ? 1.0 : a[l]);
-    case COPY_SIGN: EACH(copysign(a[l], b[l]));
-    case WHERE: EACH(a[l] ? b[l] : 0.0);
-    case ERROR_FUNCTION: EACH(erf(a[l]));
-    case LEAST: EACH(fmin(a[l], b[l]));
-    case LARGEST: EACH(fmax(a[l], b[l]));
-    case INVERSE: EACH(1.0 / a[l]);
-    case HYPERBOLIC_SINE: EACH(sinh(a[l]));
-    case HYPERBOLIC_COSINE: EACH(cosh(a[l]));
-    case HYPERBOLIC_TANGENT: EACH(tanh(a[l]));
-    case AREA_SINE: EACH(asinh(a[l]));
-    case AREA_COSINE: EACH(acosh(a[l]));
-    case AREA_TANGENT: EACH(atanh(a[l]));
-    case ARCTANGENT_OF_TWO: EACH(atan2(a[l], b[l]));
-    case CONSTANT: EACH(constant);
-    case LOGARITHM_1P: EACH(log1p(a[l]));
-    case EXPONENTIAL_M1: EACH(expm1(a[l]));
-    case HYPOTENUSE: EACH(hypot(a[l], b[l]));
+    case OP_ASSIGN: EACH(a[l]);
+    case OP_ADD: EACH(a[l] + b[l]);
+    case OP_SUB: EACH(a[l] - b[l]);
+    case OP_MUL: EACH(a[l] * b[l]);
+    case OP_DIV: EACH(a[l] / b[l]);
+    case OP_NEG: EACH(-a[l]);
+    case OP_EXP: EACH(exp(a[l]));
+    case OP_LOG: EACH(log(a[l]));
+    case OP_POW: EACH(pow(a[l], b[l]));
+    case OP_SQRT: EACH(sqrt(a[l]));
+    case OP_SQ: EACH(a[l] * a[l]);
+    case OP_TWICE: EACH(2.0 * a[l]);
+    case OP_SIN: EACH(sin(a[l]));
+    case OP_COS: EACH(cos(a[l]));
+    case OP_TAN: EACH(tan(a[l]));
+    case OP_ASIN: EACH(asin(a[l]));
+    case OP_ACOS: EACH(acos(a[l]));
+    case OP_ATAN: EACH(atan(a[l]));
+    case OP_LT: EACH(a[l] < b[l]);
+    case OP_LE: EACH(a[l] <= b[l]);
+    case OP_EQ: EACH(a[l] == b[l]);
+    case OP_NE: EACH(a[l] != b[l]);
+    case OP_NOT: EACH(!a[l]);
+    case OP_AND: EACH(a[l] && b[l]);
+    case OP_OR: EACH(a[l] || b[l]);
+    case OP_FLOOR: EACH(floor(a[l]));
+    case OP_CEIL: EACH(ceil(a[l]));
+    case OP_FMOD: EACH(fmod(a[l], b[l]));
+    case OP_FABS: EACH(fabs(a[l]));
+    case OP_SIGN: EACH(a[l] < 0 ? -1.0 : a[l] > 0 ? 1.0 : a[l]);
+    case OP_COPYSIGN: EACH(copysign(a[l], b[l]));
+    case OP_IF_ELSE_ZERO: EACH(a[l] ? b[l] : 0.0);
+    case OP_ERF: EACH(erf(a[l]));
+    case OP_FMIN: EACH(fmin(a[l], b[l]));
+    case OP_FMAX: EACH(fmax(a[l], b[l]));
+    case OP_INV: EACH(1.0 / a[l]);
+    case OP_SINH: EACH(sinh(a[l]));
+    case OP_COSH: EACH(cosh(a[l]));
+    case OP_TANH: EACH(tanh(a[l]));
+    case OP_ASINH: EACH(asinh(a[l]));
+    case OP_ACOSH: EACH(acosh(a[l]));
+    case OP_ATANH: EACH(atanh(a[l]));
+    case OP_ATAN2: EACH(atan2(a[l], b[l]));
+    case OP_CONST: EACH(constant);
+    case OP_LOG1P: EACH(log1p(a[l]));
+    case OP_EXPM1: EACH(expm1(a[l]));
+    case OP_HYPOT: EACH(hypot(a[l], b[l]));
     }
 }
 
@@ -91,13 +90,13 @@ EXPORT int NAME(columns)(
         const int lanes = columns - first < LANES ? columns - first : LANES;
         const int *own = program;
         for (int k = 0; k < count; ++k, own += 4) {
-            if (own[0] == INPUT) {
+            if (own[0] == OP_INPUT) {
                 const size_t height = heights[own[1]];
                 const double *from = places[own[1]];
                 double *to = work + (size_t)own[3] * LANES;
                 if (from) from += first * height + own[2];
                 for (int l = 0; l < LANES; ++l) to[l] = from && l < lanes ? from[l * height] : 0.0;
-            } else if (own[0] == OUTPUT) {
+            } else if (own[0] == OP_OUTPUT) {
                 const size_t height = heights[arguments + own[2]];
                 double *to = places[arguments + own[2]];
                 const double *from = work + (size_t)own[1] * LANES;

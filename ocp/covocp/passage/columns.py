@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import casadi as ca
@@ -16,17 +16,20 @@ from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import needed
 
-# Columns from which on it pays: to read an operation takes as long as it takes CasADi on a thousand columns, in
-# compiled code it takes a fifth of that; a solve asks for some twenty runs.
+# Columns from which on it pays: to read an operation takes 2 us, which a thousand columns save; a solve asks for some
+# twenty runs.
 FEWEST = 50
 
 # CasADi's operations in the order of those in columns.h.
 _KINDS = (
-    "ASSIGN ADD SUB MUL DIV NEG EXP LOG POW SQRT SQ TWICE SIN COS TAN ASIN ACOS ATAN LT LE EQ NE NOT AND OR FLOOR CEIL "
-    "FMOD FABS SIGN COPYSIGN IF_ELSE_ZERO ERF FMIN FMAX INV SINH COSH TANH ASINH ACOSH ATANH ATAN2 CONST INPUT OUTPUT "
-    "LOG1P EXPM1 HYPOT"
-).split()
-_NUMBERS = {int(getattr(ca, f"OP_{name}")): k for k, name in enumerate(_KINDS)} | {int(ca.OP_CONSTPOW): 8}
+    "ASSIGN", "ADD", "SUB", "MUL", "DIV", "NEG", "EXP", "LOG", "POW", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN",
+    "ASIN", "ACOS", "ATAN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "FLOOR", "CEIL", "FMOD", "FABS", "SIGN",
+    "COPYSIGN", "IF_ELSE_ZERO", "ERF", "FMIN", "FMAX", "INV", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH",
+    "ATAN2", "CONST", "INPUT", "OUTPUT", "LOG1P", "EXPM1", "HYPOT",
+)  # fmt: skip
+_NUMBERS = {int(getattr(ca, f"OP_{name}")): k for k, name in enumerate(_KINDS)} | {
+    int(ca.OP_CONSTPOW): _KINDS.index("POW")
+}
 _CONSTANT = _KINDS.index("CONST")
 
 
@@ -64,10 +67,10 @@ class _Kept:
     """What is kept of one owner: nodes, and operations of functions."""
 
     def __init__(self) -> None:
-        self.nodes: dict[tuple[ca.Function, int], Any] = {}
+        self.nodes: dict[tuple[ca.Function, int], ca.Function] = {}
         self._programs: dict[ca.Function, Program | None] = {}
 
-    def columns(self, function: ca.Function, count: int, name: str | None = None, options: Given = None) -> Any:
+    def columns(self, function: ca.Function, count: int, name: str = "", options: Given = None) -> ca.Function:
         """A node where it pays, else CasADi's map."""
         if count < FEWEST:
             return function.map(count)
@@ -100,12 +103,12 @@ class _Columns(Node):
     """A function of scalars on columns."""
 
     def __init__(
-        self, kept: _Kept, function: ca.Function, count: int, program: Program, name: str | None, options: Given
+        self, kept: _Kept, function: ca.Function, count: int, program: Program, name: str, options: Given
     ) -> None:
         """Keep what the library is told."""
         self._kept = kept
         self._function, self._count, self._program = function, count, program
-        self._derived: dict[tuple[str, int], Any] = {}
+        self._derived: dict[tuple[str, int], ca.Function] = {}
         self._run = needed()["columns"]
         shapes = [function.sparsity_in(i) for i in range(function.n_in())]
         results = [function.sparsity_out(i) for i in range(function.n_out())]
@@ -115,9 +118,9 @@ class _Columns(Node):
         told = (len(rows), rows.ctypes.data, constants.ctypes.data, registers, len(shapes), self._heights.ctypes.data)
         self._told = told
         self._places = ctypes.c_void_p * len(self._heights)
-        wide = [[ca.repmat(shape, 1, count) for shape in each] for each in (shapes, results)]
+        inputs, outputs = ([ca.repmat(shape, 1, count) for shape in each] for each in (shapes, results))
         own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(shapes))], **(options or {})}
-        super().__init__(name or f"columns_{function.name()}", *wide, own)
+        super().__init__(name or f"columns_{function.name()}", inputs, outputs, own)
 
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
@@ -152,7 +155,7 @@ class _Columns(Node):
         """Of CasADi."""
         return self._derivative("forward", nfwd, name, opts)
 
-    def _derivative(self, kind: str, directions: int, name: str, options: Given) -> Any:
+    def _derivative(self, kind: str, directions: int, name: str, options: Given) -> ca.Function:
         """Of one direction the same of columns, of several what CasADi's map gives."""
         if (kind, directions) not in self._derived:
             if directions > 1:

@@ -50,17 +50,17 @@ static void change(
     const Passage *p, int n, int k, int columns, const double *RESTRICT Y1, const double *RESTRICT Z0, double *RESTRICT V
 ) {
     const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz;
-    memcpy(V, Y1, sizeof(double) * 2 * n * columns);
-    for (int q = 0; q < p->nnz; ++q) {
-        const double share = -GAP * h1[q];
-        double *RESTRICT own = V + p->row[q] * columns;
-        const double *RESTRICT y = Y1 + p->col[q] * columns;
-        for (int j = 0; j < columns; ++j) own[j] += share * y[j];
+    double *RESTRICT shares = p->sizes;
+    for (int i = 0; i < 2 * n; ++i) {
+        const int first = p->begin[i], count = p->begin[i + 1] - first;
+        const double *RESTRICT before = Y1 + (size_t)i * columns, *other = Z0 && i >= n ? Z0 + (i - n) * n : NULL;
+        double *RESTRICT own = V + (size_t)i * columns;
+        for (int t = 0; t < count; ++t) shares[t] = h1[p->which[first + t]];
+        for (int j = 0; j < columns; ++j) own[j] = before[j] - (other ? other[j] : 0.0);
+        if (!other) own[i] -= 1.0;
+        add_chosen(own, -GAP, shares, p->across + first, count, Y1, columns, columns);
+        for (int j = 0; j < columns; ++j) own[j] *= 1.0 / SHARE;
     }
-    for (int i = 0; i < (Z0 ? n : 2 * n); ++i) V[i * columns + i] -= 1.0;
-    if (Z0)
-        for (int i = 0; i < n * n; ++i) V[n * n + i] -= Z0[i];
-    for (int i = 0; i < 2 * n * columns; ++i) V[i] *= 1.0 / SHARE;
 }
 
 /* D [I; E] of a (2n x 2n) matrix. */

@@ -44,14 +44,14 @@ INLINE void add_to_two(
 }
 
 #if defined(__AVX2__) && defined(__GNUC__)
-/* Rows and columns of a block of sums that stays in the registers of a processor with AVX2. */
-enum { TALL = 4, BROAD = 8 };
+/* Rows and columns of a block of sums that stays in the registers of a processor with AVX2, columns of one row of them. */
+enum { TALL = 4, BROAD = 8, BROADER = 16 };
+typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
 
 /* A block of C += sign A B; see `add_product`. */
 INLINE void add_block(
     double *C, int wide, double sign, const double *A, int tall, int step, const double *B, int across, int inner
 ) {
-    typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
     Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
     for (int k = 0; k < inner; ++k, A += step, B += across) {
         const Four left = *(const Four *)B, right = *(const Four *)(B + 4);
@@ -64,9 +64,53 @@ INLINE void add_block(
     *(Four *)C += sign * e, *(Four *)(C + 4) += sign * f, C += wide;
     *(Four *)C += sign * g, *(Four *)(C + 4) += sign * h;
 }
+
+/* The first columns of own += sign (sum of shares of chosen rows of B). */
+INLINE void add_broad(
+    double *own, double sign, const double *share, const int *rows, int count, const double *B, int wide
+) {
+    Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
+    int j = 0;
+    for (; j + 2 <= count; j += 2) {
+        const double one = share[j], two = share[j + 1];
+        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
+        const Four *second = (const Four *)(B + (size_t)rows[j + 1] * wide);
+        a += one * first[0], b += one * first[1], c += one * first[2], d += one * first[3];
+        e += two * second[0], f += two * second[1], g += two * second[2], h += two * second[3];
+    }
+    if (j < count) {
+        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
+        a += share[j] * first[0], b += share[j] * first[1], c += share[j] * first[2], d += share[j] * first[3];
+    }
+    Four *at = (Four *)own;
+    at[0] += sign * (a + e), at[1] += sign * (b + f), at[2] += sign * (c + g), at[3] += sign * (d + h);
+}
 #else
 enum { TALL = 2 };
 #endif
+
+/* own += sign (sum of shares of chosen rows of B, which lie `wide` apart), four at a time. */
+INLINE void add_chosen(
+    double *RESTRICT own, double sign, const double *share, const int *rows, int count, const double *B, int wide,
+    int columns
+) {
+    int j = 0;
+#if defined(__AVX2__) && defined(__GNUC__)
+    for (; columns >= BROADER; columns -= BROADER, own += BROADER, B += BROADER)
+        add_broad(own, sign, share, rows, count, B, wide);
+#endif
+    for (; j + 4 <= count; j += 4) {
+        const double a = sign * share[j], b = sign * share[j + 1], c = sign * share[j + 2], d = sign * share[j + 3];
+        const double *RESTRICT one = B + (size_t)rows[j] * wide, *RESTRICT two = B + (size_t)rows[j + 1] * wide,
+                     *RESTRICT three = B + (size_t)rows[j + 2] * wide, *RESTRICT four = B + (size_t)rows[j + 3] * wide;
+        for (int i = 0; i < columns; ++i) own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
+    }
+    for (; j < count; ++j) {
+        const double a = sign * share[j];
+        const double *RESTRICT one = B + (size_t)rows[j] * wide;
+        for (int i = 0; i < columns; ++i) own[i] += a * one[i];
+    }
+}
 
 /* C += sign A B, (rows x inner) (inner x columns): rows of C and of B lie `wide` and `across` apart, entries of A `tall`
  * down and `step` along. */

@@ -102,7 +102,10 @@ def _steps(
         sizes = [statement.matrices[i].size for i in positions]
         kinds = [gauss_points(statement, i, mesh.step) for i in positions]
         run = partial(_compiled, passage, sizes, kicked, every)
-        return lambda columns, count: ([h for kind in kinds for h in at_columns(statement, mesh, kind, count).call(list(columns))], run)
+        return lambda columns, count: (
+            [h for kind in kinds for h in at_columns(statement, mesh, kind, count).call(list(columns))],
+            run,
+        )
     if mesh.step == "rk4":
         step = runge_kutta_step(statement, positions)
         step = _kicked(step) if kicked else step
