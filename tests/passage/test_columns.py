@@ -12,9 +12,10 @@ import pytest
 
 import covocp as co
 from covocp.base.buffered import Buffered
-from covocp.passage import columns, library
+from covocp.models import mass_chain
+from covocp.passage import columns, library, operations
 from covocp.passage.columns import FEWEST, in_columns
-from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.covariance_steps import KEPT, gauss_points
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 
@@ -82,9 +83,37 @@ def test_every_kind_of_operation_is_met():
     """The function of all operations has each that the library knows, but those CasADi never lists for it."""
     function = everything()
     met = {function.instruction_id(k) for k in range(function.n_instructions())}
-    known = set(columns._NUMBERS)
+    known = set(operations.NUMBERS)
     assert known - met <= {ca.OP_ASSIGN, ca.OP_CONSTPOW, ca.OP_POW, ca.OP_LE, ca.OP_NE, ca.OP_LT, ca.OP_TWICE}
     assert met <= known
+
+
+@pytest.mark.parametrize("masses", [1, 5])
+def test_what_is_read_at_once_is_what_casadi_tells_one_by_one(masses: int):
+    """All operations and constants; no text of another kind is read as such."""
+    own = gauss_points(mass_chain.problem(masses).statement(), 0, "gauss")
+    for function in (everything(), smooth(), own, own.reverse(1), own.forward(1)):
+        rows, constants = operations.asked_one_by_one(function)
+        read = operations.read_at_once(function)
+        assert read is not None
+        np.testing.assert_array_equal(read[0], rows)
+        np.testing.assert_array_equal(read[1], constants)
+
+
+def test_a_text_that_is_not_understood_is_not_believed(monkeypatch: pytest.MonkeyPatch):
+    """Where CasADi kept functions otherwise, or a number is off, operations are asked for one by one."""
+    function = gauss_points(mass_chain.problem(5).statement(), 0, "gauss")
+    expected = operations.asked_one_by_one(function)
+    whole = operations._listed
+
+    def shifted(records: np.ndarray):
+        return whole(records[:, [0, 1, 3, 2]])
+
+    for wrong in (shifted, lambda records: None):
+        monkeypatch.setattr(operations, "_listed", wrong)
+        assert operations.read_at_once(function) is None
+        for one, other in zip(operations.program(function), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("which", ["gradient", "tangent", "product", "jacobian"])

@@ -9,28 +9,15 @@ from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
 from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import needed
+from covocp.passage.operations import Program, program
 
 # Columns from which on it pays: to read an operation takes 2 us, which a thousand columns save; a solve asks for some
 # twenty runs.
 FEWEST = 50
-
-# CasADi's operations in the order of those in columns.h.
-_KINDS = (
-    "ASSIGN", "ADD", "SUB", "MUL", "DIV", "NEG", "EXP", "LOG", "POW", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN",
-    "ASIN", "ACOS", "ATAN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "FLOOR", "CEIL", "FMOD", "FABS", "SIGN",
-    "COPYSIGN", "IF_ELSE_ZERO", "ERF", "FMIN", "FMAX", "INV", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH",
-    "ATAN2", "CONST", "INPUT", "OUTPUT", "LOG1P", "EXPM1", "HYPOT",
-)  # fmt: skip
-_NUMBERS = {int(getattr(ca, f"OP_{name}")): k for k, name in enumerate(_KINDS)} | {
-    int(ca.OP_CONSTPOW): _KINDS.index("POW")
-}
-_CONSTANT = _KINDS.index("CONST")
 
 
 class Owner(Protocol):
@@ -60,9 +47,6 @@ def in_columns(owner: Owner, function: ca.Function, count: int) -> ca.Function:
     return kept.nodes[function, count]
 
 
-Program = tuple[NDArray[np.intc], Array]
-
-
 class _Kept:
     """What is kept of one owner: nodes, and operations of functions."""
 
@@ -75,48 +59,30 @@ class _Kept:
         if count < FEWEST:
             return function.map(count)
         if function not in self._programs:
-            self._programs[function] = _program(function)
-        program = self._programs[function]
-        return function.map(count) if program is None else _Columns(self, function, count, program, name, options)
-
-
-def _program(function: ca.Function) -> Program | None:
-    """The operations of a function of scalars and their constants; None where one of them is not known."""
-    if not function.is_a("SXFunction"):
-        return None
-    places = range(function.n_instructions())
-    kinds = [_NUMBERS.get(kind, -1) for kind in map(function.instruction_id, places)]
-    if -1 in kinds:
-        return None
-    given, found = map(function.instruction_input, places), map(function.instruction_output, places)
-    rows = [
-        (kind, *before, *after) if len(before) + len(after) == 3 else (kind, *(before or (0,)), 0, *after)
-        for kind, before, after in zip(kinds, given, found, strict=True)
-    ]
-    constants = np.zeros(len(kinds))
-    for k in np.flatnonzero(np.array(kinds) == _CONSTANT).tolist():
-        constants[k] = function.instruction_constant(k)
-    return np.array(rows, np.intc).reshape(-1, 4), constants
+            self._programs[function] = program(function)
+        listed = self._programs[function]
+        return function.map(count) if listed is None else _Columns(self, function, count, listed, name, options)
 
 
 class _Columns(Node):
     """A function of scalars on columns."""
 
     def __init__(
-        self, kept: _Kept, function: ca.Function, count: int, program: Program, name: str, options: Given
+        self, kept: _Kept, function: ca.Function, count: int, listed: Program, name: str, options: Given
     ) -> None:
         """Keep what the library is told."""
         self._kept = kept
-        self._function, self._count, self._program = function, count, program
+        self._function, self._count, self._listed = function, count, listed
         self._derived: dict[tuple[str, int], ca.Function] = {}
         self._run = needed()["columns"]
         shapes = [function.sparsity_in(i) for i in range(function.n_in())]
         results = [function.sparsity_out(i) for i in range(function.n_out())]
         self._heights = np.array([shape.nnz() for shape in (*shapes, *results)], np.intc)
-        rows, constants = program
-        registers = 1 + int(rows[:, 1:].max(initial=0))
-        told = (len(rows), rows.ctypes.data, constants.ctypes.data, registers, len(shapes), self._heights.ctypes.data)
-        self._told = told
+        rows, constants = listed
+        self._told = (
+            *(len(rows), rows.ctypes.data, constants.ctypes.data, max(function.sz_w(), 1)),
+            *(len(shapes), self._heights.ctypes.data),
+        )
         self._places = ctypes.c_void_p * len(self._heights)
         inputs, outputs = ([ca.repmat(shape, 1, count) for shape in each] for each in (shapes, results))
         own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(shapes))], **(options or {})}
