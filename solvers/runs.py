@@ -320,7 +320,8 @@ class Runs:
         elif nlp.pieces and not settings.keys() & {"jac_g", *FOR_OWN}:
             compiled: dict[str, Any] = {name: settings[name] for name in COMPILED if name in settings}
             own, sizes = (nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0]), [part.statement.np for part in nlp.parts]
-            settings = slopes(*own, second=not self._limited, sizes=sizes, options=compiled) | settings
+            owner = None if compiled else nlp.parts[0].statement  # which lives as long as what is made here
+            settings = slopes(*own, second=not self._limited, sizes=sizes, options=compiled, owner=owner) | settings
         elif nlp.jacobian is not None and "jac_g" not in settings:
             outputs, names = [nlp.g, nlp.jacobian], (["x", "p"], ["g", "jac_g_x"])
             settings["jac_g"] = ca.Function("nlp_jac_g", [nlp.w, nlp.p], outputs, *names)

@@ -12,12 +12,12 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.nodes import Buffers, Node
-from covocp.passage.library import needed
+from covocp.passage.library import functions, needed
 from covocp.passage.operations import Program, program
 
 # Columns from which on it pays: to read an operation takes 2 us, which a thousand columns save; a solve asks for some
 # twenty runs.
-FEWEST = 50
+FEWEST = 32
 
 
 class Owner(Protocol):
@@ -56,7 +56,7 @@ class _Kept:
 
     def columns(self, function: ca.Function, count: int, name: str = "", options: Given = None) -> ca.Function:
         """A node where it pays, else CasADi's map."""
-        if count < FEWEST:
+        if count < FEWEST or functions() is None:
             return function.map(count)
         if function not in self._programs:
             self._programs[function] = program(function)
