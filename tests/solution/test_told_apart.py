@@ -247,17 +247,42 @@ def test_an_earlier_file_is_loaded_and_what_it_does_not_tell_is_said(files: dict
     ("change", "named"),
     [
         ({"when": {"every": 1.0}}, "the instants of 'm' differ"),
+        ({"noise": 20.0}, "what 'm' tells at t = 0.5 s differs"),
+        ({"matrix": 3.0}, "what 'm' tells at t = 0.5 s differs"),
+        ({"second": 0.4}, "what 'm', 'pair' tells at t = 1 s differs"),
         ({"second": None}, "the instants of 'measurement 2 at instants' differ"),
         ({"constant": 1.0}, "the symbols"),
     ],
     ids=str,
 )
-def test_instants_of_an_earlier_file_are_those_of_its_mesh(
+def test_instants_and_readings_of_an_earlier_file_are_those_of_its_own_values(
     files: dict[str, Path], tmp_path: Path, change: dict[str, Any], named: str
 ) -> None:
     path = earlier(files["estimated"], estimated, tmp_path / "estimated.npz")
     with pytest.raises(co.ProblemError, match=named):
         co.load(path, estimated(**change))
+
+
+@pytest.mark.parametrize(
+    ("build", "options"),
+    [
+        (estimated, {}),
+        (estimated, {"method": "gradient"}),
+        (estimated, {"control": "constant"}),
+        (estimated, {"covariances": "states"}),
+        (estimated, {"points": 2}),
+        (expected, {}),
+        (turning, {}),
+    ],
+    ids=str,
+)
+def test_an_earlier_file_of_a_solution_is_not_refused(build: Builder, options: dict[str, Any], tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)
+        solution = co.solve(build(), intervals=10, progress=False, **options)
+        path = earlier(solution.save(tmp_path / "now.npz"), build, tmp_path / "earlier.npz")
+        assert solution.converged
+        assert co.load(path, build()).statement is not None
 
 
 @pytest.mark.parametrize(

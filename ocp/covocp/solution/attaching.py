@@ -14,12 +14,16 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.given_controls import missed
 from covocp.extremal.nodes import rates_along
 from covocp.solution.fingerprint import Difference, differences, not_compared, only_switches, unlike_text
+from covocp.solution.meaning import SAMPLED
+from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.statement.statement import Block, Statement
 
 # Relative difference of the stored rates to those of a problem above which it is another problem; well above what
 # another version or compiler changes, well below what another number in the dynamics does.
 SAME_RATES = 1e-6
+# The same of what is read at an instant; well above what a solver leaves of the equations of a program.
+SAME_READING = 1e-4
 LISTED = 4  # differences that an error lists
 PLURAL = tuple(
     f"the {what}"
@@ -105,6 +109,8 @@ def _contradictions(solution: Solution, statement: Statement) -> list[Difference
     for name, stored, given in _instants(solution, statement):
         if stored != given:
             return [Difference(what=f"the instants of '{name}'", stored=_listed(stored), given=_listed(given))]
+    if found := _read_otherwise(solution, statement):
+        return [found]
     duration = statement.duration
     if not duration.free and not math.isclose(duration.guess, solution.duration) and math.isfinite(solution.duration):
         return [Difference(what="the duration", stored=f"{solution.duration:g} s", given=f"{duration.guess:g} s")]
@@ -134,6 +140,35 @@ def _instants(solution: Solution, statement: Statement) -> Iterator[tuple[str, l
     for k in range(max(len(taken), len(places))):
         name = names[k] if k < len(names) else f"measurement {k + 1} at instants"
         yield name, taken[k] if k < len(taken) else [], places[k] if k < len(places) else []
+
+
+def _read_otherwise(solution: Solution, statement: Statement) -> Difference | None:
+    """What a measurement at an instant does to the matrices of a file that does not tell it, where a problem differs.
+
+    Of solutions only: the steps of what did not converge need not meet, and other statistics than the design's have
+    another update.
+    """
+    samples, mesh, e, kept = statement.samples, solution.mesh, solution.trajectory.e, solution.stored_problem
+    if kept is not None and SAMPLED in kept.aspects:
+        return None
+    other = solution.origin is Origin.OTHER_TRUTH or not solution.converged or not np.isfinite(e).all()
+    if samples is None or not statement.ne or other or mesh.readings.shape[-1] != mesh.intervals:
+        return None
+    taken = np.flatnonzero(mesh.readings.any(axis=0))
+    columns = [np.asarray(c, dtype=float)[:, taken] for c in replace(solution.extremal, stated=statement).columns()]
+    after = np.asarray(samples.update.map(taken.size)(*columns, mesh.readings[:, taken])[0].full()).T
+    ahead = statement.entries((*statement.ahead, *statement.summed))
+    wrong = np.abs(after - e[taken + 1])[:, ahead] > SAME_READING * np.abs(e).max(axis=0)[ahead]
+    if not wrong.any():
+        return None
+    row, entry = np.argwhere(wrong)[0]
+    place, entry = int(taken[row]), ahead[entry]
+    names = [block.name for block, part in zip(samples.blocks, mesh.readings[:, place], strict=True) if part > 0]
+    return Difference(
+        what=f"what {', '.join(map(repr, names))} tells at t = {solution.t[place]:g} s",
+        stored=f"{statement.matrix_names[entry]} = {e[place + 1, entry]:g} after it",
+        given=f"{after[row, entry]:g}",
+    )
 
 
 def _listed(instants: list[float]) -> str:

@@ -19,6 +19,7 @@ from covocp.solution.pieces import expanded, operands_of
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Block, Statement
 
+SAMPLED = "measurements at instants"
 # Functions, and what their outputs (or entries of them) are called.
 Functions = Iterator[tuple[ca.Function, dict[str, tuple[int, Any]]]]
 
@@ -275,7 +276,7 @@ ADDED = {
     aspect.name: aspect
     for aspect in (
         Aspect(
-            name="measurements at instants",
+            name=SAMPLED,
             symbols=_sampled_symbols,
             numbers=_sampled_numbers,
             functions=_sampled_functions,
