@@ -471,8 +471,9 @@ def test_wrong_commands_are_refused_by_the_parser(capsys, arguments):
     assert "usage: covocp" in err
 
 
-def test_a_reader_that_has_gone_is_no_error():
-    command = f"{sys.executable} -m covocp list | true; echo ${{PIPESTATUS[0]}}"
+@pytest.mark.parametrize("command", ["list", "compare --help", "--version"])
+def test_a_reader_that_has_gone_is_no_error(command):
+    command = f"{sys.executable} -m covocp {command} | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "0"
     assert done.stderr == ""

@@ -141,6 +141,36 @@ def turning(*, noise: float = 0.001, sensor: float = 0.01, target: float = 1.0, 
     return p
 
 
+def constrained(
+    *,
+    structure: Any = ((True, True),),
+    constant: bool = False,
+    upper: float = 9.0,
+    stated: Any = None,
+    smallest: float = 0.0,
+    start: float = 1.0,
+    energy: float = 0.0,
+    growth: float = 0.1,
+    lower: float = 1e-6,
+    longest: float = 3.0,
+    prior: float = 0.5,
+) -> co.Problem:
+    """A gain with constraints, information, a matrix of the user's own, a free duration, decisions at the start."""
+    p = co.Problem(co.Free(2.0, 1.0, longest), name="constrained")
+    d = p.decision("d", guess=0.5, lower=-2.0, upper=2.0)
+    x = p.state("x", 2, initial=ca.vertcat(start * d, 0.0), variance=[0.5, prior])
+    u = p.control("u")
+    M = p.symmetric("M", 1, initial=1.0, lower=lower)
+    p.dynamics(x, ca.vertcat(x[1], u), noise=[0.0, 0.1])
+    p.dynamics(M, -M + growth * x[0] ** 2)
+    p.measurement("m", x[0], **(stated or {"information": 1.0}))
+    p.measurement("late", x[0], noise=0.1 * (1 + p.time), at=[0.5], relative=True)
+    p.chance(x[0], upper=9.0, probability=0.9, smallest=smallest, at="final", name="safe")
+    gain = co.Gain(structure=[list(row) for row in structure], constant=constant, upper=upper, guess=0.5)
+    p.minimize_expected(running=u**2 + x[0] ** 2 + energy * d**2, terminal=ca.sumsqr(x), gain=gain)
+    return p
+
+
 CHANGES: list[tuple[Builder, dict[str, Any], str]] = [
     (estimated, {"noise": 20.0}, "the noise of the measurement 'm'"),
     (estimated, {"noise": 0.2001}, "the noise of the measurement 'm'"),
@@ -183,6 +213,18 @@ CHANGES: list[tuple[Builder, dict[str, Any], str]] = [
     (conditioned, {"integrand": 1.1}, "the rate of 'spent'"),
     (conditioned, {"lowest": -4.0}, "the lower bound of 'd'"),
     (conditioned, {"symbol_unit": "m"}, r"the symbols differ(?s:.*)state y \(1\) in no unit(?s:.*)state y \(1\) in m"),
+    (constrained, {"structure": ((True, False),)}, "the"),
+    (constrained, {"constant": True}, "the symbols"),
+    (constrained, {"upper": 8.0}, "the upper bound of 'C"),
+    (constrained, {"stated": {"information": 2.0}}, "the noise of the measurement 'm'"),
+    (constrained, {"stated": {"noise": 2.0}}, "the noise of the measurement 'm'"),
+    (constrained, {"smallest": 0.01}, "the constraint 'safe'"),
+    (constrained, {"start": 2.0}, r"the initial value of 'x\[0\]'"),
+    (constrained, {"energy": 0.1}, "the running cost"),
+    (constrained, {"growth": 0.2}, "the rate of 'M'"),
+    (constrained, {"lower": 1e-5}, r"the lower bound of 'M"),
+    (constrained, {"longest": 4.0}, "the bounds of the duration"),
+    (constrained, {"prior": 0.6}, r"the initial value of 'E\[x\[1\], x\[1\]\]'"),
     (turning, {"noise": 0.002}, "the process noise of 'C"),
     (turning, {"sensor": 0.02}, "the noise of the measurement 'star'"),
     (turning, {"target": 1.1}, r"the constraint 'final C"),
@@ -194,7 +236,7 @@ CHANGES: list[tuple[Builder, dict[str, Any], str]] = [
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A file of some trajectory of each problem, by the name of its function."""
     folder, found = tmp_path_factory.mktemp("told"), {}
-    for build in (estimated, expected, conditioned, turning):
+    for build in (estimated, expected, conditioned, constrained, turning):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", co.CovocpWarning)  # the meshes are coarse, and nothing is optimised
             found[build.__name__] = co.evaluate(build(), intervals=10).save(folder / f"{build.__name__}.npz")
@@ -211,7 +253,7 @@ def test_each_change_is_seen_and_named(
         co.load(files[build.__name__], build(**change))
 
 
-@pytest.mark.parametrize("build", [estimated, expected, conditioned, turning])
+@pytest.mark.parametrize("build", [estimated, expected, conditioned, constrained, turning])
 def test_the_problem_itself_is_the_one_that_was_solved(files: dict[str, Path], build: Builder) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*violates", category=co.CovocpWarning)

@@ -43,7 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0; 1 where a solve failed, 2 where the input is wrong, 130 where it was interrupted before an iterate existed.
     """
-    parsed, unknown = _parser().parse_known_args(arguments)
+    try:
+        parsed, unknown = _parser().parse_known_args(arguments)
+    except SystemExit:  # of --help and --version, whose reader may have gone too
+        _print("", sys.stdout, end="")
+        raise
     if unknown:  # told by the command that was meant, with its usage
         parsed.parser.refuse(unknown)
     try:
@@ -64,7 +68,7 @@ class _Version(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print it and end."""
-        print(f"covocp {co.__version__}")
+        _print(f"covocp {co.__version__}", sys.stdout)
         parser.exit()
 
 
