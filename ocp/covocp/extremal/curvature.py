@@ -30,13 +30,11 @@ from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, se
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.scales import choose_scales
-from covocp.transcription.trajectory import Trajectory
 
 LANCZOS_STEPS = 120
 # Residual of the smallest Ritz value, relative to the largest eigenvalue, at which it is known well enough; its sign
 # is where the residual is below half of it.
 LANCZOS_TOLERANCE = 1e-3
-DISPLACEMENT = 0.3
 GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
 # Rows held, of unit length, whose part across the others is below this say nothing new.
 DEPENDENT = 1e-9
@@ -78,17 +76,6 @@ class Curvature:
         if abs(self.value) <= self.error:
             return "flat"
         return "minimum" if self.value > 0 else "saddle"
-
-    def displaced(self, extremal: Extremal, sign: float) -> Trajectory:
-        """The trajectory moved along the direction, its controls by their size or one unit, to both sides."""
-        t = extremal.trajectory
-        size = max(float(np.sqrt(np.mean(t.u**2))), DISPLACEMENT)
-        largest = max(float(np.abs(self.direction).max(initial=0.0)), float(np.abs(self.start).max(initial=0.0)))
-        step = sign * size / largest
-        x = t.x.copy()
-        x[0] = np.clip(x[0] + step * self.start, *extremal.statement.state_bounds)
-        u = np.clip(t.u + step * self.direction, *extremal.statement.control_bounds)
-        return Trajectory(x=x, u=u, e=t.e, duration=t.duration)
 
 
 def smallest_curvature(extremal: Extremal) -> Curvature | None:
