@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -53,7 +53,7 @@ Verdict = Literal["minimum", "saddle", "flat"]
 
 @dataclass(frozen=True, kw_only=True)
 class Curvature:
-    """The smallest curvature and its direction, in the metric int du' du dt.
+    """The smallest curvature and its direction, in the metric int du' du dt, of several controls each in its own unit.
 
     Attributes:
         value: smallest curvature in the directions that are left.
@@ -201,7 +201,8 @@ class _Reduced:
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
         moving = np.flatnonzero(tangents.free).tolist()
-        metric = mass_matrix(mesh, t.duration, st.nu)[moving, moving]
+        shares = ca.diag(ca.DM(_shares(fine, product, given)[np.array(moving, dtype=np.intp) % st.nu]))
+        metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
         weights = np.zeros(0)
         if tangents.start:  # in units that say something where the best control is none
             controls = choose_scales(st, mesh, t, extremal.parameters).u.mean()
@@ -257,6 +258,24 @@ class _Reduced:
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
         return null_space(rows, self.root.shape[0])
+
+
+def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:
+    """Roots of the curvature that each control has by itself, by their mean, (nu,); 1 where one has none.
+
+    Beside a control in units of 1e-7 one in units of 1 would have no curvature but rounding.
+    """
+    count, u = fine.statement.nu, fine.trajectory.u
+    if count == 1:
+        return np.ones(1)
+    first = node_size(fine.statement) * (fine.mesh.intervals + 1)
+    roots = np.zeros(count)
+    for i in range(count):
+        direction = np.zeros(first + u.size)
+        direction[first + i :: count] = 1.0
+        roots[i] = np.sqrt(abs(direction @ np.asarray(product(*given, direction).full()).ravel()))
+    mean = float(roots[roots > 0].mean()) if (roots > 0).any() else 1.0
+    return np.where(roots > 0, roots / mean, 1.0)
 
 
 def null_space(rows: Array, size: int) -> Array:

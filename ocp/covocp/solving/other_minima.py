@@ -66,15 +66,15 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
 
 
 def _stayed(before: Trajectory, extremal: Extremal) -> bool:
-    """Whether no control moved by more than a small share of its size or unit."""
+    """Whether some control moved by no more than a small share of its size or unit."""
     moved = np.abs(extremal.trajectory.u - before.u).max(axis=0, initial=0.0)
     sizes = np.abs(before.u).max(axis=0, initial=0.0)
     if not moved.size:
         return False
-    if (moved <= UNMOVED * sizes).all():
+    if (moved <= UNMOVED * sizes).any():
         return True
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
-    return bool((moved <= UNMOVED * (sizes + units)).all())
+    return bool((moved <= UNMOVED * (sizes + units)).any())
 
 
 def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Trajectory:
