@@ -15,6 +15,7 @@ from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
 from covocp.transcription.scales import choose_scales
+from covocp.transcription.starts import moving_units
 from covocp.transcription.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -81,7 +82,8 @@ def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Traject
     """The trajectory moved to one side along the direction of the smallest curvature."""
     t, st = extremal.trajectory, extremal.statement
     scales = choose_scales(st, extremal.mesh, t, extremal.parameters)
-    controls = np.maximum(np.sqrt(np.mean(t.u**2, axis=0)), DISPLACEMENT * scales.u)
+    units = moving_units(st, extremal.mesh, t, extremal.parameters)
+    controls = np.maximum(np.sqrt(np.mean(t.u**2, axis=0)), DISPLACEMENT * units)
     shares = [np.abs(curvature.direction) / controls, np.abs(curvature.start) / (DISPLACEMENT * scales.x)]
     step = sign / max(float(share.max(initial=0.0)) for share in shares)
     x = t.x.copy()

@@ -53,6 +53,9 @@ FAR = 5.0
 # Where nothing tells the unit of a control, one unit is bent, unless what moves a state by its scale is so many times
 # more or less: then that is. A bend of one would be none where a control is counted in grains, and far away in tons.
 FAR_UNIT = 100.0
+# States that answer to a control so many times more by the end than by half the time are unstable: six integrators in
+# a row give 2^6.
+GROWTH = 64.0
 # Bend that a start of the ranking keeps, in units of the bend, so that none is a symmetric point.
 REMAINDER = 0.1
 # Intervals of the mesh on which starts are compared.
@@ -233,9 +236,23 @@ def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Arra
         e=np.tile(e0, (mesh.intervals + 1, 1)),
         duration=statement.duration.guess,
     )
-    units = choose_scales(statement, mesh, still, parameters).u
+    units = moving_units(statement, mesh, still, parameters)
     far = (units > FAR_UNIT) | (units < 1.0 / FAR_UNIT)
     return np.where(untold & far, units, 1.0)
+
+
+def moving_units(statement: Statement, mesh: Mesh, along: Trajectory, parameters: Array) -> Array:
+    """Units of the controls (nu,) by what they move; 1 where it is little only because the plant amplifies it."""
+    units = choose_scales(statement, mesh, along, parameters).u.copy()
+    start, e0, duration = along.x[0], along.e[0], along.duration
+    small = [] if statement.coupled else np.flatnonzero(units < 1.0 / FAR_UNIT).tolist()
+    for i in small:
+        runs = [along.u, along.u + units[i] * np.eye(statement.nu)[i]]
+        base, moved = (simulate_states(statement, mesh, start, e0, u, duration, parameters) for u in runs)
+        change = np.abs(moved - base)
+        if (change.max(axis=0) > GROWTH * change[mesh.nodes <= 0.5].max(axis=0)).any():
+            units[i] = 1.0
+    return units
 
 
 def targets(run: Run) -> tuple[tuple[int, ...], Array]:
