@@ -142,6 +142,19 @@ def test_quiet_prints_nothing(capsys, tmp_path):
     assert (tmp_path / "f.pdf").exists()
 
 
+def test_a_script_that_takes_the_sine_of_a_symbol_is_told_whose_to_take(capsys, tmp_path):
+    """CasADi's own words are "'to_double' not defined"."""
+    path = tmp_path / "sine.py"
+    path.write_text(
+        "import math\nimport covocp as co\n\n\ndef make():\n    ocp = co.Problem(1.0)\n"
+        "    x = ocp.state('x', initial=0.0)\n    ocp.dynamics(x, math.sin(x))\n    return ocp\n"
+    )
+    code, _, error = run(capsys, "solve", f"{path}:make")
+    assert code != 0
+    assert "sine.py:8" in error
+    assert "casadi.sin and its like in place of math.sin" in " ".join(error.split())
+
+
 def test_a_function_of_a_script_is_solved(capsys, script):
     code, out, _ = run(capsys, "solve", f"{script}:make", "--set", "weight=2", "--set", "kind=3", "--intervals", 5)
     assert code == 0
