@@ -40,7 +40,8 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 class Point:
     """Where a run of the NLP solver ended: variables, multipliers for a cost scale of 1, and how it ended.
 
-    evaluable: whether the model has values there; else this is where the run began.
+    evaluable: whether the model has values there; else this is where the run began. concave: whether its steps showed a
+    negative curvature at last, so that it need not be a minimum.
     """
 
     w: Array
@@ -51,6 +52,7 @@ class Point:
     status: str
     iterations: int
     evaluable: bool
+    concave: bool = False
 
     __repr__ = short_repr
 

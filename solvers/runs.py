@@ -135,6 +135,7 @@ class Runs:
             "return_status": last.point.status,
             "hessian": "limited-memory" if self._limited else "exact",
         }
+        counts |= {"concave": True} if any(entry.point.concave for entry in rounds) else {}
         return last, counts | lost | ({"rounds": len(rounds)} if len(rounds) > 1 else {})
 
     def _rounds(self, nlp: Program, first: Point, parameters: Arrays, progress: Progress) -> list[Round]:
@@ -214,7 +215,9 @@ class Runs:
         if self._monitor is not None:
             self._monitor.attach(progress, scale, bounds, tentative, self._may_crawl)
         result, stats = self._called(solver, arguments)
+        concave = bool(stats.get("concave"))
         if self._monitor is not None and self._monitor.crawled:
+            concave = True
             self._monitor.attach(progress, scale, bounds, tentative)
             taken = int(stats.get("iter_count", 0))
             arguments["x0"] = np.clip(_numbers(result["x"]), bounds["lbx"], bounds["ubx"])
@@ -240,6 +243,7 @@ class Runs:
             status=status,
             iterations=int(stats.get("iter_count", -1)),
             evaluable=evaluable,
+            concave=concave,
         )
 
     @property

@@ -27,7 +27,7 @@ def experiment(kind: str, duration: float) -> co.Problem:
 
 
 def least_variance(kind: str, duration: float) -> float:
-    """The sensitivity of x to a is a convolution of u with a kernel of one sign: largest in size by u = 1 all the time."""
+    """The sensitivity of x to a is a convolution of u with a kernel of one sign: largest by u = 1 all the time."""
 
     def sensitivity(t: float) -> float:
         return t * np.exp(-t) - (1 - np.exp(-t)) if kind == "pole" else 1 - np.exp(-t)

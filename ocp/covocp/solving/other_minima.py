@@ -31,10 +31,13 @@ DISPLACEMENT = 0.3
 ESCAPES = (1.0, -1.0)
 # Share of the cost by which another end must be cheaper than the saddle, to be another one: not the same with roundoff.
 CHEAPER = 1e-9
+# Share of the cost that is not worth a word: a control that goes from bound to bound between two nodes is between them
+# at a node, where the cost is concave in it.
+HARDLY = 1e-5
 
 
 def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
-    """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it.
+    """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it, and leave a saddle along it.
 
     Args:
         prepared: what ran.
@@ -46,7 +49,8 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
     iterations = outcome.stats.get("iterations", -1)
     exact = outcome.stats.get("hessian") == "exact"
     few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
-    if not outcome.converged or not (few or _stayed(start.trajectory, outcome.extremal)):
+    suspicious = few or bool(outcome.stats.get("concave")) or _stayed(start.trajectory, outcome.extremal)
+    if not outcome.converged or not suspicious:
         return outcome
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal)
     if curvature is None or curvature.verdict != "saddle":
@@ -60,10 +64,14 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
     better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
         return outcome
+    best = min(better, key=cost_of)
+    together = counted(outcome, best)
+    if cost_of(outcome) - cost_of(best) <= HARDLY * abs(cost_of(outcome)):
+        return with_stats(best, **together)
     warn_user(
         "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
     )
-    return with_stats(min(better, key=cost_of), left_saddle=True)
+    return with_stats(best, **together, left_saddle=True)
 
 
 def _stayed(before: Trajectory, extremal: Extremal) -> bool:
