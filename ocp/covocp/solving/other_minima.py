@@ -37,7 +37,7 @@ HARDLY = 1e-5
 
 
 def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
-    """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it, and leave a saddle along it.
+    """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it; leave a saddle along it.
 
     Args:
         prepared: what ran.
