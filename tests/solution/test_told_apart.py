@@ -316,7 +316,7 @@ def test_instants_and_readings_of_an_earlier_file_are_those_of_its_own_values(
         (expected, {}),
         (turning, {}),
     ],
-    ids=str,
+    ids=lambda part: getattr(part, "__name__", str(part)),
 )
 def test_an_earlier_file_of_a_solution_is_not_refused(build: Builder, options: dict[str, Any], tmp_path: Path) -> None:
     with warnings.catch_warnings():
