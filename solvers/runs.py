@@ -25,6 +25,7 @@ from covocp.solvers.reached import (
     Point,
     Round,
     Start,
+    as_given,
     carried,
     not_zero,
     reached_scales,
@@ -184,7 +185,8 @@ class Runs:
     def _rescaled(self, last: Round, first: Program, parameters: Arrays, dual: bool) -> tuple[Program, Start]:
         """The NLP in the scales of the point that a run reached, and that point in its units."""
         nlp = last.nlp
-        scales = not_zero(nlp, reached_scales(nlp, last.where[0], parameters, again=nlp is not first))
+        reached = reached_scales(nlp, last.where[0], parameters, again=nlp is not first)
+        scales = not_zero(nlp, as_given(nlp, reached))
         if nlp is not self._nlp or not similar(nlp, scales):
             self._transcribe(scales, last.where[0], parameters)
         assert self._nlp is not None

@@ -36,6 +36,7 @@ from covocp.transcription.first_guess import (
     starts,
 )
 from covocp.transcription.mesh import Mesh, Options, control_places, explicit_substeps
+from covocp.transcription.scales import magnitudes, needed_controls
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory, at_nodes
@@ -47,6 +48,10 @@ FAINT = 0.05
 HALVINGS = 30
 # Share of the miss that the first step of steering may leave where a problem is plain.
 PLAIN_MISS = 0.3
+# The range of the bounds of a state counts up to so many times its magnitude (1 where it has none).
+WIDE = 1e3
+# A bend is at most so many times the change of a control that moves some state by its magnitude.
+REACH = 10.0
 # A control that steering moved by more than so many bends is not bent.
 FAR = 5.0
 # Bend that a start of the ranking keeps, in units of the bend, so that none is a symmetric point.
@@ -117,6 +122,8 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
         else:
             flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
             u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat)
+    elif statement.nu and statement.coupled:
+        u = _within_reach(statement, mesh, parameters, u)
     return First(trajectory=completed(statement, mesh, parameters, u), plain=plain)
 
 
@@ -148,11 +155,15 @@ def completed(
 
 
 def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
-    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give."""
+    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give.
+
+    Bounds that are far away say little: where something else tells the magnitude they are no more than so many times it.
+    """
     final = statement.boundary_values(parameters)[1]
     lower, upper = statement.state_bounds
     span = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), 0.0)
-    scale = np.maximum.reduce([np.abs(start), np.abs(np.nan_to_num(final)), span])
+    known = np.maximum(np.abs(start), np.abs(np.nan_to_num(final)))
+    scale = np.maximum(known, np.minimum(span, WIDE * np.where(known > 0, known, 1.0)))
     for block in statement.states:
         given = statement.scales.get(block.name)
         if given is not None:
@@ -202,13 +213,42 @@ def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
     """
     if not np.isfinite(run.start).all():
         return bent, True
-    bend = bent - flat
+    bend = (bent - flat) * _reachable(run, flat, np.abs(bent - flat).max(axis=0))
     size = bend_size(run, flat, bend)
     fixed, target = targets(run)
     steered, left = steer(run, fixed, target, flat) if fixed else (flat, 0.0)
     sign = np.where(np.sum((steered - flat) * bend, axis=0) < 0, -1.0, 1.0)
     far = np.linalg.norm(steered - flat, axis=0) > FAR * size * np.linalg.norm(bend, axis=0)
     return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
+
+
+def _reachable(run: Run, flat: Array, sizes: Array) -> Array:
+    """Shares of the bends of the controls, of these sizes, that do not move the states far beyond their magnitudes.
+
+    A bend of half the range between bounds that are far away would start, and measure all that follows, far from
+    anything that the problem is about.
+    """
+    t = Trajectory(x=run.start[None, :], u=flat, e=np.zeros((1, 0)), duration=run.duration)
+    needed = needed_controls(run.statement, run.mesh, t, run.divisors, run.parameters)
+    return _shares(run.statement, sizes, needed)
+
+
+def _shares(statement: Statement, sizes: Array, needed: Array) -> Array:
+    """REACH times what is needed over these sizes, at most 1; 1 where the scale is given or nothing is moved."""
+    with np.errstate(divide="ignore"):
+        shares = np.where((needed > 0) & (sizes > 0), np.minimum(1.0, REACH * needed / sizes), 1.0)
+    for block in statement.controls:
+        if block.name in statement.scales:
+            shares[block.span] = 1.0
+    return shares
+
+
+def _within_reach(statement: Statement, mesh: Mesh, parameters: Array, u: Array) -> Array:
+    """Bent controls whose bends do not move states far beyond their magnitudes, where covariances drive the states."""
+    flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+    t = completed(statement, mesh, parameters, flat)
+    needed = needed_controls(statement, mesh, t, magnitudes(statement, t, parameters).x, parameters)
+    return np.asarray(flat + _shares(statement, np.abs(u - flat).max(axis=0), needed) * (u - flat))
 
 
 def targets(run: Run) -> tuple[tuple[int, ...], Array]:
@@ -269,6 +309,7 @@ def _units(run: Run, flat: Array) -> Array:
     statement, units = run.statement, np.ones(run.statement.nu)
     for block in statement.controls:
         units[block.span] = control_scale(statement, block, flat[:, block.span])
+    units *= _reachable(run, flat, units)
     for i in range(statement.nu):
         bend = np.zeros_like(flat)
         bend[:, i] = units[i]
