@@ -22,7 +22,7 @@ STRETCH = 10.0
 # lesser one: at a start, which may not have moved it yet, and at a point that was reached, where less is roundoff.
 AT_START, REACHED = 1e-3, 1e-9
 # Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
-GIVEN_SHARE = 1e-3
+GIVEN_SHARE = 1e-6
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
 SMALL, LARGE = 0.1, 1e3
 
