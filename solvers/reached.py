@@ -205,7 +205,9 @@ def residuals(
     bounds = nlp.bounds(parameters)
     bound = scales is None
     if scales is None:
-        own = [(magnitudes(part.statement, t, p, reached=True), part) for part, t, p in nlp.each(trajectories, parameters)]
+        own = [
+            (magnitudes(part.statement, t, p, reached=True), part) for part, t, p in nlp.each(trajectories, parameters)
+        ]
         scales = tuple(replace(entry, u=np.maximum(entry.u, part.scales.u)) for entry, part in own)
     able = not_zero(nlp, scales)
     unit, row = nlp.units(able), nlp.row_units(able)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.errors import warn_user
+from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
@@ -20,6 +20,8 @@ LOST_LOOP = (
     "deviation is that of the error of the estimate alone. The cost and E do not depend on them. Use more intervals, "
     "or units in which initial variances and densities of the noise differ less."
 )
+# The method whose slopes are integrated, not those of its cost on the mesh; stationarity from which the two differ.
+OWN_SLOPES, NOT_STATIONARY = "gradient", 1e-3
 REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
 
 
@@ -43,11 +45,32 @@ def mention_doubts(solution: Solution) -> None:
     else:
         _mention_loop(solution)
     mention_spread(solution)
+    _mention_slopes(solution)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         warn_user(
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             "covariance_step='gauss' or more intervals."
+        )
+
+
+def _mention_slopes(solution: Solution) -> None:
+    """Warn of a point that is stationary by the slopes of the method alone, or of no minimum, where it has its own."""
+    if not solution.optimised or solution.method != OWN_SLOPES or solution.statement is None:
+        return
+    try:
+        found = solution.optimality
+    except (CovocpError, RuntimeError, ArithmeticError, ValueError):  # the report says that it is not known
+        return
+    if found.stationarity is not None and found.stationarity > NOT_STATIONARY:
+        warn_user(
+            f"The point is stationary by the slopes that the method integrates, not by those of its cost on this mesh "
+            f"(stationarity {found.stationarity:.1e}). Use more intervals, or method='ipopt' from there (guess=)."
+        )
+    if found.curvature is not None and found.curvature < 0:
+        warn_user(
+            f"This is no minimum: the reduced Hessian has a negative curvature, {found.curvature:.1e} of its largest. "
+            "Start elsewhere, or go on from there by method='ipopt' (guess=)."
         )
 
 
@@ -100,10 +123,11 @@ def mention_limits(solution: Solution) -> None:
             f"interval (points={2 * solution.mesh.points}, method 'ipopt'), or use more intervals."
         )
         return
+    where = "At points where" if passed[0].imposed else "Between the points where"
+    remedy = passed[0].remedy(solution.mesh.points)
     warn_user(
-        f"Between the points where it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
-        f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. Impose it at more points of each "
-        f"interval (points={2 * solution.mesh.points}, method 'ipopt'), use more intervals, or keep a margin."
+        f"{where} it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
+        f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. {remedy[0].upper()}{remedy[1:]}."
     )
 
 

@@ -90,7 +90,11 @@ def choose_scales(
     for block in free:
         magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
         own = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
-        own = np.minimum(own, _half_range(statement, block))
+        half = _half_range(statement, block)
+        if not reached:  # a bounded component of a vector that does nothing yet has the size of the others
+            least = np.maximum(magnitude.max(initial=0.0), AT_START * np.minimum(half, 1.0))
+            own = np.where(np.isfinite(half), np.maximum(own, least), own)
+        own = np.minimum(own, half)
         u[block.span] = _as_given(statement, block, own, own > 0, reached)
     return replace(scales, u=u)
 

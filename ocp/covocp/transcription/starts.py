@@ -157,7 +157,7 @@ def completed(
 def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
     """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give.
 
-    Bounds that are far away say little: where something else tells the magnitude they are no more than so many times it.
+    Bounds that are far away say little: they count up to so many times what something else tells.
     """
     final = statement.boundary_values(parameters)[1]
     lower, upper = statement.state_bounds
@@ -213,7 +213,7 @@ def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
     """
     if not np.isfinite(run.start).all():
         return bent, True
-    bend = (bent - flat) * _reachable(run, flat, np.abs(bent - flat).max(axis=0))
+    bend = (bent - flat) * reachable(run, flat, np.abs(bent - flat).max(axis=0))
     size = bend_size(run, flat, bend)
     fixed, target = targets(run)
     steered, left = steer(run, fixed, target, flat) if fixed else (flat, 0.0)
@@ -222,21 +222,26 @@ def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
     return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
 
 
-def _reachable(run: Run, flat: Array, sizes: Array) -> Array:
+def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH) -> Array:
     """Shares of the bends of the controls, of these sizes, that do not move the states far beyond their magnitudes.
+
+    Far is so many times, `reach`.
 
     A bend of half the range between bounds that are far away would start, and measure all that follows, far from
     anything that the problem is about.
     """
-    t = Trajectory(x=run.start[None, :], u=flat, e=np.zeros((1, 0)), duration=run.duration)
-    needed = needed_controls(run.statement, run.mesh, t, run.divisors, run.parameters)
-    return _shares(run.statement, sizes, needed)
+    x = run.states(flat)
+    x = x if np.isfinite(x).all() else run.start[None, :]
+    t = Trajectory(x=x, u=flat, e=np.zeros((1, run.statement.ne)), duration=run.duration)
+    scale = magnitudes(run.statement, t, run.parameters).x  # that of the run counts wide bounds as well
+    return _shares(run.statement, sizes, needed_controls(run.statement, run.mesh, t, scale, run.parameters), reach)
 
 
-def _shares(statement: Statement, sizes: Array, needed: Array) -> Array:
-    """REACH times what is needed over these sizes, at most 1; 1 where the scale is given or nothing is moved."""
-    with np.errstate(divide="ignore"):
-        shares = np.where((needed > 0) & (sizes > 0), np.minimum(1.0, REACH * needed / sizes), 1.0)
+def _shares(statement: Statement, sizes: Array, needed: Array, reach: float = REACH) -> Array:
+    """So many times what is needed over these sizes, at most 1; 1 without two bounds, with a scale, without effect."""
+    bounded = np.isfinite(statement.control_bounds).all(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(bounded & (needed > 0) & (sizes > 0), np.minimum(1.0, reach * needed / sizes), 1.0)
     for block in statement.controls:
         if block.name in statement.scales:
             shares[block.span] = 1.0
@@ -309,7 +314,7 @@ def _units(run: Run, flat: Array) -> Array:
     statement, units = run.statement, np.ones(run.statement.nu)
     for block in statement.controls:
         units[block.span] = control_scale(statement, block, flat[:, block.span])
-    units *= _reachable(run, flat, units)
+    units *= reachable(run, flat, units)
     for i in range(statement.nu):
         bend = np.zeros_like(flat)
         bend[:, i] = units[i]
