@@ -97,6 +97,18 @@ def test_a_condition_whose_other_limit_is_far():
     assert co.solve(slow(row=1e9), progress=False).cost == pytest.approx(SLOW, rel=1e-5)
 
 
+@pytest.mark.parametrize("upper", [1e4, 1e9])
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_a_condition_of_one_sign_whose_other_limit_is_far(upper, method):
+    """x(1) >= 1 with least energy: u = 1. In units of the upper limit nothing held: x(1) = 0, at no cost."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.subject_to(x - 1, at="final", lower=0.0, upper=upper)
+    ocp.minimize(running=u**2)
+    assert co.solve(ocp, method=method, intervals=10, progress=False).cost == pytest.approx(1.0, rel=1e-5)
+
+
 @pytest.mark.parametrize("upper", [10.0, 1e4, 1e8])
 def test_a_duration_with_a_wide_bound(upper):
     """T u^2 + T with u = 1/T is least at T = 1: 2."""
@@ -217,7 +229,15 @@ def test_a_state_that_has_not_moved_yet():
 
 @pytest.mark.parametrize(
     ("lower", "upper", "unit"),
-    [(-1e9, 0.3, 1.0), (-np.inf, 1e-3, 1e-3), (0.0, 1e5, 1e5), (2e4, 1e9, 2e4), (-np.inf, np.inf, 1.0), (0.01, 5, 1.0)],
+    [
+        (-1e9, 0.3, 1.0),
+        (-np.inf, 1e-3, 1e-3),
+        (0.0, 1e5, 1.0),
+        (2e4, 1e9, 2e4),
+        (-1e9, 1e-9, 1e-9),
+        (-np.inf, np.inf, 1.0),
+        (0.01, 5, 1.0),
+    ],
 )
 def test_units_of_limits(lower, upper, unit):
     assert limit_units(np.array([lower]), np.array([upper])) == pytest.approx([unit])

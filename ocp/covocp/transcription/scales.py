@@ -30,12 +30,11 @@ SMALL, LARGE = 0.1, 1e3
 def limit_units(lower: Array, upper: Array) -> Array:
     """Units of rows between limits: the larger one where it is small, the nearer one to zero where it is large, else 1.
 
-    A limit far away beside another (-1e9 <= v <= 0.3) says nothing of what it limits.
+    A large limit beside one that is not (-1e9 <= v <= 0.3, 0 <= v <= 1e9) says nothing of what it limits.
     """
     limits = np.abs(np.stack([lower, upper]))
-    known = np.isfinite(limits) & (limits > 0)
-    largest = np.where(known, limits, 0.0).max(axis=0)
-    nearest = np.where(known, limits, np.inf).min(axis=0)
+    nearest = np.where(np.isfinite(limits), limits, np.inf).min(axis=0)
+    largest = np.where(limits <= LARGE, limits, 0.0).max(axis=0)
     large = np.isfinite(nearest) & (nearest > LARGE)
     return np.where((largest > 0) & (largest < SMALL), largest, np.where(large, nearest, 1.0))
 

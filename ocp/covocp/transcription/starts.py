@@ -201,7 +201,7 @@ def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[in
     start = starts(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
-    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat))
+    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat, path))
     return run.clip(resampled(track(run, rows, path[:, list(rows)], flat), coarse, mesh))
 
 
@@ -222,16 +222,17 @@ def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
     return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
 
 
-def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH) -> Array:
+def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH, path: Array | None = None) -> Array:
     """Shares of the bends of the controls, of these sizes, that do not move the states far beyond their magnitudes.
 
-    Far is so many times, `reach`.
+    Far is so many times, `reach`; magnitudes are those of the unbent run, and of a path that is given.
 
     A bend of half the range between bounds that are far away would start, and measure all that follows, far from
     anything that the problem is about.
     """
     x = run.states(flat)
     x = x if np.isfinite(x).all() else run.start[None, :]
+    x = x if path is None else np.vstack([x, path])
     t = Trajectory(x=x, u=flat, e=np.zeros((1, run.statement.ne)), duration=run.duration)
     scale = magnitudes(run.statement, t, run.parameters).x  # that of the run counts wide bounds as well
     return _shares(run.statement, sizes, needed_controls(run.statement, run.mesh, t, scale, run.parameters), reach)
@@ -309,12 +310,12 @@ def _of_vectors(statement: Statement, rows: list[int], sizes: Array) -> Array:
     return np.where(result > 0, result, 1.0)[rows]
 
 
-def _units(run: Run, flat: Array) -> Array:
-    """Sizes of the bends of each control, from their effect on the states: constant changes."""
+def _units(run: Run, flat: Array, path: Array | None = None) -> Array:
+    """Sizes of the bends of each control, from their effect on the states, which may have a path: constant changes."""
     statement, units = run.statement, np.ones(run.statement.nu)
     for block in statement.controls:
         units[block.span] = control_scale(statement, block, flat[:, block.span])
-    units *= reachable(run, flat, units)
+    units *= reachable(run, flat, units, path=path)
     for i in range(statement.nu):
         bend = np.zeros_like(flat)
         bend[:, i] = units[i]
