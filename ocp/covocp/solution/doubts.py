@@ -27,7 +27,7 @@ REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or 
 
 def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
-    error = solution.mesh_error
+    error, fine = solution.mesh_error, False
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
@@ -43,9 +43,10 @@ def mention_doubts(solution: Solution) -> None:
             "its range. Use more intervals or substeps."
         )
     else:
+        fine = True
         _mention_loop(solution)
     mention_spread(solution)
-    _mention_slopes(solution)
+    _mention_slopes(solution, fine)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         warn_user(
@@ -54,15 +55,18 @@ def mention_doubts(solution: Solution) -> None:
         )
 
 
-def _mention_slopes(solution: Solution) -> None:
-    """Warn of a point that is stationary by the slopes of the method alone, or of no minimum, where it has its own."""
+def _mention_slopes(solution: Solution, fine: bool) -> None:
+    """Warn of a point that is stationary by the slopes of the method alone, or of no minimum, where it has its own.
+
+    fine: whether the mesh seems to be; else it was said why slopes and costs differ.
+    """
     if not solution.optimised or solution.method != OWN_SLOPES or solution.statement is None:
         return
     try:
         found = solution.optimality
     except (CovocpError, RuntimeError, ArithmeticError, ValueError):  # the report says that it is not known
         return
-    if found.stationarity is not None and found.stationarity > NOT_STATIONARY:
+    if fine and found.stationarity is not None and found.stationarity > NOT_STATIONARY:
         warn_user(
             f"The point is stationary by the slopes that the method integrates, not by those of its cost on this mesh "
             f"(stationarity {found.stationarity:.1e}). Use more intervals, or method='ipopt' from there (guess=)."
