@@ -195,7 +195,7 @@ def _places(mesh: Mesh, dense: Dense, points: int) -> Iterator[tuple[NDArray[np.
         yield np.concatenate([k, np.searchsorted(mesh.nodes, extra) - 1]), np.concatenate([s, extra])
 
 
-def _imposed(mesh: Mesh, k: Array, s: Array, points: int) -> NDArray[np.bool_]:
+def _imposed(mesh: Mesh, k: NDArray[np.intp], s: Array, points: int) -> NDArray[np.bool_]:
     """Which normalised times s are ends of so many equal parts of the intervals k, a column."""
     h = np.diff(mesh.nodes)[k]
     part = (s - mesh.nodes[k]) / np.where(h > 0, h, 1.0) * points

@@ -10,6 +10,7 @@ from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
+from covocp.transcription.scales import choose_scales
 
 # Relative difference of the cost and of that of the loop's own covariances above which these are not resolved.
 COARSE_LOOP = 1e-2
@@ -22,6 +23,8 @@ LOST_LOOP = (
 )
 # The method whose slopes are integrated, not those of its cost on the mesh; stationarity from which the two differ.
 OWN_SLOPES, NOT_STATIONARY = "gradient", 1e-3
+# Share of their magnitudes below which the controls do nothing.
+NOTHING = 1e-6
 REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
 
 
@@ -61,6 +64,11 @@ def _mention_slopes(solution: Solution, fine: bool) -> None:
     fine: whether the mesh seems to be; else it was said why slopes and costs differ.
     """
     if not solution.optimised or solution.method != OWN_SLOPES or solution.statement is None:
+        return
+    extremal = solution.extremal
+    t = extremal.trajectory
+    units = choose_scales(extremal.statement, extremal.mesh, t, extremal.parameters).u
+    if not (np.abs(t.u) > NOTHING * units).any():  # slopes are those of roundoff
         return
     try:
         found = solution.optimality
