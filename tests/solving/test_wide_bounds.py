@@ -90,6 +90,22 @@ def test_a_thrust_of_one_sign(upper):
     assert co.solve(ocp, progress=False).cost == pytest.approx(0.5 / square, rel=1e-5)
 
 
+@pytest.mark.parametrize("wide", [20.0, 50.0, 1e3, 1e5])
+def test_a_pendulum_swings_up_as_without_bounds(wide):
+    """A start that turned it forty times ended at other optima: 43765 and 1473336."""
+
+    def swung(bound: float) -> float:
+        ocp = co.Problem(5.0)
+        a, w = ocp.state("a", initial=0.0, final=np.pi), ocp.state("w", initial=0.0, final=0.0)
+        u = ocp.control("u", lower=-bound, upper=bound)
+        ocp.dynamics(a, w)
+        ocp.dynamics(w, -9.81 * ca.sin(a) + u)
+        ocp.minimize(running=u**2)
+        return co.solve(ocp, progress=False).cost
+
+    assert swung(wide) == pytest.approx(swung(np.inf), rel=1e-5)
+
+
 @pytest.mark.parametrize("states", [1e3, 1e6, 1e9])
 def test_states_between_wide_bounds(states):
     assert co.solve(slow(states=states), progress=False).cost == pytest.approx(SLOW, rel=1e-5)

@@ -51,7 +51,7 @@ PLAIN_MISS = 0.3
 # The range of the bounds of a state counts up to so many times its magnitude (1 where it has none).
 WIDE = 1e3
 # A bend is at most so many times the change of a control that moves some state by its magnitude.
-REACH = 3.0
+REACH = 4.0
 # A control that steering moved by more than so many bends is not bent.
 FAR = 5.0
 # Bend that a start of the ranking keeps, in units of the bend, so that none is a symmetric point.
