@@ -25,6 +25,7 @@ from covocp.solvers.reached import (
     Point,
     Round,
     Start,
+    as_given,
     carried,
     not_zero,
     reached_scales,
@@ -38,6 +39,8 @@ from covocp.transcription.separable import FOR_OWN, slopes
 MAX_ITERATIONS = 1000
 # Runs from one start, each in the scales of the point that the last one reached.
 LARGEST_ROUNDS = 6
+# So many of them are in the scales that the user gave; where these do not do, the point tells better.
+GIVEN_ROUNDS = 3
 # A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
 # of what is too much, between these.
 ENOUGH, STRICTEST, STRICTER = 0.3, 1e-3, 0.3
@@ -150,7 +153,8 @@ class Runs:
             best = _best(done)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
-            nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best)
+            given = len(done) < GIVEN_ROUNDS
+            nlp, start = self._rescaled(best, done[0].nlp, parameters, dual=done[-1] is best, given=given)
             before, begun = begun, (id(best), done[-1] is best)
             # the run would end where it begins, or as the last one did, which began there too
             if self._open and ((done[-1] is best and nlp is best.nlp) or before == begun):
@@ -187,10 +191,13 @@ class Runs:
             found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
         return Round(nlp=nlp, point=point, where=where, residuals=found, converged=found.hold(self._limit))
 
-    def _rescaled(self, last: Round, first: Program, parameters: Arrays, dual: bool) -> tuple[Program, Start]:
-        """The NLP in the scales of the point that a run reached, and that point in its units."""
+    def _rescaled(
+        self, last: Round, first: Program, parameters: Arrays, dual: bool, given: bool
+    ) -> tuple[Program, Start]:
+        """The NLP in the scales of the point that a run reached, or the given ones, and that point in its units."""
         nlp = last.nlp
-        scales = not_zero(nlp, reached_scales(nlp, last.where[0], parameters, again=nlp is not first))
+        reached = reached_scales(nlp, last.where[0], parameters, again=nlp is not first)
+        scales = not_zero(nlp, as_given(nlp, reached) if given else reached)
         if nlp is not self._nlp or not similar(nlp, scales):
             self._transcribe(scales, last.where[0], parameters)
         assert self._nlp is not None
