@@ -20,7 +20,7 @@ PROGRESS = 0.9
 NEAR = 1e-3
 # A run crawls after so many steps that are the same but for this share. The Hessian of limited memory is then the first
 # one, the identity: pairs without positive curvature are left out, and steps are unit steps along the gradient.
-SAME_STEPS, SAME = 5, 0.02
+SAME_STEPS, SAME = 8, 0.02
 # Rows that are violated by no more than this, in the units of the program, count as met.
 MET = 1e-6
 
