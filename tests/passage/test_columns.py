@@ -201,7 +201,8 @@ def test_many_problems_leave_nothing_behind():
         ocp.minimize(running=u**2, terminal=E[x, x])
         co.Solver(ocp, intervals=60, max_iterations=2).solve(progress=False, allow_failure=True, assess=False)
 
+    before = len(columns._KEPT)  # other tests may keep theirs
     for k in range(3 * KEPT):
         solved(0.1 + 0.01 * k)
     gc.collect()
-    assert len(columns._KEPT) < 2 * KEPT
+    assert len(columns._KEPT) - before < 2 * KEPT

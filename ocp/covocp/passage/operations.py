@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, distinct
 
 # CasADi's operations in the order of those in columns.h.
 KINDS = (
@@ -22,31 +22,11 @@ CONSTANT, INPUT, OUTPUT = (KINDS.index(name) for name in ("CONST", "INPUT", "OUT
 UNKNOWN = -1
 
 # Of which there are two arguments; inputs and outputs have two numbers too.
-_OF_TWO = np.isin(
-    KINDS,
-    [
-        "ADD",
-        "SUB",
-        "MUL",
-        "DIV",
-        "POW",
-        "LT",
-        "LE",
-        "EQ",
-        "NE",
-        "AND",
-        "OR",
-        "FMOD",
-        "COPYSIGN",
-        "IF_ELSE_ZERO",
-        "FMIN",
-        "FMAX",
-        "ATAN2",
-        "HYPOT",
-        "INPUT",
-        "OUTPUT",
-    ],
+_PAIRS = frozenset(
+    {"ADD", "SUB", "MUL", "DIV", "POW", "LT", "LE", "EQ", "NE", "AND", "OR", "FMOD", "COPYSIGN", "IF_ELSE_ZERO"}
+    | {"FMIN", "FMAX", "ATAN2", "HYPOT", "INPUT", "OUTPUT"}
 )
+_OF_TWO = np.array([name in _PAIRS for name in KINDS])
 
 # Of each operation its kind and three numbers, as in columns.h, and its constant.
 Program = tuple[NDArray[np.intc], Array]
@@ -97,7 +77,7 @@ def read_at_once(function: ca.Function) -> Program | None:
     if digits.size % 2 or digits.max(initial=0) > 15:
         return None
     content = (digits[0::2] | digits[1::2] << 4).tobytes()
-    places = np.unique(np.linspace(0, count - 1, COMPARED).astype(int))
+    places = distinct(np.linspace(0, count - 1, COMPARED).astype(int))
     kinds = np.array([function.instruction_id(int(k)) for k in places])
     for offset in range(4):
         numbers = np.frombuffer(content, "<i4", (len(content) - offset) // 4, offset)
