@@ -11,7 +11,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
-from covocp.extremal.path_limits import NOTED
+from covocp.extremal.path_limits import NOTED, acting
 from covocp.solution.chances import chance_section
 from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical, Origin
@@ -410,12 +410,22 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
         return "semidefinite" if solution.semidefinite else "INDEFINITE"
     if name == "mesh_error" and np.isnan(value) and solution.converged:
         return "not assessed"
+    if name == "control_error" and np.isnan(value) and solution.converged:
+        return _not_known(solution)
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
     return words if solution.converged and abs(value) > level else ""
+
+
+def _not_known(solution: Solution) -> str:
+    """What is said in place of the effect of the form of the controls: which limits act, and what tells more."""
+    shares = {} if solution.statement is None else acting(solution.extremal)
+    where = max(shares, key=lambda name: shares[name], default=None)
+    reason = "" if where is None else f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
+    return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="
 
 
 def _between_nodes(solution: Solution) -> Section:
