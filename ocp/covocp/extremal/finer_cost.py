@@ -9,6 +9,7 @@ more where a control changes much, limits at all of them; the difference of the 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal
-from covocp.statement.statement import Statement
+from covocp.extremal.links import Within
 from covocp.transcription.halved_steps import refined_run
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Mesh, control_places, readings_at, step_unit
@@ -33,7 +34,7 @@ MOST_ENTRIES = 21
 # quarter; a ramp in place of a jump becomes a third as long. Measured: 1.02 to 1.5 (tests/extremal/test_finer_cost.py).
 WHOLE = 4.0 / 3.0
 # The start is a solution but for what is sought: the barrier begins small and leaves it where it is.
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "print_level": 0,
     "sb": "yes",
     "tol": 1e-8,
@@ -50,7 +51,7 @@ MET, LARGE = 1e-6, 1e-3
 TINY = float(np.finfo(float).tiny)
 
 
-def change_on_finer_mesh(extremal: Extremal, size: float, held: bool) -> float | None:
+def change_on_finer_mesh(extremal: Extremal, size: float, within: Within | None) -> float | None:
     """Estimated error of the cost by the form of the controls and by limits that are missed between the nodes.
 
     Both have the same cause, a control that cannot follow its limit, and largely cancel: what is left of them counts.
@@ -58,31 +59,35 @@ def change_on_finer_mesh(extremal: Extremal, size: float, held: bool) -> float |
     Args:
         extremal: the solution.
         size: of the cost, in which it is measured.
-        held: whether the state is held at both ends, and the duration: the rest of a chain hangs on them.
+        within: what the rest of a chain says of it: the states are then held at both ends.
 
     Returns:
         The error relative to `size`; None where the finer mesh was not solved, or has too large matrices.
     """
     st = extremal.statement
-    if st.ne > (0 if held else MOST_ENTRIES):
+    if st.ne > (MOST_ENTRIES if within is None else 0):
         return None
     try:
         with np.errstate(all="ignore"):
-            return _change(extremal, max(size, TINY), held)
+            return _change(extremal, max(size, TINY), within)
     except (CovocpError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
         return None  # a step that cannot be differentiated, a start without a value
 
 
-def _change(extremal: Extremal, size: float, held: bool) -> float | None:
+def _change(extremal: Extremal, size: float, within: Within | None) -> float | None:
     """The same, where nothing fails."""
     st, t, parameters = extremal.statement, extremal.trajectory, extremal.parameters
     mesh, start = _finer(extremal)
     nlp = transcribe(st, mesh, choose_scales(st, mesh, start, parameters))
     w, p = nlp.pack(start), np.append(parameters, size)
     bounds = nlp.bounds(parameters)
-    if held:
-        _hold(nlp, w, bounds)
-    solver = ca.nlpsol("finer", "ipopt", {"x": nlp.w, "p": nlp.p, "f": nlp.f, "g": nlp.g}, {**QUIET, "ipopt": SETTINGS})
+    cost = nlp.f
+    if within is not None:
+        _hold(nlp, w, parameters, bounds)
+        if st.duration.free:
+            cost += within.by_duration / size * nlp.scales.duration * (nlp.w[-1] - w[-1])
+    settings: dict[str, Any] = {**QUIET, "ipopt": SETTINGS}
+    solver = ca.nlpsol("finer", "ipopt", {"x": nlp.w, "p": nlp.p, "f": cost, "g": nlp.g}, settings)
     found = {name: np.asarray(value).ravel() for name, value in solver(x0=w, p=p, **bounds).items()}
     before = refined_run(st, extremal.mesh, t, parameters, 1).running
     before += float(st.terminal(t.x[-1], t.e[-1], t.duration, parameters))
@@ -117,12 +122,14 @@ def _finer(extremal: Extremal) -> tuple[Mesh, Trajectory]:
     return finer, Trajectory(x=z[:, : st.nx], e=z[:, st.nx :], u=u, duration=t.duration)
 
 
-def _hold(nlp: NLP, w: Array, bounds: dict[str, Array]) -> None:
-    """Hold the states at both ends and the duration where they are (in place); there are no matrices."""
-    st: Statement = nlp.statement
+def _hold(nlp: NLP, w: Array, parameters: Array, bounds: dict[str, Array]) -> None:
+    """Hold the states at both ends where they are (in place), also a little beyond a limit; there are no matrices."""
+    nx, last = nlp.statement.nx, nlp.mesh.intervals * nlp.statement.nx
     kept = np.zeros(w.size, dtype=bool)
-    kept[: st.nx] = True
-    kept[nlp.mesh.intervals * st.nx : (nlp.mesh.intervals + 1) * st.nx] = True
-    kept[w.size - int(st.duration.free) :] = True
+    kept[:nx] = kept[last : last + nx] = True
     for name in ("lbx", "ubx"):
         bounds[name] = np.where(kept, w, bounds[name])
+    g, lower, upper = nlp.unpack(w, parameters)[1]["g"], bounds["lbg"], bounds["ubg"]
+    limits = lower < upper
+    bounds["ubg"] = np.where(limits & (g > upper) & (g < upper + MET), g, upper)
+    bounds["lbg"] = np.where(limits & (g < lower) & (g > lower - MET), g, lower)

@@ -139,9 +139,10 @@ def assess(
     left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
     others = 0.0 if within is None else within.size
-    control_slope, control_error = 0.0, 0.0
+    control_slope: float | None = 0.0
+    control_error: float | None = 0.0
     if st.nu and acting(extremal):
-        known = change_on_finer_mesh(extremal, absolute_cost(extremal) + others, within is not None)
+        known = change_on_finer_mesh(extremal, absolute_cost(extremal) + others, within)
         control_slope, control_error = None, np.nan if known is None else known
     elif st.nu and free is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])

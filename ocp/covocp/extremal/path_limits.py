@@ -88,8 +88,8 @@ def acting(extremal: Extremal) -> dict[str, float]:
 
 
 def _touching(values: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Which values (K, rows) are at a limit."""
-    result = np.zeros(values.shape, dtype=bool)
+    """Which values (K, rows) are at a limit; those of equations always are."""
+    result = np.broadcast_to(lower == upper, values.shape).copy()
     for limits in (lower, upper):
         known = np.isfinite(limits)
         limits = np.where(known, limits, 0.0)

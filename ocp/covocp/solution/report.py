@@ -422,9 +422,13 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
 
 def _not_known(solution: Solution) -> str:
     """What is said in place of the effect of the form of the controls: which limits act, and what tells more."""
-    shares = {} if solution.statement is None else acting(solution.extremal)
-    where = max(shares, key=lambda name: shares[name], default=None)
-    reason = "" if where is None else f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
+    reason = ""
+    if solution.statement is not None:
+        shares = acting(solution.extremal)
+        if not shares:
+            return ""
+        where = max(shares, key=lambda name: shares[name])
+        reason = f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
     return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="
 
 
