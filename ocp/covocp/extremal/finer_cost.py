@@ -48,7 +48,8 @@ SETTINGS: dict[str, Any] = {
 }
 # Scaled residual at which an iterate meets all constraints; a gain, relative, that is large whatever is left of it.
 MET, LARGE = 1e-6, 1e-3
-TINY = float(np.finfo(float).tiny)
+# Costs below this count as zero.
+NO_COST = 1e-12
 
 
 def change_on_finer_mesh(extremal: Extremal, size: float, within: Within | None) -> float | None:
@@ -69,7 +70,7 @@ def change_on_finer_mesh(extremal: Extremal, size: float, within: Within | None)
         return None
     try:
         with np.errstate(all="ignore"):
-            return _change(extremal, max(size, TINY), within)
+            return _change(extremal, max(size, NO_COST), within)
     except (CovocpError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
         return None  # a step that cannot be differentiated, a start without a value
 
