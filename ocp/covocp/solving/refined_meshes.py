@@ -276,13 +276,13 @@ def _beside_jumps(nodes: Array, extremal: Extremal, others: Array) -> Array:
     A jump that has nodes close on both sides and is not quite where it should be costs, in what is long beside it, less
     than a ramp over half of that would: without a node close to it neither mesh would move it, nor tell of it.
     """
-    h, u = np.diff(nodes), extremal.controls_at(0.5 * (nodes[1:] + nodes[:-1]))
-    first, last = extremal.controls_at(nodes[:-1]), extremal.controls_at(nodes[1:], before=True)
-    change = np.abs(last - first)
-    if extremal.mesh.control == "constant":
-        change = np.abs(np.diff(u, axis=0, append=u[-1:]))
-    span = np.ptp(extremal.controls, axis=0)
-    steep = (change >= CHANGING * np.where(span > 0, span, np.inf)).any(axis=1)
+    h, span = np.diff(nodes), np.ptp(extremal.controls, axis=0)
+    least = CHANGING * np.where(span > 0, span, np.inf)
+    inside = extremal.controls_at(nodes[:-1]), extremal.controls_at(nodes[1:], before=True)
+    steep = np.any(np.abs(inside[1] - inside[0]) >= least, axis=1)
+    if extremal.mesh.control == "constant":  # which jumps at nodes, between two intervals
+        jump = np.any(np.abs(np.diff(inside[0], axis=0)) >= least, axis=1)
+        steep[1:], steep[:-1] = steep[1:] | jump, steep[:-1] | jump
     added = []
     for k in np.flatnonzero(steep):
         for side, end in ((-1, nodes[k]), (1, nodes[k + 1])):
