@@ -81,7 +81,7 @@ WORRIES: dict[str, tuple[float, str]] = {
     ),
     "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
     "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
-    "control_error": (1e-3, "large: a freer control would cost that much less: more intervals, or control='linear'"),
+    "control_error": (1e-3, "large: the cost is off by about that: more intervals, refine=, or control='linear'"),
     "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
     "cross_covariance": (
         1e-2,
