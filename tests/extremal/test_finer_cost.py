@@ -221,3 +221,28 @@ def test_phases_below_a_speed():
     estimated = sum(solution[name].optimality.control_error for name in ("first", "second"))
     assert truth > 1e-4
     assert truth / FACTOR < estimated < truth * FACTOR
+
+
+def test_phases_with_covariances_that_go_on():
+    """What the later phase costs by the covariance counts; against the cost on ten times the intervals."""
+
+    def part(name: str, duration: float) -> co.Problem:
+        ocp = co.Problem(duration, name=name)
+        first = name == "first"
+        x = ocp.state("x", initial=0.0 if first else None, variance=1.0 if first else None)
+        b, u = ocp.unknown("b", mean=1.0, variance=5.0), ocp.control("u")
+        ocp.dynamics(x, -b * x + u, noise=1.0)
+        ocp.measurement("m", x, noise=1.0)
+        E = ocp.estimation_covariance()
+        ocp.subject_to(x, lower=-0.3, upper=0.3, name="room")
+        ocp.minimize(running=0.5 * u**2, terminal=0.0 if first else 10.0 * E[b, b])
+        return ocp
+
+    def solved(intervals: int) -> co.PhasesSolution:
+        return co.solve(co.Phases([part("first", 4.0), part("second", 6.0)]), intervals=intervals, progress=False)
+
+    solution = solved(10)
+    truth = abs(solution.cost / solved(100).cost - 1.0)
+    estimated = [solution[name].optimality.control_error for name in ("first", "second")]
+    assert min(estimated) > 1e-4
+    assert truth / FACTOR < sum(estimated) < truth * FACTOR
