@@ -18,6 +18,9 @@ from covocp.transcription.program import Program
 PATIENCE = 40
 PROGRESS = 0.9
 NEAR = 1e-3
+# A run crawls after so many steps that are the same but for this share. The Hessian of limited memory is then the first
+# one, the identity: pairs without positive curvature are left out, and steps are unit steps along the gradient.
+SAME_STEPS, SAME = 8, 0.02
 # Rows that are violated by no more than this, in the units of the program, count as met.
 MET = 1e-6
 
@@ -40,6 +43,28 @@ class Iterate:
         return (0.0, self.cost) if self.violation <= MET else (self.violation, self.cost)
 
 
+class _Steps:
+    """Steps of a run, and how many of the last ones were the same."""
+
+    def __init__(self) -> None:
+        """Begin."""
+        self._last: Array | None = None
+        self._step: Array | None = None
+        self._count = 0
+
+    def same(self, w: Array) -> int:
+        """How many steps up to this point were the one before them."""
+        last, before = self._last, self._step
+        self._last = w.copy()
+        if last is None:
+            return 0
+        self._step = self._last - last
+        size = float(np.abs(self._step).max(initial=0.0))
+        alike = before is not None and size > 0.0 and float(np.abs(self._step - before).max()) <= SAME * size
+        self._count = self._count + 1 if alike else 0
+        return self._count
+
+
 class Monitor(ca.Callback):
     """Ipopt's iteration callback: reports progress, and stops when the user asks."""
 
@@ -51,14 +76,31 @@ class Monitor(ca.Callback):
         self._bounds: dict[str, Array] = {}
         self._impatient, self.wandered = False, False
         self._least, self._since = np.inf, 0
+        self._steps, self._crawling, self.crawled = _Steps(), False, False
         self.best: Iterate | None = None  # of a run that a limit may end
         self.construct("progress", {})
 
-    def attach(self, progress: Progress, scale: float, bounds: dict[str, Array], impatient: bool = False) -> None:
-        """Report to this progress from now on; an impatient one stops a run that has lost its way."""
+    def attach(
+        self,
+        progress: Progress,
+        scale: float,
+        bounds: dict[str, Array],
+        impatient: bool = False,
+        crawling: bool = False,
+    ) -> None:
+        """Report to this progress from now on.
+
+        Args:
+            progress: who is told.
+            scale: of the cost.
+            bounds: of the program.
+            impatient: whether a run that has lost its way is stopped.
+            crawling: whether one is that crawls.
+        """
         self._progress, self._scale, self._bounds, self._iteration = progress, scale, bounds, 0
         self._impatient, self.wandered = impatient, False
         self._least, self._since = np.inf, 0
+        self._steps, self._crawling, self.crawled = _Steps(), crawling, False
         self.best = None
 
     def get_n_in(self) -> int:
@@ -103,7 +145,8 @@ class Monitor(ca.Callback):
                 self.best = replace(one, w=w.copy(), lam_x=lam_x.copy(), lam_g=lam_g.copy())
         self._progress.update(self._iteration, cost * self._scale, violation)
         self._iteration += 1
-        return self._progress.stop or self._wanders(violation)
+        self.crawled = self._crawling and self._steps.same(w) >= SAME_STEPS
+        return self._progress.stop or self.crawled or self._wanders(violation)
 
     def _wanders(self, violation: float) -> bool:
         """Whether a run that need not be finished has made no progress for long."""

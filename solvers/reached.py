@@ -16,7 +16,7 @@ from covocp.base.short_repr import short_repr
 from covocp.solvers.at_point import AtPoint, Weighed
 from covocp.transcription.nlp import NLP, Scales
 from covocp.transcription.program import Arrays, Program, Trajectories
-from covocp.transcription.scales import choose_scales, magnitudes
+from covocp.transcription.scales import choose_scales, magnitudes, with_given
 from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Scales fall by no more than this factor at a time: a state that is zero but for roundoff has no magnitude.
@@ -40,7 +40,8 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 class Point:
     """Where a run of the NLP solver ended: variables, multipliers for a cost scale of 1, and how it ended.
 
-    evaluable: whether the model has values there; else this is where the run began.
+    evaluable: whether the model has values there; else this is where the run began. concave: whether its steps showed a
+    negative curvature at last, so that it need not be a minimum.
     """
 
     w: Array
@@ -51,6 +52,7 @@ class Point:
     status: str
     iterations: int
     evaluable: bool
+    concave: bool = False
 
     __repr__ = short_repr
 
@@ -150,10 +152,15 @@ def reached_scales(nlp: Program, trajectories: Trajectories, parameters: Arrays,
     """
     result = []
     for part, trajectory, own in nlp.each(trajectories, parameters):
-        found = choose_scales(part.statement, part.mesh, trajectory, own)
+        found = choose_scales(part.statement, part.mesh, trajectory, own, reached=True)
         least = SMALLEST_SHARE * part.scales.u.reshape(-1, found.u.size).max(axis=0, initial=0.0) if again else 0.0
         result.append(replace(found, u=np.maximum(found.u, least), duration=trajectory.duration))
     return tuple(result)
+
+
+def as_given(nlp: Program, scales: Magnitudes) -> Magnitudes:
+    """Magnitudes in which the user wants a program to work: the scales that were given in place of what was found."""
+    return tuple(with_given(part.statement, own) for part, own in zip(nlp.parts, scales, strict=True))
 
 
 def not_zero(nlp: Program, scales: Magnitudes) -> Magnitudes:
@@ -200,7 +207,9 @@ def residuals(
     bounds = nlp.bounds(parameters)
     bound = scales is None
     if scales is None:
-        own = [(magnitudes(part.statement, t, p), part) for part, t, p in nlp.each(trajectories, parameters)]
+        own = [
+            (magnitudes(part.statement, t, p, reached=True), part) for part, t, p in nlp.each(trajectories, parameters)
+        ]
         scales = tuple(replace(entry, u=np.maximum(entry.u, part.scales.u)) for entry, part in own)
     able = not_zero(nlp, scales)
     unit, row = nlp.units(able), nlp.row_units(able)
@@ -210,12 +219,13 @@ def residuals(
     g, by_g = first.constraints(point.w, parameters, lam_g)
     free, unequal = bounds["ubx"] > bounds["lbx"], bounds["ubg"] > bounds["lbg"]
     slope = float(np.sum(np.abs(by_w + by_g + lam_x)[free] * unit[free]))
-    excess = np.maximum(np.maximum(bounds["lbg"] - g, g - bounds["ubg"]), 0.0)
+    lower, upper = bounds["lbg"], bounds["ubg"]
+    excess = np.maximum(np.maximum(lower - g, g - upper), 0.0)
     apart = np.maximum(np.maximum(bounds["lbx"] - point.w, point.w - bounds["ubx"]), 0.0)
     rest = float(np.sum(np.abs(lam_x * room_x)[free]) + np.sum(np.abs(lam_g * room_g)[unequal]))
     missed = float(np.sum(np.abs(lam_g) * excess))
-    for limits in (bounds["lbg"], bounds["ubg"]):  # the size of a limit is one of what it limits
-        row = np.maximum(row, np.where(np.isfinite(limits), np.abs(limits), 0.0))
+    passed = np.where(g > upper, upper, lower)  # its size is one of what it limits, that of the other one need not be
+    row = np.maximum(row, np.where(np.isfinite(passed), np.abs(passed), 0.0))
     worst = float(np.concatenate([excess / row, apart / unit]).max(initial=0.0))
     size = sum(abs(costs["running"]) + abs(costs["terminal"]) for costs in values["parts"])
     if not np.isfinite([slope, rest, missed, worst, size]).all():

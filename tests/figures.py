@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 
 def panels(figure):
     """Visible axes by their label."""
@@ -22,14 +24,18 @@ def legend_of(figure):
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
-def values_of(figure, label):
-    """Ordinates of the curves of a panel."""
-    return [line.get_ydata() for line in main_lines(panels(figure)[label])]
+def values_of(figure, label, at=None):
+    """Ordinates of the curves of a panel; `at`: those at some of the times."""
+    return [_ordinates(line, at) for line in main_lines(panels(figure)[label])]
 
 
-def edges_of(axes):
-    """Ordinates of the edges of the bands, which are thin lines."""
-    return [line.get_ydata() for line in axes.lines if line.get_linewidth() < 0.8 and len(line.get_xdata()) > 2]
+def _ordinates(line, at):
+    return line.get_ydata() if at is None else line.get_ydata()[np.isin(line.get_xdata(), at)]
+
+
+def edges_of(axes, at=None):
+    """Ordinates of the edges of the bands, which are thin lines; `at`: those at some of the times."""
+    return [_ordinates(line, at) for line in axes.lines if line.get_linewidth() < 0.8 and len(line.get_xdata()) > 2]
 
 
 def entries_of(axes):

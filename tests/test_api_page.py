@@ -13,6 +13,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import pytest
 
 import covocp as co
@@ -155,3 +156,16 @@ def test_the_namespace_shows_what_is_meant_and_nothing_else():
     assert all(hasattr(co, name) for name in dir(co))
     assert len(co.__all__) == len(shown)
     assert all(f"`{name}`" in co.__doc__ for name in co.__all__ if inspect.isfunction(getattr(co, name)))
+
+
+def test_what_may_be_a_list_in_dynamics_is_what_the_page_says() -> None:
+    """A rate is one expression; its noise may be a list that mixes numbers and expressions."""
+    (row,) = (line for line in SECTIONS["`Problem`"].splitlines() if line.startswith("| `dynamics("))
+    rate, noise = row.split("; noise: ")
+    assert "not a list" in rate
+    assert "as a list too, which may mix numbers and expressions" in noise
+    problem = co.Problem(1.0)
+    x, k = problem.state("x", 2, initial=0.0, variance=1.0), problem.parameter("k", 2.0)
+    with pytest.raises(co.ProblemError, match=r"(?s)rate of 'x' is not an expression.*casadi\.vertcat.*not lists"):
+        problem.dynamics(x, [x[1], -k * x[0]])
+    problem.dynamics(x, ca.vertcat(x[1], -k * x[0]), noise=[0.1, k])

@@ -111,6 +111,14 @@ class ChainSpace(Unknowns):
             parts.append(part.with_weights(Weights(**chosen)))
         return chain_space(tuple(parts), self.links)
 
+    def judged_at(self, iterate: Iterate) -> ChainSpace:
+        """The same with the magnitudes of the inequalities there, where those are smaller."""
+        assert isinstance(iterate, ChainIterate)
+        each = zip(self.parts, iterate.spaces, iterate.parts, strict=True)
+        parts = [replace(space, weights=part.weights).judged_at(own) for part, space, own in each]
+        scales = tuple(value for part in parts for value in part.weights.scales)
+        return self.with_weights(replace(self.weights, scales=scales))
+
     def with_extra(self, extra: Array) -> ChainSpace:
         """The same with other weights of what is no control value."""
         spans = _consecutive([part.extra.size for part in self.parts])
@@ -252,7 +260,8 @@ class ChainSpace(Unknowns):
     def violations(self, iterate: ChainIterate, tolerance: float) -> dict[str, float]:
         """Largest violation of each violated constraint, in its own unit, by name with that of the phase."""
         found: dict[str, float] = {}
-        for space, own in zip(iterate.spaces, iterate.parts, strict=True):
+        for part, space, own in zip(self.parts, iterate.spaces, iterate.parts, strict=True):
+            space = replace(space, weights=part.weights)
             prefix = f"{space.sweeps.statement.name}: "
             found |= {prefix + name: value for name, value in space.violations(own, tolerance).items()}
         return dict(sorted(found.items(), key=lambda entry: -entry[1]))

@@ -104,7 +104,9 @@ class GradientChainSolver:
             "history": tuple(search.control.history),
         }
         iterate, measures = end.iterate, end.measures
+        judged = search.space
         assert isinstance(iterate, ChainIterate)
+        assert isinstance(judged, ChainSpace)
         linear = space.linearise(iterate)
         assert isinstance(linear, ChainLinear)
         found, at_ends = space.multipliers(iterate, linear, measures)
@@ -128,7 +130,7 @@ class GradientChainSolver:
             cost_terms=tuple({"terminal": own.run.terminal, "running": own.run.running} for own in iterate.parts),
             converged=end.status is Status.SOLVED,
             message=end.status.told(misled),
-            violations=space.violations(iterate, self._settings.violation_tolerance),
+            violations=judged.violations(iterate, self._settings.violation_tolerance),
             stats=counts,
         )
 

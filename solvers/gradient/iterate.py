@@ -36,6 +36,7 @@ from covocp.solvers.gradient.penalty import (
     Weights,
     evaluate_penalty,
     first_weights,
+    judged_along,
     limited,
     limits,
 )
@@ -138,6 +139,21 @@ class Space(Unknowns):
         """The same with other penalties."""
         return replace(self, weights=weights)
 
+    def judged_at(self, iterate: Iterate) -> Space:
+        """The same with the magnitudes of the inequalities there, where those are smaller."""
+        run, sweeps = iterate.run, self.sweeps
+        if not self.groups or not run.finite:
+            return self
+        scales = self._scales_along(run)
+        known = (self.groups, sweeps.mesh, run, self.parameters, scales)
+        return self.with_weights(judged_along(*known, self.weights))
+
+    def _scales_along(self, run: Run) -> Scales:
+        """The magnitudes along a run that was reached."""
+        nx = self.sweeps.statement.nx
+        trajectory = Trajectory(x=run.z[:, :nx], u=run.u, e=run.z[:, nx:], duration=run.duration)
+        return choose_scales(self.sweeps.statement, self.sweeps.mesh, trajectory, self.parameters, reached=True)
+
     def linearise(self, iterate: Iterate, later: Later | None = None, first: Array | None = None) -> Linear:
         """Backward sweep at an iterate.
 
@@ -210,9 +226,7 @@ class Space(Unknowns):
     def reached_units(self, iterate: Iterate, linear: Linear, measures: Measures) -> tuple[Array, float]:
         """Magnitudes of the entries of a point there, and the change of the cost by those of the controls."""
         run, st = iterate.run, self.sweeps.statement
-        trajectory = Trajectory(x=run.z[:, : st.nx], u=run.u, e=run.z[:, st.nx :], duration=run.duration)
-        at_controls = choose_scales(st, self.sweeps.mesh, trajectory, self.parameters).u
-        at_controls = np.maximum(at_controls, ZERO * self.unit[: st.nu])
+        at_controls = np.maximum(self._scales_along(run).u, ZERO * self.unit[: st.nu])
         unit = np.concatenate([np.tile(at_controls, run.u.shape[0]), self.unit[self.controls :]])
         columns = linear.slopes.columns
         curvature = control_curvature(self.sweeps, run, run.u, columns, measures.ell, self.parameters)

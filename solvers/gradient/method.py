@@ -259,8 +259,10 @@ class GradientSolver:
         check_domain(current.run.finite, misled)
         search = Search(space, self._settings, progress)
         end = search.run(current)
+        judged = search.space
+        assert isinstance(judged, Space)
         return self._outcome(
-            space,
+            judged,
             end,
             misled,
             {

@@ -230,17 +230,37 @@ def first_weights(
 ) -> Weights:
     """Weights for the first pass: a violation by the magnitude of a row costs some times `size`; no shifts."""
     weights, magnitudes = [], []
-    z_scale = np.concatenate([scales.x, scales.e])
     for group in groups:
-        count, rows = group.nodes.size, len(group.names)
-        zero = np.zeros((count, rows))
-        outputs = _evaluate(group, mesh, run, parameters, zero, zero)
-        by_z, by_u = (v.reshape(rows, count, -1) for v in outputs[-2:])
-        magnitude = (by_z @ z_scale + by_u @ scales.u).max(axis=1, initial=0.0)
-        magnitude = np.where(magnitude > 0, magnitude, 1.0)
-        magnitudes.append(np.where(group.units < 1.0, np.minimum(magnitude, group.units), magnitude))
+        magnitude = _magnitudes(group, mesh, run, parameters, scales)
+        magnitudes.append(_at_limits(group, magnitude))
         weights.append(FIRST_WEIGHT * size * group.shares[:, None] / group.shares.sum() / magnitude**2)
     return Weights(weights=tuple(weights), shifts=tuple(np.zeros_like(w) for w in weights), scales=tuple(magnitudes))
+
+
+def judged_along(
+    groups: tuple[Group, ...], mesh: Mesh, run: Run, parameters: Array, scales: Scales, weights: Weights
+) -> Weights:
+    """The same weights with the magnitudes of the rows along another run, where those are smaller.
+
+    A start far away has magnitudes in which any violation is small.
+    """
+    found = [_at_limits(group, _magnitudes(group, mesh, run, parameters, scales)) for group in groups]
+    return replace(weights, scales=tuple(map(np.minimum, weights.scales, found)))
+
+
+def _magnitudes(group: Group, mesh: Mesh, run: Run, parameters: Array, scales: Scales) -> Array:
+    """What changes of states, matrices and controls by their magnitudes make of the rows of a group, at most."""
+    count, rows = group.nodes.size, len(group.names)
+    zero, z_scale = np.zeros((count, rows)), np.concatenate([scales.x, scales.e])
+    outputs = _evaluate(group, mesh, run, parameters, zero, zero)
+    by_z, by_u = (v.reshape(rows, count, -1) for v in outputs[-2:])
+    magnitude = (by_z @ z_scale + by_u @ scales.u).max(axis=1, initial=0.0)
+    return np.where(magnitude > 0, magnitude, 1.0)
+
+
+def _at_limits(group: Group, magnitude: Array) -> Array:
+    """Magnitudes of the rows of a group, no more than limits that are small."""
+    return np.where(group.units < 1.0, np.minimum(magnitude, group.units), magnitude)
 
 
 def _evaluate(group: Group, mesh: Mesh, run: Run, parameters: Array, weights: Array, shifts: Array) -> list[Array]:

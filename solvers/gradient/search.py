@@ -117,6 +117,7 @@ class Search:
             end = self._pass(current, tolerance)
             current = end.iterate
             self.passes += 1
+            space = self.space = space.judged_at(current)
             worst = space.violation(current)
             if end.status is not Status.SOLVED or not space.groups:
                 return end

@@ -70,6 +70,10 @@ class Unknowns(ABC):
         """The same with other penalties."""
 
     @abstractmethod
+    def judged_at(self, iterate: Iterate) -> Unknowns:
+        """The same with the magnitudes of the inequalities there, where those are smaller."""
+
+    @abstractmethod
     def with_extra(self, extra: Array) -> Unknowns:
         """The same with other weights of what is no control value."""
 

@@ -66,6 +66,7 @@ class Engine:
             "success": ended.status is Status.SOLVED,
             "return_status": str(ended.status),
             "iter_count": ended.iterations,
+            "concave": sequence.concave,
         }
         return {"x": ended.place.w, "lam_x": ended.lam_x, "lam_g": ended.lam_g}
 

@@ -23,7 +23,7 @@ from covocp.solvers.endings import Ending
 from covocp.solvers.reached import Magnitudes
 from covocp.solvers.reduced.engine import Engine
 from covocp.solvers.reduced.statuses import Status
-from covocp.solvers.runs import Runs, share_for
+from covocp.solvers.runs import Kind, Runs, share_for
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.program import Arrays, Program, Trajectories, alone
@@ -121,13 +121,13 @@ class ReducedRuns(Runs):
         self._open = True
         self._tolerance, self._most = tolerance, most
 
-    def _make(self, functions: dict[str, Any], warm: bool = False) -> Engine:
+    def _make(self, functions: dict[str, Any], kind: Kind = "cold") -> Engine:
         """The sequence on the present program; it needs no functions of another."""
         assert self._nlp is not None
         assert self._monitor is not None
         return Engine(self._nlp, self._tolerance, self._most, self._monitor)
 
-    def _solver(self, warm: bool) -> Engine:
+    def _solver(self, warm: bool, bold: bool = False) -> Engine:
         """The same for all starts: what was learnt stays."""
         engine = super()._solver(False)
         assert isinstance(engine, Engine)
@@ -136,13 +136,13 @@ class ReducedRuns(Runs):
 
     def _together(self) -> AtPoint | None:
         """Those of the sequence on the present program."""
-        engine = self._solvers.get(False)
+        engine = self._solvers.get("cold")
         return None if engine is None else engine.functions
 
     def _tighten(self, found: Residuals) -> None:
         """All by the tolerance: nothing here is compared with one. What led to no step at all is not asked again."""
         self._strictness *= share_for(found.worst / LIMIT)
-        engine = self._solvers.get(False)
+        engine = self._solvers.get("cold")
         if isinstance(engine, Engine) and engine.stats()["iter_count"] == 0:
             engine.forget()
 

@@ -126,6 +126,7 @@ class Sequence:
         """
         self._of, self._layout, self._bounds = functions, layout, bounds
         self._first, self._tolerance, self._most, self._watch = first, tolerance, most, watch
+        self.concave = False  # whether the last step that told of the curvature showed a negative one
 
     def run(self, start: Place, kept: Memory | None) -> Ended:
         """From a start, with what a run before left."""
@@ -284,7 +285,9 @@ class Sequence:
         closed = whole[self._layout.given] - moved_by
         if np.linalg.norm(closed) > CLOSING * np.hypot(np.linalg.norm(change), np.linalg.norm(moved_by)):
             return curvature
-        return learnt(curvature, change, self._difference(place, following, rows, lam_g))
+        difference = self._difference(place, following, rows, lam_g)
+        self.concave = float(change @ difference) < 0.0
+        return learnt(curvature, change, difference)
 
     def _difference(self, place: Place, following: Place, rows: Subproblem, lam_g: Array) -> Array:
         """Change of the slope of the Lagrangian, in the chosen variables."""

@@ -153,11 +153,40 @@ def test_one_indefinite_matrix_among_many():
 
 def test_the_semidefinite_part_is_the_nearest_covariance():
     """Of diag(2, -1) in a turned basis what is left is 2 along the first direction; a covariance stays what it is."""
-    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)  # both variances are the same: units change nothing
     np.testing.assert_allclose(
         semidefinite_part(turn @ np.diag([2.0, -1.0]) @ turn.T), 2 * np.outer(turn[:, 0], turn[:, 0])
     )
-    np.testing.assert_allclose(
-        semidefinite_part(turn @ np.diag([2.0, 1.0]) @ turn.T), turn @ np.diag([2.0, 1.0]) @ turn.T
-    )
+    covariance = turn @ np.diag([2.0, 1.0]) @ turn.T
+    assert semidefinite_part(covariance) is covariance
     assert semidefinite_part(np.array([[-9.9]])) == 0.0
+
+
+UNITS = [(1e3, 1e-6), (1e-6, 1e3), (1e6, 1e-6), (1.0, 1.0), (1e140, 1e135), (1e-150, 1e-140)]
+
+
+@pytest.mark.parametrize("units", UNITS)
+@pytest.mark.parametrize("correlation", [0.0, -0.5, 0.999, 1.0, 1.001, -2.0])
+def test_a_covariance_is_one_in_all_units(units, correlation):
+    """A correlation of two is none, however small the other variance is beside the larger one."""
+    scale = np.diag(units)
+    plain = np.array([[1.0, correlation], [correlation, 1.0]])
+    assert is_semidefinite(scale @ plain @ scale) == (abs(correlation) <= 1)
+    part = np.linalg.inv(scale) @ semidefinite_part(scale @ plain @ scale) @ np.linalg.inv(scale)
+    most = max(1.0, (1.0 + abs(correlation)) / 2)  # of the eigenvalues 1 + |rho| and 1 - |rho| the first is left
+    kept = np.sign(correlation) * most if abs(correlation) > 1 else correlation
+    np.testing.assert_allclose(part, [[most, kept], [kept, most]], rtol=1e-6)
+
+
+def test_what_is_left_of_a_large_variance_is_known_to_its_rounding():
+    """Two variances fall by 16 orders: what rounding leaves of their correlation at the end tells nothing."""
+    left = np.array([[1.0, 1.0 + 1e-3], [1.0 + 1e-3, 1.0]])
+    assert not is_semidefinite(left)
+    assert is_semidefinite(np.stack([1e16 * np.eye(2), left]))
+    assert not is_semidefinite(np.stack([1e6 * np.eye(2), left]))
+
+
+def test_what_rounding_leaves_beside_a_large_variance_is_forgiven():
+    assert is_semidefinite(np.array([[1e6, 1e-12], [1e-12, -1e-16]]))
+    assert is_semidefinite(np.array([[1e6, 1e-12], [1e-12, 0.0]]))
+    assert not is_semidefinite(np.array([[1e6, 1e-3], [1e-3, 0.0]]) + 1e-30 * np.eye(2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -238,3 +240,15 @@ def still(C, x):
 def test_wrong_arguments_are_named(call, argument):
     with pytest.raises(ProblemError, match=argument):
         call()
+
+
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+def test_functions_of_numbers_in_a_users_dynamics_are_named(kind):
+    """CasADi's own words are "'to_double' not defined", and of an SX math.sin makes NaN in silence."""
+    C, x = kind.sym("C", 3, 3), kind.sym("x", 3)
+    with pytest.raises(ProblemError, match=r"'dynamics'(?s:.)*casadi\.sin and its like in place of math\.sin"):
+        so3.runge_kutta_step(lambda C, x: (ca.vertcat(math.sin(x[0]), x[1], 0), x), C, x, 0.1)
+    with pytest.raises(ProblemError, match=r"'function'(?s:.)*casadi\.sin and its like in place of math\.sin"):
+        so3.body_gradient(lambda C: math.sin(C[0, 0]), C)
+    with pytest.raises(ProblemError, match=r"'function'(?s:.)*casadi\.if_else"):
+        so3.body_gradient(lambda C: C[0, 0] if C[0, 0] > 0 else 0.0, C)

@@ -269,3 +269,21 @@ def test_expressions_off_the_rotations_are_finite():
 def test_wrong_arguments_are_named(call, argument):
     with pytest.raises(ProblemError, match=argument):
         call()
+
+
+@pytest.mark.parametrize("size", [1e155, 1e200, 1e308])
+@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.5, -1.0, 0.25]])
+def test_a_vector_whose_square_is_no_number_is_a_rotation_about_its_axis(size, direction):
+    """Its angle is known to many turns only, but its axis is."""
+    vector = size * np.array(direction)
+    axis = np.array(direction) / np.linalg.norm(direction)
+    C, J = so3.exp(vector), so3.left_jacobian(vector)
+    assert so3.is_rotation(C, tolerance=1e-14)
+    np.testing.assert_allclose(C @ axis, axis, atol=1e-14)
+    np.testing.assert_allclose(J, np.outer(axis, axis), atol=1e-14)  # the mean of the rotations up to it
+    for kind in (ca.SX, ca.MX):
+        v = kind.sym("v", 3)
+        found = ca.Function("exp", [v], [so3.exp(v), so3.left_jacobian(v), ca.jacobian(so3.exp(v), v)])(vector)
+        np.testing.assert_allclose(found[0].full(), C, atol=1e-14)
+        np.testing.assert_allclose(found[1].full(), J, atol=1e-14)
+        assert np.isfinite(found[2].full()).all()

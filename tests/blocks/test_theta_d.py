@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import subprocess
 
 import casadi as ca
@@ -431,6 +432,8 @@ def test_factorisation_is_checked_at_states():
     f = ca.DM(A0) @ X + A @ X
     theta_d.check_factorisation(X, A0, A, f)
     theta_d.check_factorisation(X, A0, A, lambda x: ca.DM(A0) @ x + A @ x)
+    with pytest.raises(co.ProblemError, match=r"casadi\.sin and its like in place of math\.sin"):
+        theta_d.check_factorisation(X, A0, A, lambda x: ca.vertcat(math.sin(x[0]), x[1], x[2]))
     with pytest.raises(co.ProblemError, match=r"component 1 of f[^$]*at x = \("):
         theta_d.check_factorisation(X, A0, A, f + ca.vertcat(0.0, 1e-6 * X[2] ** 2, 0.0))
     away = ca.vertcat(0.0, ca.fmax(X[0] - 50.0, 0.0), 0.0)

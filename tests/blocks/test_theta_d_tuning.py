@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import covocp as co
-from covocp.blocks import sdre, theta_d
+from covocp.blocks import sdre, theta_d, theta_d_tuning
 from covocp.models import agile_aircraft, theta_d_benchmarks
 from covocp.simulation.laws import simulate_law
 
@@ -95,6 +97,44 @@ def test_conditions_of_theorem_3_1():
             assert found.largest_transformed < 0.0
             assert np.all(found.guaranteed > 0.0)
             assert np.all(found.guaranteed <= found.radius)
+
+
+def exact_squares(A):
+    """Pi of A' Pi + Pi A = -I for a 3 x 3 matrix of floats, solved in fractions."""
+    a = [[Fraction(float(entry)) for entry in row] for row in A]
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    rows = []
+    for i, j in pairs:
+        row = [Fraction(0)] * 6 + [Fraction(-1 if i == j else 0)]
+        for k in range(3):
+            row[pairs.index((min(k, j), max(k, j)))] += a[k][i]
+            row[pairs.index((min(i, k), max(i, k)))] += a[k][j]
+        rows.append(row)
+    for c in range(6):
+        pivot = next(r for r in range(c, 6) if rows[r][c])
+        rows[c], rows[pivot] = rows[pivot], rows[c]
+        rows[c] = [v / rows[c][c] for v in rows[c]]
+        rows = [r if k == c else [v - r[c] * w for v, w in zip(r, rows[c], strict=True)] for k, r in enumerate(rows)]
+    found = np.zeros((3, 3))
+    for (i, j), row in zip(pairs, rows, strict=True):
+        found[i, j] = found[j, i] = float(row[6])
+    return found
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (1.0, 1e-5, 1e5), (1e5, 1.0, 1e-5)])
+@pytest.mark.parametrize("seed", range(4))
+def test_coordinates_of_theorem_3_1_in_mixed_units(units, seed):
+    """Entries 16 orders apart left the small eigenvalues of Pi no digit, some a minus, and (iv) had seemed to fail."""
+    plain = np.random.default_rng(seed).standard_normal((3, 3))
+    plain -= (np.linalg.eigvals(plain).real.max() + 1.0) * np.eye(3)
+    closed = np.diag(units) @ plain @ np.diag(1.0 / np.array(units))
+    squares = exact_squares(closed)
+    root, inverse = theta_d_tuning._coordinates(closed)
+    sizes = np.sqrt(np.diag(squares))
+    np.testing.assert_allclose(root.T @ root / np.outer(sizes, sizes), squares / np.outer(sizes, sizes), atol=1e-6)
+    np.testing.assert_allclose(root @ inverse, np.eye(3), atol=1e-12)
+    moved = root @ closed @ inverse
+    assert np.linalg.eigvalsh(moved + moved.T)[-1] < 1e-12  # exactly -1 / the largest eigenvalue of Pi
 
 
 def test_guaranteed_radius_bounds_the_terms():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -205,6 +207,7 @@ def test_steps_do_not_depend_on_the_coordinates(seed, size, count):
         ({"covariance": np.zeros((2, 2)), "R": 0.0, "form": "sequential"}, "innovation(?s:.)*singular"),
         ({"R": 0.0, "form": "information"}, "R is singular"),
         ({"covariance": np.zeros((2, 2)), "form": "information"}, "covariance is singular"),
+        ({"covariance": np.zeros((2, 2)), "form": "information"}, "form='sequential' or 'joseph'"),
         ({"estimate": "x"}, "numbers or a CasADi expression"),
         ({"covariance": ca.SX.sym("P", 2, 2), "H": ca.MX.sym("H", 1, 2)}, "mix SX and MX"),
     ],
@@ -213,6 +216,25 @@ def test_bad_arguments(change, message):
     arguments = {"estimate": [0.0, 0.0], "covariance": np.eye(2), "measurement": 1.0, "H": [1.0, 0.0], "R": 1.0}
     with pytest.raises(ProblemError, match=message):
         kalman.update(**(arguments | change))
+
+
+@pytest.mark.parametrize("form", ["joseph", "standard"])
+def test_refusal_of_two_accurate_sensors_names_the_form_that_takes_them(form):
+    """Their innovation is singular to rounding; row by row the update is exact."""
+    prior, noise = 1e6, 1e-12
+    arguments = ([0.0], np.array([[prior]]), [3.0, 3.0], np.ones((2, 1)), noise * np.eye(2))
+    with pytest.raises(ProblemError, match=r"innovation(?s:.)*singular(?s:.)*form='sequential'"):
+        kalman.update(*arguments, form=form)
+    estimate, covariance = kalman.update(*arguments, form="sequential")
+    inverse = 1 / Fraction(prior) + 2 / Fraction(noise)
+    assert covariance[0, 0] == pytest.approx(float(1 / inverse), rel=1e-3)
+    assert estimate[0] == pytest.approx(float(6 / Fraction(noise) / inverse), rel=1e-12)
+
+
+def test_factor_update_in_turn_names_the_array_form_where_noises_depend():
+    root = np.array([[1.0, 0.0], [1.0, 0.0]])
+    with pytest.raises(ProblemError, match=r"singular(?s:.)*form='array'"):
+        kalman.update_factor([0.0], np.eye(1), [1.0, 1.0], np.ones((2, 1)), root, form="sequential")
 
 
 def test_bad_arguments_of_predict():

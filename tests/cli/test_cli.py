@@ -8,6 +8,7 @@ import sys
 import pytest
 
 import covocp as co
+import covocp.cli.commands
 import covocp.models
 import covocp.plot.figure
 from covocp.base.progress import Progress
@@ -97,6 +98,16 @@ def test_help_of_a_command_that_solves_names_the_options_of_the_solver(capsys):
     assert "values of --option" not in run(capsys, "list", "--help")[1]
 
 
+def test_help_of_compare_lists_what_compare_takes(capsys):
+    """What an expected cost is solved for is no option of it, and options by method are none of solve."""
+    listed = {command: run(capsys, command, "--help")[1] for command in ("solve", "compare")}
+    assert "nominal=deterministic" in listed["solve"]
+    assert "nominal" not in listed["compare"]
+    assert "METHOD.NAME=VALUE" in listed["compare"]
+    assert "METHOD.NAME" not in listed["solve"]
+    assert "ipopt, gradient by default" in " ".join(listed["compare"].split())
+
+
 def test_unknown_options_are_told_by_the_command_with_the_nearest_one(capsys):
     code, out, err = run(capsys, "solve", "unknown_lag", "--interval", "50")
     assert (code, out) == (2, "")
@@ -129,6 +140,19 @@ def test_quiet_prints_nothing(capsys, tmp_path):
     )
     assert (code, out, err) == (0, "", "")
     assert (tmp_path / "f.pdf").exists()
+
+
+def test_a_script_that_takes_the_sine_of_a_symbol_is_told_whose_to_take(capsys, tmp_path):
+    """CasADi's own words are "'to_double' not defined"."""
+    path = tmp_path / "sine.py"
+    path.write_text(
+        "import math\nimport covocp as co\n\n\ndef make():\n    ocp = co.Problem(1.0)\n"
+        "    x = ocp.state('x', initial=0.0)\n    ocp.dynamics(x, math.sin(x))\n    return ocp\n"
+    )
+    code, _, error = run(capsys, "solve", f"{path}:make")
+    assert code != 0
+    assert "sine.py:8" in error
+    assert "casadi.sin and its like in place of math.sin" in " ".join(error.split())
 
 
 def test_a_function_of_a_script_is_solved(capsys, script):
@@ -182,6 +206,49 @@ def test_compare_ends_with_one_where_a_run_failed(capsys):
     )
     assert code == 1
     assert "ipopt: did not converge" in out
+
+
+INFEASIBLE = """
+import covocp as co
+
+def infeasible():
+    ocp = co.Problem(duration=2.0, name="infeasible")
+    x = ocp.state("x", initial=0.0, final=10.0)
+    u = ocp.control("u", lower=-1, upper=1)
+    ocp.dynamics(x, u - x)
+    ocp.minimize(running=u**2)
+    return ocp
+"""
+
+
+def test_a_quiet_compare_says_which_run_failed_and_why(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    script = tmp_path / "infeasible.py"
+    script.write_text(INFEASIBLE, encoding="utf-8")
+    model = f"{script}:infeasible"
+    code, out, err = run(capsys, "compare", model, "--quiet", "--method", "ipopt", "--intervals", 5)
+    assert (code, out) == (1, "")
+    assert err.startswith("covocp: ipopt: did not converge: ")
+    assert run(capsys, "compare", "noisy_integrator", "--quiet", "--method", "ipopt", "--intervals", 10) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--option", "nominal=deterministic"], "'ipopt' has no option 'nominal' here"),
+        (["--option", "variant=gradient"], "write --option gradient.variant=VALUE"),
+        (["--option", "tolerances=1"], "perhaps 'tolerance' is meant"),
+        (["--method", "ipopt", "--option", "gradient.variant=gradient"], "add --method gradient"),
+        (["--method", "ipopt", "--option", "ipopt.variant=gradient"], "remove it"),
+        (["--method", "ipopt", "--method", "ipopt"], "A method is given twice"),
+        (["--method", "simplex"], "correct --method"),
+    ],
+)
+def test_wrong_options_of_compare_are_refused_in_words_of_the_command(capsys, arguments, words):
+    outcome = run(capsys, "compare", "noisy_integrator", "--intervals", "10", *arguments)
+    assert_refused(outcome, words)
+    assert "method_options" not in outcome[2]
+    assert "methods=" not in outcome[2]
 
 
 def test_plot_draws_the_figures_of_the_source(capsys, tmp_path):
@@ -417,11 +484,51 @@ def test_wrong_commands_are_refused_by_the_parser(capsys, arguments):
     assert "usage: covocp" in err
 
 
-def test_a_reader_that_has_gone_is_no_error():
-    command = f"{sys.executable} -m covocp list | true; echo ${{PIPESTATUS[0]}}"
+@pytest.mark.parametrize("command", ["list", "compare --help", "--version"])
+def test_a_reader_that_has_gone_is_no_error(command):
+    command = f"{sys.executable} -m covocp {command} | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "0"
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("solve noisy_integrator --intervals 10 --save out.npz", 0),
+        ("solve unknown_lag --intervals 30 --option max_iterations=3 --save out.npz", 1),
+        ("compare noisy_integrator --method ipopt --intervals 10 --plot out.png", 0),
+    ],
+)
+def test_files_are_written_and_the_exit_code_is_right_where_the_reader_has_gone(tmp_path, command, code):
+    """Neither stream has a reader: the errors go into the same pipe."""
+    line = f"{sys.executable} -m covocp {command} 2>&1 | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.stdout.strip(), done.stderr) == (str(code), "")
+    assert all((tmp_path / name).exists() for name in ("out.npz", "out.png") if name in command)
+
+
+def test_files_are_written_before_anything_is_printed(capsys, tmp_path, monkeypatch):
+    """A reader that pages, such as less, holds the output back; what was found must not wait for it."""
+    file, seen = tmp_path / "solution.npz", []
+    monkeypatch.setattr(covocp.cli.commands, "_print", lambda text, *_, **__: seen.append((text, file.exists())))
+    assert run(capsys, "solve", "noisy_integrator", "--intervals", 10, "--save", file)[0] == 0
+    assert seen[0][1]
+    assert f"solution: {file}" in seen[0][0]
+
+
+def test_a_figure_that_cannot_be_drawn_hides_no_solution(capsys, tmp_path, monkeypatch):
+    def failing(*arguments, **options):
+        raise co.ProblemError("No figure.", expected="one", received="none", remedy="none")
+
+    monkeypatch.setattr(covocp.plot.figure, "plot_solutions", failing)
+    files = ["--plot", tmp_path / "f.png", "--save", tmp_path / "s.npz"]
+    outcome = run(capsys, "solve", "noisy_integrator", "--intervals", 10, *files)
+    assert outcome[0] == 2
+    assert outcome[1].startswith("integrator with state-dependent noise: solved")
+    assert f"solution: {tmp_path / 's.npz'}" in outcome[1]
+    assert "figure:" not in outcome[1]
+    assert "covocp: No figure." in outcome[2]
 
 
 def test_other_problems_of_a_model_and_none_as_a_value() -> None:

@@ -10,6 +10,7 @@ from problems import solve
 
 import covocp as co
 from covocp.plot.figure import plot_solutions
+from covocp.plot.legends import axis_label, entry_labels
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,57 @@ def test_nothing_is_cut_from_a_figure_of_one_panel(walk, runs, title):
     figure = plot_solutions([walk, walk], "p[0]", labels=labels, title=title)
     assert inside(figure)
     assert "".join(legend_of(figure)[0].split()) == "".join(labels[0].split())
+
+
+LONG = "position_of_the_vehicle_in_the_inertial_frame_of_reference"
+
+
+@pytest.fixture(scope="module")
+def lengthy():
+    """A problem whose names are much longer than a panel."""
+    ocp = co.Problem(1.0, "lengthy")
+    x = ocp.state(LONG, initial=0.0, final=1.0, variance=1.0, unit="m")
+    v = ocp.state("v", initial=0.0, variance=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=0.1)
+    ocp.dynamics(v, u - v)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[x, x])
+    return solve(ocp, intervals=10)
+
+
+@pytest.mark.parametrize("how", ["usual", "asked", "alone", "over", "costates"])
+def test_long_names_stay_within_their_panels(lengthy, how):
+    names = {
+        "asked": ([LONG, "v"], (LONG, "v"), {"a label of the user's own that says much too much " * 3: LONG}, "u"),
+        "alone": (LONG,),
+        "over": ("v",),
+    }
+    options = {"over": {"over": LONG}, "costates": {"costates": True}}
+    figure = lengthy.plot(*names.get(how, ()), **options.get(how, {}))
+    figure.canvas.draw()
+    axes = [place for place in figure.axes if place.get_visible()]
+    page = figure.bbox
+    for place in axes:
+        own, outer = place.get_window_extent(), place.get_tightbbox()
+        assert outer.x0 >= 0
+        assert outer.y0 >= 0
+        assert outer.x1 <= page.width
+        assert outer.y1 <= page.height
+        assert own.width > 0.15 * page.width  # what labels take is not taken from the curves
+        assert not any(outer.overlaps(other.get_window_extent()) for other in axes if other is not place)
+        if place.get_legend() is not None:
+            assert place.get_legend().get_window_extent().width <= own.width
+    labels = "".join(place.get_ylabel() + place.get_xlabel() for place in axes).replace("\n", "")
+    assert "position_of_the_vehicle" in labels
+    assert "…" in labels
+
+
+def test_labels_that_fit_are_left_alone():
+    assert axis_label("E[v[0], v[0]] [(m/s)²]") == "E[v[0], v[0]] [(m/s)²]"
+    assert axis_label("rms of log_density [ln(slug/ft^3)]") == "rms of log_density\n[ln(slug/ft^3)]"
+    assert axis_label("a name of more than one line of a panel") == "a name of more than one\nline of a panel"
+    assert entry_labels([f"accelerometer[{i}]" for i in range(4)]) == ([f"accelerometer[{i}]" for i in range(4)], 2)
 
 
 def test_a_path_has_equal_axes_where_units_agree(walk):

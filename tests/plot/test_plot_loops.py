@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from figures import edges_of, entries_of, legend_of, main_lines, panels, values_of
 from matplotlib.colors import to_hex
 from problems import constrained_gain, solve
+from scipy.integrate import solve_ivp
 
 import covocp as co
 from covocp.models import mars_entry, unknown_lag
+from covocp.plot.curves import Drawn
 from covocp.plot.figure import COLOURS, plot_solutions
 
 
@@ -45,7 +49,7 @@ def test_a_closed_loop_shows_what_the_actual_system_does(combined):
         ("u", combined["u"], fed_back),
         ("b (estimate)", combined["b"], loop.E[:, 1, 1]),
     ):
-        low, high = edges_of(panels(figure)[label])
+        low, high = edges_of(panels(figure)[label], combined.t)
         np.testing.assert_allclose((high + low) / 2, value, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose((high - low) / 2, np.sqrt(variance), rtol=1e-9, atol=1e-12)
 
@@ -54,11 +58,50 @@ def test_root_mean_squares_have_their_parts(combined):
     figure = combined.plot("rms")
     assert list(panels(figure)) == ["rms of x", "rms error of b"]
     loop = combined.loop
-    for curve, matrix in zip(values_of(figure, "rms of x"), (loop.X, loop.E, loop.Xhat), strict=True):
+    for curve, matrix in zip(values_of(figure, "rms of x", combined.t), (loop.X, loop.E, loop.Xhat), strict=True):
         np.testing.assert_allclose(curve, np.sqrt(matrix[:, 0, 0]), rtol=1e-9)
     assert entries_of(panels(figure)["rms of x"]) == ["deviation", "error of the estimate", "estimate"]
-    (error,) = values_of(figure, "rms error of b")
+    (error,) = values_of(figure, "rms error of b", combined.t)
     np.testing.assert_allclose(error, np.sqrt(loop.E[:, 1, 1]), rtol=1e-9)
+
+
+def coarse(control="linear"):
+    """A loop on ten intervals, in the first of which the error falls by half, and its covariances by scipy."""
+    p = co.Problem(4.0, name="coarse")
+    y = p.state("y", initial=1.0, variance=0.5)
+    w = p.control("w", lower=-1, upper=1)
+    p.dynamics(y, w - y, noise=0.1)
+    p.measurement("m", y, noise=0.2)
+    p.minimize_expected(running=w**2 + y**2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)  # the mesh is as coarse as it says
+        solution = co.solve(p, intervals=10, control=control, progress=False)
+
+    grid = np.linspace(0.0, 4.0, 2001)
+    gain = solution.at(grid)["S"][:, 0, 0] / 2
+
+    def rates(t, z):
+        learnt = z[0] ** 2 / 0.2
+        return [-2 * z[0] + 0.1 - learnt, -2 * (1 + np.interp(t, grid, gain)) * z[1] + learnt]
+
+    exact = solve_ivp(rates, (0, 4), [0.5, 0.0], rtol=1e-7, atol=1e-9, dense_output=True, max_step=0.1)
+    return solution, exact.sol
+
+
+@pytest.mark.parametrize("control", ["linear", "constant"])
+def test_between_nodes_root_mean_squares_are_those_of_the_integrator(control):
+    """E to the tolerance of the dense output; X and Xhat, which it does not have, to what ten nodes tell of X."""
+    solution, exact = coarse(control)
+    figure = solution.plot("rms", "y", "w")
+    for k, (line, tolerance) in enumerate(zip(main_lines(panels(figure)["rms of y"]), (5e-3, 5e-5, 1e-2), strict=True)):
+        t = line.get_xdata()
+        assert t.size > 15
+        error, estimate = exact(t)
+        expected = np.sqrt((error + estimate, error, np.maximum(estimate, 0.0))[k])
+        assert np.abs(line.get_ydata() - expected).max() < tolerance
+    (deviation,) = values_of(figure, "rms of y")[:1]
+    low, high = edges_of(panels(figure)["y"])
+    np.testing.assert_allclose((high - low) / 2, deviation, rtol=1e-9)
 
 
 def test_gains_on_request(combined):
@@ -66,8 +109,9 @@ def test_gains_on_request(combined):
     assert list(panels(figure))[4:] == ["C[u, x]", "C[u, b]", "K[x]", "K[b]"]
     assert list(panels(combined.plot("C", "K"))) == ["C[u, x]", "C[u, b]", "K[x]", "K[b]"]
     for i, name in enumerate(("x", "b")):
-        np.testing.assert_allclose(values_of(figure, f"C[u, {name}]")[0], combined.gains["C"][:, 0, i], atol=1e-15)
-        np.testing.assert_allclose(values_of(figure, f"K[{name}]")[0], combined.gains["K"][:, i, 0], atol=1e-15)
+        feedback, filtering = (values_of(figure, f"{gain}{name}]", combined.t)[0] for gain in ("C[u, ", "K["))
+        np.testing.assert_allclose(feedback, combined.gains["C"][:, 0, i], atol=1e-15)
+        np.testing.assert_allclose(filtering, combined.gains["K"][:, i, 0], atol=1e-15)
     assert list(panels(combined.plot(("C", "b"), ("K", combined.symbols["x"])))) == ["C[u, b]", "K[x]"]
 
 
@@ -84,8 +128,8 @@ def test_covariances_of_a_closed_loop(combined):
         figure = combined.plot(name)
         assert list(panels(figure)) == [f"{name}[x, x]", f"{name}[x, b]", f"{name}[b, b]"]
         expected = getattr(combined.loop, name)[:, 0, 1]
-        np.testing.assert_allclose(values_of(figure, f"{name}[x, b]")[0], expected, atol=1e-15)
-    (pair,) = values_of(combined.plot(("x", "b")), "X[x, b]")
+        np.testing.assert_allclose(values_of(figure, f"{name}[x, b]", combined.t)[0], expected, atol=1e-15)
+    (pair,) = values_of(combined.plot(("x", "b")), "X[x, b]", combined.t)
     np.testing.assert_allclose(pair, combined.loop.X[:, 0, 1], atol=1e-15)
     assert list(panels(combined.plot("E", "S")))[3:] == ["S[x, x]", "S[x, b]", "S[b, b]"]
 
@@ -99,7 +143,8 @@ def test_combined_and_classical_in_one_figure(combined, classical):
         lines, [(s, name) for s in (combined, classical) for name in ("X", "E")], strict=True
     ):
         expected = np.sqrt(getattr(solution.loop, name)[:, 0, 0])
-        np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-9)
+        at_nodes = np.isin(line.get_xdata(), solution.t)
+        np.testing.assert_allclose(line.get_ydata()[at_nodes], expected, rtol=1e-9)
     assert entries_of(panels(figure)["rms of x"]) == ["deviation", "error of the estimate"]
 
 
@@ -132,7 +177,7 @@ def test_a_loaded_closed_loop_is_drawn_without_its_problem(combined, tmp_path):
 def test_a_constrained_gain_is_drawn_as_a_gain(constant):
     solution = solve(constrained_gain(constant), intervals=200)
     assert list(panels(solution.plot())) == ["x", "u", "rms of x"]
-    (curve,) = values_of(solution.plot("C"), "C[u, x]")
+    (curve,) = values_of(solution.plot("C"), "C[u, x]", solution.t)
     np.testing.assert_allclose(curve, solution.gains["C"][:, 0, 0], rtol=1e-12)
 
 
@@ -141,8 +186,9 @@ def test_expressions_have_labels_and_bands(entry):
     load = mars_entry.load_factor(problem)
     figure = flight.plot({"load factor [g]": load, "velocity gain": ("C", "v")}, ("rms", load), ("rms", "lift_to_drag"))
     assert list(panels(figure))[:2] == ["load factor [g]", "velocity gain"]
-    np.testing.assert_allclose(values_of(figure, "load factor [g]")[0], flight[load], rtol=1e-12)
-    np.testing.assert_allclose(values_of(figure, "velocity gain")[0], flight.gains["C"][:, 0, 2], rtol=1e-12)
+    (factor,), (gain,) = (values_of(figure, label, flight.t) for label in ("load factor [g]", "velocity gain"))
+    np.testing.assert_allclose(factor, flight[load], rtol=1e-12)
+    np.testing.assert_allclose(gain, flight.gains["C"][:, 0, 2], rtol=1e-12)
     # d(load)/load = 2 dv/v + dlambda + u du/(1 + u^2), du = -C x'
     loop, u, v = flight.loop, flight["lift_to_drag"], flight["v"]
     slope = np.zeros((flight.t.size, 5))
@@ -151,9 +197,9 @@ def test_expressions_have_labels_and_bands(entry):
     variance = np.einsum("ki,kij,kj->k", slope, loop.E, slope)
     variance += np.einsum("ki,kij,kj->k", by_estimate, loop.Xhat, by_estimate)
     variance -= 2 * np.einsum("ki,kij,kj->k", slope, loop.Z, by_estimate)
-    low, high = edges_of(panels(figure)["load factor [g]"])
+    low, high = edges_of(panels(figure)["load factor [g]"], flight.t)
     np.testing.assert_allclose((high - low) / 2, flight[load] * np.sqrt(variance), rtol=1e-6)
-    (fed_back,) = values_of(figure, "rms of lift_to_drag")
+    (fed_back,) = values_of(figure, "rms of lift_to_drag", flight.t)
     expected = np.einsum("ki,kij,kj->k", loop.gain[:, 0], loop.Xhat, loop.gain[:, 0])
     np.testing.assert_allclose(fed_back, np.sqrt(expected), rtol=1e-9)
 
@@ -163,10 +209,11 @@ def test_another_abscissa_than_time(entry):
     figure = flight.plot("h", "v", over="theta")
     assert {axes.get_xlabel() for axes in panels(figure).values()} == {"theta [rad]"}
     (line,) = main_lines(panels(figure)["h [ft]"])
-    np.testing.assert_allclose(line.get_xdata(), flight["theta"], rtol=1e-12)
-    np.testing.assert_allclose(line.get_ydata(), flight["h"], rtol=1e-12)
-    miles = flight.plot("h", over=flight.symbols["theta"] * 2101.1)
-    np.testing.assert_allclose(main_lines(panels(miles)["h [ft]"])[0].get_xdata(), flight["theta"] * 2101.1, rtol=1e-12)
+    at_nodes = np.isin(Drawn(flight, 0).t, flight.t)
+    np.testing.assert_allclose(line.get_xdata()[at_nodes], flight["theta"], rtol=1e-12)
+    np.testing.assert_allclose(line.get_ydata()[at_nodes], flight["h"], rtol=1e-12)
+    (line,) = main_lines(panels(flight.plot("h", over=flight.symbols["theta"] * 2101.1))["h [ft]"])
+    np.testing.assert_allclose(line.get_xdata()[at_nodes], flight["theta"] * 2101.1, rtol=1e-12)
     with pytest.raises(co.ProblemError, match="one number at each time"):
         flight.plot("h", over="E")
 

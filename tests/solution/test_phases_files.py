@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from phased import bounce, steered
 
 import covocp as co
+from covocp.base.archive import unpacked
+from covocp.solution.storage import write
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +142,68 @@ def test_names_of_phases_are_compared(tmp_path: Path) -> None:
     for other in (("one", "zwei"), ("two", "one")):
         with pytest.raises(co.ProblemError, match=f"(?s)other phases.*one, two.*{', '.join(other)}"):
             co.load(path, named(*other))
+
+
+def thrown(
+    *,
+    slope: float = 0.9,
+    noise: float = 0.01,
+    bend: float = 0.0,
+    floor: float = 1e6,
+    sensor: float = 0.2,
+    every: float = 0.25,
+) -> co.Phases:
+    """Two phases; the state jumps where it is 1, and what bends the jump there shows in none of their values."""
+    one, two = co.Problem(1.0, name="one"), co.Problem(1.0, name="two")
+    x = one.state("x", initial=0.0, final=1.0, variance=0.5)
+    y = two.state("y", initial=None, final=0.0)
+    for ocp, symbol in ((one, x), (two, y)):
+        u = ocp.control("u")
+        ocp.dynamics(symbol, u - symbol, noise=0.1)
+        ocp.measurement("m", symbol, noise=sensor, every=every)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=u**2, terminal=E[symbol, symbol])
+    phases = co.Phases([one, two])
+    phases.jump(y, slope * x + bend * (x - 1) ** 2 + ca.fmax(0, x - floor), noise=noise)
+    return phases
+
+
+@pytest.fixture(scope="module")
+def thrown_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", co.CovocpWarning)
+        found = co.evaluate(thrown(), nominal=co.solve(thrown(), intervals=8, progress=False), intervals=8)
+    return found.save(tmp_path_factory.mktemp("thrown") / "thrown.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"bend": 0.5}, "other phases: the jump of y from 'one' to 'two' differs"),
+        ({"slope": 0.9001}, "other phases: the jump of y from 'one' to 'two' differs"),
+        ({"noise": 0.0101}, r"other phases: the continuity of E\[y, y\] from 'one' to 'two' differs"),
+        ({"floor": 2e6}, "other phases: the place where a jump switches differs"),
+        ({"sensor": 2.0}, "another problem: the noise of the measurement 'm' differs"),
+        ({"every": 0.5}, r"another problem: the instants .* of the measurement 'm' differ"),
+    ],
+    ids=str,
+)
+def test_each_change_of_phases_is_seen_and_named(thrown_file: Path, change: dict[str, float], named: str) -> None:
+    assert co.load(thrown_file, thrown()).links
+    with pytest.raises(co.ProblemError, match=named):
+        co.load(thrown_file, thrown(**change))
+
+
+def test_what_is_known_of_jumps_outlives_another_file_and_may_be_missing(thrown_file: Path, tmp_path: Path) -> None:
+    copy_of = co.load(thrown_file).save(tmp_path / "copy.json")
+    assert co.load(copy_of, thrown()).links
+    with pytest.raises(co.ProblemError, match="the jump of y"):
+        co.load(copy_of, thrown(bend=0.5))
+    tree = {name: value for name, value in unpacked(thrown_file.read_bytes())[0].items() if name != "links"}
+    write(tree, tmp_path / "earlier.npz")  # a file of a version that did not keep them
+    assert co.load(tmp_path / "earlier.npz", thrown()).links
+    cut = unpacked(thrown_file.read_bytes())[0]
+    cut["links"][0]["values"] = cut["links"][0]["values"][:, :1]
+    write(cut, tmp_path / "cut.npz")
+    with pytest.raises(co.ProblemError, match="what passes between its phases contradicts itself"):
+        co.load(tmp_path / "cut.npz")

@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.arguments import is_whole as is_whole
 from covocp.base.errors import ProblemError, kind_and_name, shown
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, pack_symbolic, real_numbers
+from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers
 
 
 def caller() -> str:
@@ -204,23 +204,9 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
 
 
 def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:
-    """A numeric density or variance must be finite, symmetric and positive (semi)definite."""
-    problem = None
+    """A numeric density or variance must be finite, symmetric and positive (semi)definite, in units of its own."""
+    problem = "contains NaN or inf" if not np.isfinite(numbers).all() else _indefinite(numbers, definite)
     scalar = numbers.size == 1
-    if not np.isfinite(numbers).all():
-        problem = "contains NaN or inf"
-    elif not np.allclose(numbers, numbers.T, rtol=1e-9, atol=1e-12 * float(np.abs(numbers).max(initial=0.0))):
-        problem = "is not symmetric"
-    else:
-        values = np.linalg.eigvalsh(numbers)
-        largest = float(np.abs(values).max(initial=0.0))
-        alone = not np.count_nonzero(numbers - np.diag(np.diag(numbers)))  # each entry in a unit of its own
-        least = 0.0 if alone else 1e-14 * largest
-        if values.size and values[0] < -1e-12 * largest:
-            problem = f"is not positive semidefinite (smallest eigenvalue {values[0]:.6g})"
-            problem = "is negative" if scalar else problem
-        elif definite and values.size and values[0] <= least:
-            problem = "is zero" if scalar else f"is singular (smallest eigenvalue {values[0]:.6g})"
     if problem:
         number = f"a {'positive' if definite else 'nonnegative'} number"
         matrix = f"a symmetric positive {'definite' if definite else 'semidefinite'} matrix"
@@ -232,6 +218,27 @@ def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> No
             remedy=f"check the {what} given for '{name}'"
             + (": every measurement needs some noise" if definite and "noise" in what else ""),
         )
+
+
+def _indefinite(numbers: Array, definite: bool) -> str:
+    """What keeps a finite density or variance from being symmetric and positive (semi)definite; "" where nothing."""
+    if not numbers.size:
+        return ""
+    scaled = over_units(numbers, own_units(numbers, alone=True))  # entries 10^18 apart say nothing of each other
+    if not np.allclose(scaled, scaled.T, rtol=1e-9, atol=1e-12):
+        return "is not symmetric"
+    values, scalar = np.linalg.eigvalsh(scaled), numbers.size == 1
+    largest = float(np.abs(values).max())
+    alone = not np.count_nonzero(numbers - np.diag(np.diag(numbers)))
+    plain = float(np.linalg.eigvalsh(numbers)[0])
+    told = f"(smallest eigenvalue {plain:.6g})"
+    if np.sign(plain) != np.sign(values[0]):  # rounding of the largest one
+        told = f"(smallest eigenvalue {values[0]:.6g} where the diagonal is scaled to 1)"
+    if values[0] < -1e-12 * largest:
+        return "is negative" if scalar else f"is not positive semidefinite {told}"
+    if definite and values[0] <= (0.0 if alone else 1e-14 * largest):
+        return "is zero" if scalar else f"is singular {told}"
+    return ""
 
 
 def check_bounds(name: str, lower: Array, upper: Array) -> None:

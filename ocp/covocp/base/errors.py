@@ -101,6 +101,16 @@ class CovocpWarning(UserWarning):
     """The result is usable, but the user should know something about it (mesh too coarse, saddle point left)."""
 
 
+def remedy_for_symbols(error: BaseException, otherwise: str) -> str:
+    """What to do about an error of a user's function that was given symbols; CasADi's own words do not say it."""
+    text = str(error)
+    if "to_double" in text:
+        return "symbols have no number: take casadi.sin and its like in place of math.sin, and no float() of them"
+    if "truth value" in text:
+        return "symbols are neither true nor false: take casadi.if_else, casadi.fmin and casadi.fmax, not if, min, max"
+    return otherwise
+
+
 def _remade(kind: type[CovocpError], problem: str, kept: dict[str, Any]) -> CovocpError:
     """An error from what it was made of."""
     error = kind(problem, **{name: kept[name] for name in ("expected", "received", "remedy")})

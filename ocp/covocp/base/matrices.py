@@ -21,9 +21,13 @@ from covocp.base.expressions import Expr, Given
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-# A covariance counts as positive semidefinite while its smallest eigenvalue is above minus this times its largest:
-# roundoff of a propagation over some thousand steps.
+# A covariance counts as positive semidefinite while its smallest eigenvalue is above minus this times its largest, both
+# with unit diagonal: roundoff of a propagation over some thousand steps.
 SEMIDEFINITE_TOLERANCE = 1e-9
+# A variance is known to this share of what it once was: some hundred roundings of that.
+ROUNDINGS = 1e-13
+# Entries below so many units of the machine's precision times the size, relative to the largest, hold nothing else.
+RUBBLE = 8.0
 
 
 def real_numbers(value: Given) -> Array:
@@ -110,10 +114,34 @@ def unpack(half: ArrayLike, size: int) -> Array:
     return np.asarray(np.asarray(half, dtype=float)[..., unpack_indices(size)])
 
 
+def own_units(matrices: Array, alone: bool = False) -> Array:
+    """Units of the rows of symmetric matrices (..., n, n) in which their diagonals are 1, (..., n).
+
+    In these no decision depends on the units that something is stated in. A variance that is not positive has no unit
+    of its own: its row gets that of the largest; where it is `alone`, without an entry beside it, that of its size.
+    """
+    diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
+    sizes = np.abs(diagonal)
+    largest = np.abs(matrices).max(axis=(-2, -1), initial=0.0)[..., None]
+    kept = diagonal > 0
+    if alone:
+        kept = kept | ((sizes > 0) & (np.count_nonzero(matrices, axis=-1) <= 1))
+    sizes = np.where(kept, sizes, largest)
+    return np.asarray(np.sqrt(np.where(sizes > 0, sizes, 1.0)))
+
+
+def over_units(matrices: Array, units: Array) -> Array:
+    """Entries (i, j) of matrices (..., n, n) over units i and j (..., n), whose product may underflow."""
+    return np.asarray(matrices / units[..., :, None] / units[..., None, :])
+
+
 def semidefinite_part(matrix: Array) -> Array:
-    """The nearest positive semidefinite matrix of a symmetric one."""
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    """The positive semidefinite matrix nearest to a symmetric one with unit diagonal; one that is none comes back."""
+    units = own_units(matrix)
+    values, vectors = np.linalg.eigh(over_units(matrix, units))
+    if values.min(initial=0.0) >= 0.0:
+        return matrix
+    return np.asarray(units[:, None] * ((vectors * np.maximum(values, 0.0)) @ vectors.T) * units)
 
 
 def unpack_costate(half: ArrayLike, size: int) -> Array:
@@ -162,20 +190,34 @@ def smallest_eigenvalue(matrices: ArrayLike) -> float:
 
 
 def is_semidefinite(matrices: ArrayLike, known: float = 0.0) -> bool:
-    """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff.
+    """Whether every symmetric matrix of shape (..., n, n) is positive semidefinite up to roundoff, in its own units.
 
     Args:
-        matrices: each is compared with its own largest eigenvalue.
-        known: share of the largest eigenvalue of all up to which they are known, where they are found by iteration.
+        matrices: of one quantity at several times, say; what is left of a variance is known to rounding of the largest
+            one among them.
+        known: share of the largest one up to which they are known besides, where they are found by iteration.
     """
     full = np.asarray(matrices, dtype=float)
     if full.size == 0:
         return True
     if not np.all(np.isfinite(full)):
         return False
-    values = np.linalg.eigvalsh(full)
-    least = SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[..., -1]), 1e-300)
-    return bool(np.all(values[..., 0] >= -np.maximum(least, known * np.abs(values).max())))
+    size = full.shape[-1]
+    full = full.reshape(-1, size, size)
+    rounding = (ROUNDINGS + known) * np.diagonal(full, axis1=1, axis2=2).max(axis=0).clip(0.0)
+    full = _without_rubble(full) + np.diag(rounding)
+    values = np.linalg.eigvalsh(over_units(full, own_units(full)))
+    return bool(np.all(values[:, 0] >= -SEMIDEFINITE_TOLERANCE * np.maximum(np.abs(values[:, -1]), 1e-300)))
+
+
+def _without_rubble(matrices: Array) -> Array:
+    """Matrices (K, n, n) with zeros where the rounding of the largest entry is all that is left of a coupled row."""
+    sizes = np.abs(matrices)
+    own = np.diagonal(matrices, axis1=1, axis2=2)
+    beside = np.count_nonzero(matrices, axis=2) > (own != 0)
+    limit = RUBBLE * matrices.shape[-1] * np.finfo(float).eps * sizes.max(axis=(1, 2), initial=0.0)
+    empty = beside & (sizes.max(axis=2, initial=0.0) <= limit[:, None])
+    return np.where(empty[:, :, None] | empty[:, None, :], 0.0, matrices)
 
 
 def standard_deviations(covariances: ArrayLike) -> Array:

@@ -100,13 +100,18 @@ def beside(left: Expr, right: Expr) -> Any:
     return np.hstack([left, right]) if isinstance(left, np.ndarray) else ca.horzcat(left, right)
 
 
-def definite_solve(matrix: Expr, right: Expr, what: str) -> Any:
+# What to do where a matrix is singular, unless the caller knows better.
+SOME_NOISE = "give every measurement some noise; where rounding hides it, take the square-root form"
+
+
+def definite_solve(matrix: Expr, right: Expr, what: str, remedy: str = SOME_NOISE) -> Any:
     """matrix^-1 right for a positive definite matrix, by L D L' without pivots.
 
     Args:
         matrix: shape (n, n).
         right: shape (n, k).
         what: the matrix is, for the message.
+        remedy: what to do about it, for the message.
 
     Raises:
         ProblemError: numbers that are not positive definite.
@@ -119,13 +124,13 @@ def definite_solve(matrix: Expr, right: Expr, what: str) -> Any:
             # With unit diagonal the order of the pivots, and so the rounding, does not depend on units.
             return np.linalg.solve(scaled, right / units[:, None]) / units[:, None]
         except np.linalg.LinAlgError as error:
-            raise _indefinite(what, matrix) from error
+            raise _indefinite(what, matrix, remedy) from error
     entries, upper, order = ca.ldl(matrix)
     return ca.ldl_solve(ca.densify(right), entries, upper, order)
 
 
-def unit_triangular(matrix: Expr, what: str) -> tuple[Any, Any]:
-    """L and the column D of matrix = L diag(D) L', L unit lower triangular.
+def unit_triangular(matrix: Expr, what: str, remedy: str = SOME_NOISE) -> tuple[Any, Any]:
+    """L and the column D of matrix = L diag(D) L', L unit lower triangular; the words are for the message.
 
     Raises:
         ProblemError: numbers, not diagonal, that are not positive definite.
@@ -137,7 +142,7 @@ def unit_triangular(matrix: Expr, what: str) -> tuple[Any, Any]:
         try:
             factor = np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError as error:
-            raise _indefinite(what, matrix) from error
+            raise _indefinite(what, matrix, remedy) from error
         return factor / np.diag(factor), (np.diag(factor) ** 2)[:, None]
     entries, upper, _ = ca.ldl(matrix, False)
     return ca.SX.eye(matrix.shape[0]) + upper.T, entries
@@ -187,11 +192,11 @@ def semidefinite(value: Expr, before: Expr = None) -> Any:
     return value if not isinstance(value, np.ndarray) or not value.size else semidefinite_part(value, before)
 
 
-def _indefinite(what: str, matrix: Array) -> ProblemError:
+def _indefinite(what: str, matrix: Array, remedy: str) -> ProblemError:
     smallest = float(np.linalg.eigvalsh(matrix)[0]) if np.isfinite(matrix).all() else np.nan
     return ProblemError(
         f"The {what} is singular.",
         expected="a positive definite matrix",
         received=f"a smallest eigenvalue of {smallest:.3g}",
-        remedy="give every measurement some noise; where rounding hides it, take the square-root form",
+        remedy=remedy,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.arguments import checked, whole
-from covocp.base.errors import ProblemError
+from covocp.base.errors import ProblemError, remedy_for_symbols
 from covocp.base.expressions import Expr
 from covocp.blocks import values
 
@@ -127,17 +127,25 @@ def _at_state(f: Callable[[Any], Any], x: Expr) -> Any:
     """What a function returns for the symbol.
 
     Raises:
-        ProblemError: it fails.
+        ProblemError: it fails, or makes NaN of it.
     """
     try:
-        return f(x)
+        value = f(x)
     except Exception as error:  # whatever the user's function raises
         raise ProblemError(
             "The function f fails for the symbol of the state.",
             expected="a function of x, by CasADi's functions",
             received=f"{type(error).__name__}: {error}"[:200],
-            remedy="call it by itself with that symbol",
+            remedy=remedy_for_symbols(error, "call it by itself with that symbol"),
         ) from error
+    if values.holds_nan(value):
+        raise ProblemError(
+            "The function f makes NaN of the symbol of the state.",
+            expected="a function of x, by CasADi's functions",
+            received="NaN, which math.sin and its like make of a symbol",
+            remedy="take casadi.sin and its like in place of math.sin",
+        )
+    return value
 
 
 class WithIntegrals(NamedTuple):

@@ -232,7 +232,7 @@ def recursion(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> tuple[Any, Any]:
 
 def _step_back(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr) -> tuple[Any, Any]:
     """The step back in Joseph form, so that S stays positive semidefinite."""
-    K = definite_solve(symmetric(R + B.T @ S @ B), B.T @ S @ A, "weight R + B'S B")
+    K = definite_solve(symmetric(R + B.T @ S @ B), B.T @ S @ A, "weight R + B'S B", "give every control some weight")
     closed = A - B @ K
     return symmetric(closed.T @ S @ closed + K.T @ R @ K + Q), K
 

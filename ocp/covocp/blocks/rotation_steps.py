@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import ProblemError, shown
+from covocp.base.errors import ProblemError, remedy_for_symbols, shown
 from covocp.base.expressions import Expr, Given
 from covocp.blocks.rotation_entries import (
     Entries,
@@ -23,7 +23,7 @@ from covocp.blocks.rotation_entries import (
     read_vector,
 )
 from covocp.blocks.rotations import exponential
-from covocp.blocks.values import SYMBOLIC, array, is_symbolic, wrong_argument
+from covocp.blocks.values import SYMBOLIC, array, holds_nan, is_symbolic, wrong_argument
 from covocp.blocks.values import matrix as casadi_matrix
 
 Dynamics = Callable[[Any, Any], tuple[Any, Any]]
@@ -149,15 +149,20 @@ def _called(name: str, function: Callable[..., Any], *arguments: Expr) -> Any:
     """What a function of the user returns.
 
     Raises:
-        ProblemError: it fails.
+        ProblemError: it fails, or makes NaN of symbols.
     """
+    expected = "a function of C" if len(arguments) == 1 else "a function of (C, x)"
     try:
-        return function(*arguments)
+        result = function(*arguments)
     except ProblemError:
         raise
     except Exception as error:  # whatever the user's function raises
-        expected = "a function of C" if len(arguments) == 1 else "a function of (C, x)"
-        raise wrong_argument(name, expected, f"{type(error).__name__}: {error}"[:200]) from error
+        received, remedy = f"{type(error).__name__}: {error}"[:200], remedy_for_symbols(error, f"correct {name}")
+        raise wrong_argument(name, expected, received, remedy) from error
+    if is_symbolic(*arguments) and holds_nan(result):
+        remedy = "take casadi.sin and its like in place of math.sin, and no float() of symbols"
+        raise wrong_argument(name, expected, "NaN, which math.sin and its like make of a symbol", remedy)
+    return result
 
 
 def _length(h: Given) -> Any:

@@ -37,6 +37,9 @@ from covocp.blocks.rotation_series import (
 from covocp.blocks.scaling import ROUNDOFF
 from covocp.blocks.values import is_symbolic, wrong_argument
 
+# Largest entry of a rotation vector that is taken as it is: its square, and derivatives by it, are numbers.
+LONGEST = 1e100
+
 
 def cross(vector: Expr) -> Any:
     """The cross-product matrix v^x, with v^x w = v x w.
@@ -92,6 +95,8 @@ def antisymmetric_part(matrix: Expr) -> Any:
 def exp(vector: Expr) -> Any:
     """The attitude C = e^{-phi^x} = 1 - A phi^x + B phi^x phi^x of a rotation vector.
 
+    From 1e16 rad on the rounding of the vector is more than a turn: what is left of C is its axis.
+
     Args:
         vector: phi^ba, shape (3,), as expression (3, 1), or numbers (..., 3) [rad].
 
@@ -101,7 +106,7 @@ def exp(vector: Expr) -> Any:
     Raises:
         ProblemError: another shape, NaN.
     """
-    return evaluated(exponential, read_vector("vector", vector))
+    return evaluated(lambda phi: exponential(shortened(phi)), read_vector("vector", vector))
 
 
 def log(matrix: Expr) -> Any:
@@ -272,10 +277,22 @@ def _axis(C: list[Any], c: Expr, far: Expr) -> list[Any]:
     return [entry / length for entry in column]
 
 
+def shortened(phi: list[Any]) -> list[Any]:
+    """A rotation vector whose square is a number, of the same axis: itself up to LONGEST in its largest entry."""
+    functions = library(phi[0])
+    largest = functions.fabs(phi[0])
+    for entry in phi[1:]:
+        largest = functions.fmax(largest, functions.fabs(entry))
+    share = LONGEST / functions.fmax(largest, LONGEST)  # exactly 1 for all but these
+    return [share * entry for entry in phi]
+
+
 def _left_jacobian(phi: list[Any]) -> list[Any]:
+    phi = shortened(phi)
     x = inner_product(phi, phi)
     return polynomial_of_cross(phi, -versine(x), sine_remainder(x))
 
 
 def _inverse_left_jacobian(phi: list[Any]) -> list[Any]:
+    phi = shortened(phi)
     return polynomial_of_cross(phi, 0.5, cotangent_remainder(inner_product(phi, phi)))

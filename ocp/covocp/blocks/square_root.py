@@ -218,7 +218,8 @@ def _skipping_update(correct: Correction, x: Expr, L: Expr, y: Expr, H: Expr, V:
 
 def _correct_in_turn(x: Expr, L: Expr, residual: Expr, H: Expr, V: Expr) -> tuple[Any, Any]:
     """As `_correct`, by `in_turn`."""
-    lower, variances = unit_triangular(V @ V.T, "measurement noise, whose rows are correlated,")
+    remedy = "take form='array', which does not square the root of the noise"
+    lower, variances = unit_triangular(V @ V.T, "measurement noise, whose rows are correlated,", remedy)
     corrected, root = in_turn(x, L, triangular_solve(lower, residual), triangular_solve(lower, H), variances)
     return corrected, triangular(root)
 

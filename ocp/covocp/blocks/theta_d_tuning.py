@@ -22,6 +22,7 @@ from covocp.blocks import sdre, values
 from covocp.blocks import theta_d_series as series
 from covocp.blocks.algebraic import lyapunov
 from covocp.blocks.factorisation import as_states, dependence
+from covocp.blocks.scaling import diagonal_scales, over
 
 Array = NDArray[np.float64]
 
@@ -135,13 +136,13 @@ def convergence(
     guaranteed = _bounds(begin)
     bounds = np.array([guaranteed(matrix) for matrix in matrices])
     radii = np.array([_radius(begin, matrix, bound) for matrix, bound in zip(matrices, bounds, strict=True)])
-    root, inverse_root = _coordinates(begin.closed_loop)
+    root, _ = _coordinates(begin.closed_loop)
     result = Convergence(
         radius=radii,
         guaranteed=bounds,
         decay=float(np.linalg.eigvals(begin.closed_loop).real.max()),
         largest=_largest_symmetric(begin.closed_loop),
-        largest_transformed=_largest_symmetric(root @ begin.closed_loop @ inverse_root),
+        largest_transformed=-1.0 / float(np.linalg.norm(root, 2)) ** 2,  # X A_c X^-1 + (...)' = -(X X')^-1
     )
     if warn and not result.converges:
         worst = int(np.argmin(radii))
@@ -309,9 +310,12 @@ def _scaled_terms(begin: series.Start, direction: Array, count: int) -> Array:
 
 
 def _coordinates(closed_loop: Array) -> tuple[Array, Array]:
-    """Pi^1/2 and its inverse, A_c' Pi + Pi A_c = -I."""
-    squares, vectors = np.linalg.eigh(np.asarray(lyapunov(closed_loop.T, np.eye(len(closed_loop)))))
-    return (vectors * np.sqrt(squares)) @ vectors.T, (vectors / np.sqrt(squares)) @ vectors.T
+    """X with X' X = Pi, which is Pi^1/2 but for a rotation, and its inverse, A_c' Pi + Pi A_c = -I."""
+    squares = np.asarray(lyapunov(closed_loop.T, np.eye(len(closed_loop))))
+    units = diagonal_scales(squares)  # states in other units leave small eigenvalues no digit, and some a minus
+    values, vectors = np.linalg.eigh(over(squares, units))
+    roots = np.sqrt(values)
+    return (vectors * roots) @ vectors.T * units, ((vectors / roots) @ vectors.T) / units[:, None]
 
 
 def _largest_symmetric(matrix: Array) -> float:
@@ -331,7 +335,7 @@ def _bounds(begin: series.Start) -> Any:
     spread = (
         kappa
         * np.linalg.norm(root @ begin.root, 2) ** 2
-        * np.linalg.norm(inverse_root @ begin.riccati @ inverse_root, 2)
+        * np.linalg.norm(inverse_root.T @ begin.riccati @ inverse_root, 2)
     )
     limit = 1.0 / (1.0 + 2.0 * spread + np.sqrt((1.0 + 2.0 * spread) ** 2 - 1.0))
 

@@ -30,6 +30,12 @@ from covocp.blocks.arithmetic import (
 from covocp.blocks.values import SYMBOLIC, array, is_symbolic, matrix, restored, square, weight
 
 Form = Literal["joseph", "standard", "sequential", "information"]
+# Remedies: two accurate sensors of one state leave H P H' + R singular to rounding, each by itself does not.
+IN_TURN = (
+    "give every measurement some noise; where rounding hides it, take one row after the other "
+    "(form='sequential', where there is a choice) or the square-root form"
+)
+NOT_DIVIDED = "take form='sequential' or 'joseph', which need no inverse of the covariance"
 Missing = Literal["raise", "skip"]
 
 
@@ -223,7 +229,7 @@ def joseph_form(P: Expr, L: Expr, H: Expr, R: Expr) -> Any:
 def definite_gain(P: Expr, H: Expr, R: Expr) -> Any:
     """L = M H'(H M H' + R)^-1, by a solver for positive definite matrices."""
     what = "covariance of the innovation, H P H' + R,"
-    return innovation_gain(P, H, R, lambda S, seen: definite_solve(symmetric(S), seen, what))[0]
+    return innovation_gain(P, H, R, lambda S, seen: definite_solve(symmetric(S), seen, what, IN_TURN))[0]
 
 
 def _joseph(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
@@ -238,14 +244,16 @@ def _standard(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
 
 def _information(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     size = unit(P, P.shape[0])
-    weighted = definite_solve(R, H, "measurement noise R").T
-    spread = symmetric(definite_solve(symmetric(definite_solve(P, size, "covariance") + weighted @ H), size, "sum"))
+    weighted = definite_solve(R, H, "measurement noise R", NOT_DIVIDED).T
+    inverse = definite_solve(P, size, "covariance", NOT_DIVIDED)
+    spread = symmetric(definite_solve(symmetric(inverse + weighted @ H), size, "sum", NOT_DIVIDED))
     return spread @ (weighted @ residual), spread
 
 
 def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     """Row by row; the covariance in Joseph form, its products with I - k h written as corrections of rank one."""
-    lower, variances = unit_triangular(R, "measurement noise R, whose rows are correlated,")
+    remedy = "give every row some noise of its own, or take form='joseph'"
+    lower, variances = unit_triangular(R, "measurement noise R, whose rows are correlated,", remedy)
     rows, residual = triangular_solve(lower, H), triangular_solve(lower, residual)
     step = 0 * P[:, :1]
     for i in range(rows.shape[0]):

@@ -64,6 +64,16 @@ def array(name: str, value: Given) -> NDArray[np.float64]:
         raise wrong_argument(name, "numbers or a CasADi expression", received) from error
 
 
+def holds_nan(value: Given) -> bool:
+    """Whether an entry of what a function made of symbols is NaN: so math.sin takes an SX, without a word."""
+    if isinstance(value, (list, tuple)):
+        return any(map(holds_nan, value))
+    if isinstance(value, ca.SX):
+        entries: list[Any] = value.elements()
+        return any(entry.is_constant() and np.isnan(float(entry)) for entry in entries)
+    return isinstance(value, (float, ca.DM)) and bool(np.isnan(ca.DM(value).full()).any())
+
+
 def square(name: str, value: Given, size: int | None = None) -> Any:
     """A square matrix of a size; see `matrix`.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from covocp.base.errors import CovocpError, ProblemError, kind_and_name, spelling
+from covocp.base.errors import CovocpError, ProblemError, kind_and_name, remedy_for_symbols, spelling
 from covocp.problem.builder import Problem
 
 MODELS = "covocp.models"
@@ -231,7 +231,7 @@ def _called(name: str, script: Path | None, function: Callable[[], Any]) -> Any:
             f"'{name}' failed{place}.",
             expected="a function that makes a problem",
             received=f"{type(error).__name__}: {text}" if text else type(error).__name__,
-            remedy="correct the script" if script else "check the values of --set",
+            remedy=remedy_for_symbols(error, "correct the script" if script else "check the values of --set"),
         ) from error
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import covocp as co
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, SolveError, spelling
@@ -22,7 +22,7 @@ from covocp.base.pages import WIDTH
 from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
-from covocp.solving.comparison import COMPARED
+from covocp.solving.comparison import COMPARED, SOLVE_OPTIONS
 from covocp.solving.methods import method_options
 from covocp.solving.random_starts import STARTS
 from covocp.transcription.mesh import INTERVALS, Options
@@ -43,21 +43,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0; 1 where a solve failed, 2 where the input is wrong, 130 where it was interrupted before an iterate existed.
     """
-    parsed, unknown = _parser().parse_known_args(arguments)
+    try:
+        parsed, unknown = _parser().parse_known_args(arguments)
+    except SystemExit:  # of --help and --version, whose reader may have gone too
+        _print("", sys.stdout, end="")
+        raise
     if unknown:  # told by the command that was meant, with its usage
         parsed.parser.refuse(unknown)
     try:
         with _plain_warnings():
-            return int(parsed.run(parsed))
+            code = int(parsed.run(parsed))
     except SolveError as error:
-        return _complain(error, FAILED)
+        code = _complain(error, FAILED)
     except CovocpError as error:
-        return _complain(error, WRONG_INPUT)
+        code = _complain(error, WRONG_INPUT)
     except KeyboardInterrupt:
-        return _complain("interrupted", INTERRUPTED)
-    except BrokenPipeError:  # the reader of the output has gone: `covocp list | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing left to flush at the end
-        return 0
+        code = _complain("interrupted", INTERRUPTED)
+    _print("", sys.stdout, end="")  # what is left of the output goes now, while a reader that has gone is no error
+    return code
 
 
 class _Version(argparse.Action):
@@ -65,7 +68,7 @@ class _Version(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print it and end."""
-        print(f"covocp {co.__version__}")
+        _print(f"covocp {co.__version__}", sys.stdout)
         parser.exit()
 
 
@@ -81,7 +84,7 @@ class _Parser(argparse.ArgumentParser):
     def format_help(self) -> str:
         """The help; below that of a command that solves, the options of the solver, looked up only now."""
         if "--option" in self._option_string_actions:
-            self.epilog = _solver_options()
+            self.epilog = _solver_options(self.get_default("several"))
         return super().format_help()
 
     def refuse(self, unknown: list[str]) -> NoReturn:
@@ -91,15 +94,17 @@ class _Parser(argparse.ArgumentParser):
         self.error(f"unrecognized: {' '.join(unknown)}" + (f"; {hint}" if hint else ""))
 
 
-def _solver_options() -> str:
-    """What `--option` takes, with the defaults."""
+def _solver_options(several: bool) -> str:
+    """What `--option` takes, with the defaults; several: where more than one method runs."""
     groups = {
         "of the mesh": {f.name: f.default for f in fields(Options) if f.name != "intervals"},
         **{f"of {method}": method_options(method) for method in co.methods()},
         "of the start": {"guess": "multistart", "starts": STARTS, "seed": 0},
-        "of an expected cost": {"nominal": "deterministic"},
     }
-    lines = ["values of --option (docs/api.md says what they mean; METHOD.NAME=VALUE where several methods run):"]
+    if not several:
+        groups["of an expected cost"] = {"nominal": "deterministic"}
+    own = "; METHOD.NAME=VALUE for one of the methods" if several else ""
+    lines = [f"values of --option (docs/api.md says what they mean{own}):"]
     for title, options in groups.items():
         words = "  " + " ".join(f"{name}={value}" for name, value in options.items())
         lines += [f"  {title}:", *textwrap.wrap(words, WIDTH, initial_indent="  ", subsequent_indent="    ")]
@@ -156,6 +161,7 @@ def _export_options(export: argparse.ArgumentParser) -> None:
 
 def _common(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     """Options of every command that solves; several: by more than one method."""
+    parser.set_defaults(several=several)
     parser.add_argument("model", metavar="MODEL", help="a name from `covocp list`, or path/to/script.py:function")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the model; may be repeated"
@@ -167,8 +173,8 @@ def _common(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     methods = ", ".join(co.methods())
     if several:
-        words = "may be given several times; all methods by default: "
-        parser.add_argument("--method", action="append", help=words + methods)
+        words = f"one of {methods}; may be given several times, {', '.join(COMPARED)} by default"
+        parser.add_argument("--method", action="append", help=words)
     else:
         parser.add_argument("--method", default="ipopt", help="one of " + methods)
 
@@ -188,8 +194,8 @@ def _list(arguments: argparse.Namespace) -> int:
     """covocp list."""
     for model in (entry for own in models() for entry in problems(own)):
         words = " ".join(f"{name}={value}" for name, value in model.defaults().items())
-        print(f"{model.label}\n    {model.description}")
-        print(f"    --set {words}\n" if words else "    no parameters\n")
+        setting = f"    --set {words}\n" if words else "    no parameters\n"
+        _print(f"{model.label}\n    {model.description}\n{setting}", sys.stdout)
     return 0
 
 
@@ -200,14 +206,13 @@ def _solve(arguments: argparse.Namespace) -> int:
     solution, code = _solved(problem, arguments)
     if solution is None:
         return code
-    if not arguments.quiet:
-        print(solution)
-    if arguments.plot:
-        solution.plot(path=arguments.plot)
-        _say(arguments, "", f"figure: {arguments.plot}")
-    if arguments.save:
-        solution.save(arguments.save)
-        _say(arguments, *([] if arguments.plot else [""]), f"solution: {arguments.save}")
+    with _told(arguments, solution) as written:
+        if arguments.save:
+            solution.save(arguments.save)
+            written.append(f"solution: {arguments.save}")
+        if arguments.plot:
+            solution.plot(path=arguments.plot)
+            written.append(f"figure: {arguments.plot}")
     return code
 
 
@@ -217,15 +222,63 @@ def _compare(arguments: argparse.Namespace) -> int:
     problem = find_model(arguments.model).build(arguments.set)
     methods = arguments.method or list(COMPARED)
     shared, own = _options(arguments.option, co.methods())
+    _check_compared(methods, shared, own)
     comparison = co.compare(
         problem, methods, intervals=arguments.intervals, progress=not arguments.quiet, method_options=own, **shared
     )
-    if not arguments.quiet:
-        print(comparison)
-    if arguments.plot and comparison.solutions:
-        comparison.plot(path=arguments.plot)
-        _say(arguments, "", f"figure: {arguments.plot}")
+    with _told(arguments, comparison) as written:
+        if arguments.plot and comparison.solutions:
+            comparison.plot(path=arguments.plot)
+            written.append(f"figure: {arguments.plot}")
+    for row in comparison if arguments.quiet else ():  # else the table has said it
+        if row.reason:
+            _complain(f"{row.label}: {row.reason}", FAILED)
     return 0 if comparison.converged else FAILED
+
+
+def _check_compared(methods: Sequence[str], shared: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]]) -> None:
+    """What `compare` refuses, in words of the command line.
+
+    Args:
+        methods: that are compared.
+        shared: options of all of them.
+        own: options by method.
+
+    Raises:
+        ProblemError: an unknown method, one that is given twice, options of one that is not compared or that one of
+            them does not have.
+    """
+    for method in methods:
+        if method not in co.methods():
+            raise ProblemError(
+                f"There is no such method: '{method}'.",
+                expected="one of " + ", ".join(co.methods()),
+                received=f"--method {method}",
+                remedy=spelling(method, co.methods(), "correct --method"),
+            )
+    shared_by_all = {f.name for f in fields(Options)} | set(SOLVE_OPTIONS)
+    known = {method: {*method_options(method), *shared_by_all} for method in methods}
+    given = [(method, f"{method}.{name}", name) for method, options in own.items() for name in options]
+    given += [(method, name, name) for name in shared for method in methods]
+    for method, written, name in given:
+        if method not in known or name not in known[method]:
+            has = [other for other in known if name in known[other]]
+            remedy = f"write --option {has[0]}.{name}=VALUE for the method that has it" if has else "remove it"
+            raise ProblemError(
+                f"'{method}' is not compared." if method not in known else f"'{method}' has no option '{name}' here.",
+                expected="options of the compared methods: `covocp compare --help` lists them",
+                received=f"--option {written}=...",
+                remedy=f"add --method {method}, or remove the option"
+                if method not in known
+                else spelling(name, known[method], remedy),
+            )
+    if len(set(methods)) < len(methods):
+        raise ProblemError(
+            "A method is given twice.",
+            expected="each method once",
+            received=" ".join(f"--method {method}" for method in methods),
+            remedy="remove one of them",
+        )
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -281,8 +334,7 @@ def _export(arguments: argparse.Namespace) -> int:
             settings[name] = getattr(arguments, name)
     package = exporting.export_c(what, arguments.directory, **settings)
     check = package.check(samples=arguments.samples)
-    if not arguments.quiet:
-        print(package)
+    _say(arguments, str(package))
     return 0 if check.ok else FAILED
 
 
@@ -345,15 +397,40 @@ def _check_targets(*targets: tuple[str | None, tuple[str, ...]]) -> None:
             check_target(path, suffixes)
 
 
+@contextmanager
+def _told(arguments: argparse.Namespace, outcome: object) -> Iterator[list[str]]:
+    """Write files, then print what came out, also where a file could not be written.
+
+    First the files: printing waits for a reader that pages, and ends with one that goes. What is put into the list is
+    printed below, a line each.
+    """
+    written: list[str] = []
+    try:
+        yield written
+    finally:
+        _say(arguments, str(outcome), *([""] if written else []), *written)
+
+
 def _say(arguments: argparse.Namespace, *lines: str) -> None:
+    """Lines on the standard output, where these are wanted."""
     if not arguments.quiet:
-        print("\n".join(lines))
+        _print("\n".join(lines), sys.stdout)
 
 
 def _complain(error: object, code: int) -> int:
     """A message on the standard error."""
-    print(f"covocp: {error}", file=sys.stderr)
+    _print(f"covocp: {error}", sys.stderr)
     return code
+
+
+def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
+    """Print, or print nothing from now on where the reader has gone (`covocp list | head`): that is no error."""
+    if stream is None:  # closed by the shell
+        return
+    try:
+        print(text, end=end, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextmanager
@@ -361,7 +438,7 @@ def _plain_warnings() -> Iterator[None]:
     """Warnings as lines without the place in the code."""
 
     def show(message: Warning | str, *place: Any) -> None:
-        print(f"covocp: warning: {message}", file=sys.stderr)
+        _print(f"covocp: warning: {message}", sys.stderr)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", co.CovocpWarning)

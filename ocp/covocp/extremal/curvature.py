@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -30,14 +30,14 @@ from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, se
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.scales import choose_scales
-from covocp.transcription.trajectory import Trajectory
 
 LANCZOS_STEPS = 120
 # Residual of the smallest Ritz value, relative to the largest eigenvalue, at which it is known well enough; its sign
 # is where the residual is below half of it.
 LANCZOS_TOLERANCE = 1e-3
-DISPLACEMENT = 0.3
 GOLDEN = 0.5 * np.sqrt(5.0) - 0.5
+# Controls count in units of their own where these differ by more than this factor.
+FAR_APART = 1e3
 # Rows held, of unit length, whose part across the others is below this say nothing new.
 DEPENDENT = 1e-9
 # An eigenvalue below its error is zero: this multiple of the asymmetry of the operator as it was computed, or this
@@ -55,7 +55,7 @@ Verdict = Literal["minimum", "saddle", "flat"]
 
 @dataclass(frozen=True, kw_only=True)
 class Curvature:
-    """The smallest curvature and its direction, in the metric int du' du dt.
+    """The smallest curvature and its direction, in the metric int du' du dt; see `_shares`.
 
     Attributes:
         value: smallest curvature in the directions that are left.
@@ -78,17 +78,6 @@ class Curvature:
         if abs(self.value) <= self.error:
             return "flat"
         return "minimum" if self.value > 0 else "saddle"
-
-    def displaced(self, extremal: Extremal, sign: float) -> Trajectory:
-        """The trajectory moved along the direction, its controls by their size or one unit, to both sides."""
-        t = extremal.trajectory
-        size = max(float(np.sqrt(np.mean(t.u**2))), DISPLACEMENT)
-        largest = max(float(np.abs(self.direction).max(initial=0.0)), float(np.abs(self.start).max(initial=0.0)))
-        step = sign * size / largest
-        x = t.x.copy()
-        x[0] = np.clip(x[0] + step * self.start, *extremal.statement.state_bounds)
-        u = np.clip(t.u + step * self.direction, *extremal.statement.control_bounds)
-        return Trajectory(x=x, u=u, e=t.e, duration=t.duration)
 
 
 def smallest_curvature(extremal: Extremal) -> Curvature | None:
@@ -214,7 +203,8 @@ class _Reduced:
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
         moving = np.flatnonzero(tangents.free).tolist()
-        metric = mass_matrix(mesh, t.duration, st.nu)[moving, moving]
+        shares = ca.diag(ca.DM(_shares(fine, product, given)[np.array(moving, dtype=np.intp) % st.nu]))
+        metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
         weights = np.zeros(0)
         if tangents.start:  # in units that say something where the best control is none
             controls = choose_scales(st, mesh, t, extremal.parameters).u.mean()
@@ -270,6 +260,26 @@ class _Reduced:
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
         return null_space(rows, self.root.shape[0])
+
+
+def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:
+    """Units of the metric (nu,): 1, or where they are far apart the roots of the curvature of each control by itself.
+
+    Beside a control in units of 1e-7 one in units of 1 would have no curvature but rounding.
+    """
+    count, u = fine.statement.nu, fine.trajectory.u
+    if count == 1:
+        return np.ones(1)
+    first = node_size(fine.statement) * (fine.mesh.intervals + 1)
+    roots = np.zeros(count)
+    for i in range(count):
+        direction = np.zeros(first + u.size)
+        direction[first + i :: count] = 1.0
+        roots[i] = np.sqrt(abs(direction @ np.asarray(product(*given, direction).full()).ravel()))
+    own = roots[roots > 0]
+    if not own.size or own.max() <= FAR_APART * own.min():
+        return np.ones(count)
+    return np.where(roots > 0, roots / own.mean(), 1.0)
 
 
 def null_space(rows: Array, size: int) -> Array:

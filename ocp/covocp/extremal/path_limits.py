@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,7 @@ from covocp.extremal.polynomials import Dense
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
 
 # Points that are looked at together: what bounds the memory.
 TOGETHER = 1 << 15
@@ -25,6 +27,8 @@ TOGETHER = 1 << 15
 NOTED = 1e-4
 # A limit acts where a value is closer to it than this, in its range or the limit itself.
 TOUCHED = 1e-4
+# Share of what a limit is passed by that is much of it, and parts of an interval within which a point is one.
+MUCH, SAME_PLACE = 0.5, 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,17 +40,32 @@ class Passed:
         by: largest violation, in the unit of the constraint; inf where the constraint is NaN or inf.
         share: the same relative to the limit (see `limit_sizes`).
         time: where it is largest relative to the limit [s]; where it has no value, the first such time.
+        equation: whether both limits are one, which is imposed at the nodes alone.
+        imposed: whether much of it is at points where it is imposed, not between them.
     """
 
     name: str
     by: float
     share: float
     time: float
+    equation: bool = False
+    imposed: bool = False
 
     @property
     def defined(self) -> bool:
         """Whether what has the limit has a value everywhere."""
         return bool(np.isfinite(self.by))
+
+    def remedy(self, points: int) -> str:
+        """What makes it less, of a solution with so many points of each interval where limits are imposed."""
+        if self.imposed:
+            return "start again from it (guess=), or ask for a smaller tolerance="
+        if self.equation:
+            return "equations are imposed at the nodes alone: use more intervals, or eliminate a control by it"
+        return (
+            f"impose it at more points of each interval (points={2 * points}, method 'ipopt'), use more intervals, "
+            "or keep a margin"
+        )
 
 
 def limited(extremal: Extremal) -> bool:
@@ -118,7 +137,23 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
         x = _before(extremal, dense, k, s)[:, : st.nx]
         return np.hstack([x, _conditions(extremal, dense, st.path, k, s)]) if st.path.size else x
 
-    return _passed(extremal, dense, points, names, limits, values)
+    terms = np.concatenate([np.zeros(st.nx), _equation_terms(extremal)])
+    return _passed(extremal, dense, points, names, limits, values, terms)
+
+
+def _equation_terms(extremal: Extremal) -> Array:
+    """Sizes of the terms of the equations along the path, at the nodes; 0 of other conditions.
+
+    What an equation u - w = 0 is passed by is nothing beside u, but all of u - w.
+    """
+    path = extremal.statement.path
+    if not path.equations.any():
+        return np.zeros(path.size)
+    inputs = [ca.MX.sym(path.function.name_in(i), path.function.size1_in(i)) for i in range(path.function.n_in())]
+    value = path.function(*inputs)
+    terms = sum(ca.fabs(ca.jacobian(value, v)) @ ca.fabs(v) for v in inputs[:3])
+    function = ca.Function("terms", inputs, [ca.densify(terms)]).map(extremal.mesh.intervals + 1)
+    return np.asarray(np.where(path.equations, finite_sizes(np.asarray(function(*extremal.columns()).full()).T), 0.0))
 
 
 def left_tables(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed, ...]:
@@ -146,23 +181,17 @@ def _passed(
     names: Sequence[str],
     limits: tuple[Array, ...],
     values_at: Callable[[Any, Array], Array],
+    terms: Array | float = 0.0,
 ) -> tuple[Passed, ...]:
-    """Rows that pass their limits along the true path, from what gives them at normalised times of intervals."""
+    """Rows that pass their limits along the true path, from what gives them at normalised times of intervals.
+
+    terms: sizes of what equations compare, 0 of other rows.
+    """
     mesh, (lower, upper) = extremal.mesh, limits
-    worst, largest = np.zeros((2, len(names))), np.zeros(len(names))
+    worst, largest, held = np.zeros((2, len(names))), np.zeros(len(names)), np.zeros(len(names))
     limited_rows = np.isfinite(lower) | np.isfinite(upper)
     when = np.zeros((2, len(names)))
-    nearest = np.clip(np.searchsorted(mesh.nodes, dense.knots), 0, mesh.intervals)
-    inner = dense.knots[mesh.nodes[nearest] != dense.knots]
-    regular = mesh.intervals * (points + 1)
-    for begin in range(0, regular + inner.size, TOGETHER):
-        at = np.arange(begin, min(begin + TOGETHER, regular + inner.size))
-        own = at[at < regular]
-        k, j = own // (points + 1), own % (points + 1)
-        s = mesh.nodes[k] + j / points * np.diff(mesh.nodes)[k]
-        extra = inner[at[at >= regular] - regular]
-        s = np.concatenate([s, extra])
-        k = np.concatenate([k, np.searchsorted(mesh.nodes, extra) - 1])
+    for k, s in _places(mesh, dense, points):
         values = values_at(k, s)
         largest = np.maximum(largest, finite_sizes(values))
         unknown = ~np.isfinite(values) & limited_rows
@@ -174,7 +203,9 @@ def _passed(
             found = excess[place, np.arange(len(names))]
             when[side] = np.where(found > worst[side], s[place], when[side])
             worst[side] = np.maximum(worst[side], found)
-    shares = worst / limit_sizes(lower, upper, largest)
+            there = np.where(lower == upper, _imposed(mesh, k, s, 1), _imposed(mesh, k, s, mesh.points))
+            held = np.maximum(held, np.where(there, excess, 0.0).max(axis=0, initial=0.0))
+    shares = worst / limit_sizes(lower, upper, np.where(np.asarray(terms) > 0, terms, largest))
     side = shares.argmax(axis=0)
     result = [
         Passed(
@@ -182,11 +213,34 @@ def _passed(
             by=float(worst[:, i].max()),
             share=float(shares[side[i], i]),
             time=float(when[side[i], i] * extremal.trajectory.duration),
+            equation=bool(lower[i] == upper[i]),
+            imposed=bool(held[i] > MUCH * worst[:, i].max()),
         )
         for i, name in enumerate(names)
         if shares[side[i], i] > OF_RANGE
     ]
     return tuple(sorted(result, key=lambda entry: -entry.share))
+
+
+def _places(mesh: Mesh, dense: Dense, points: int) -> Iterator[tuple[NDArray[np.intp], Array]]:
+    """Intervals, and normalised times in them: the ends of so many equal parts of each, and the knots."""
+    nearest = np.clip(np.searchsorted(mesh.nodes, dense.knots), 0, mesh.intervals)
+    inner = dense.knots[mesh.nodes[nearest] != dense.knots]
+    regular = mesh.intervals * (points + 1)
+    for begin in range(0, regular + inner.size, TOGETHER):
+        at = np.arange(begin, min(begin + TOGETHER, regular + inner.size))
+        own = at[at < regular]
+        k, j = own // (points + 1), own % (points + 1)
+        s = mesh.nodes[k] + j / points * np.diff(mesh.nodes)[k]
+        extra = inner[at[at >= regular] - regular]
+        yield np.concatenate([k, np.searchsorted(mesh.nodes, extra) - 1]), np.concatenate([s, extra])
+
+
+def _imposed(mesh: Mesh, k: NDArray[np.intp], s: Array, points: int) -> NDArray[np.bool_]:
+    """Which normalised times s are ends of so many equal parts of the intervals k, a column."""
+    h = np.diff(mesh.nodes)[k]
+    part = (s - mesh.nodes[k]) / np.where(h > 0, h, 1.0) * points
+    return np.asarray(np.abs(part - np.round(part)) <= SAME_PLACE)[:, None]
 
 
 def finite_sizes(values: Array) -> Array:

@@ -2,12 +2,21 @@
 /* X' M = B solved in place, B (n x n); X' = P' L U. */
 static void divide_transposed(const double *RESTRICT factor, const double *RESTRICT swaps, int n, double *RESTRICT B) {
     for (int k = 0; k < n; ++k) exchange(B, n, k, (int)swaps[k]);
-    for (int i = 1; i < n; ++i) add_rows(B + i * n, -1.0, factor + i * n, 1, B, n, i, n);
-    for (int i = n - 1; i >= 0; --i) {
-        double *RESTRICT own = B + i * n;
-        add_rows(own, -1.0, factor + i * n + i + 1, 1, B + (i + 1) * n, n, n - 1 - i, n);
-        const double inverse = 1.0 / factor[i * n + i];
-        for (int c = 0; c < n; ++c) own[c] *= inverse;
+    for (int first = 0, end; first < n; first = end) {
+        end = first + PANEL < n ? first + PANEL : n;
+        add_product(B + first * n, n, -1.0, factor + first * n, n, 1, B, n, end - first, first, n);
+        for (int i = first + 1; i < end; ++i)
+            add_rows(B + i * n, -1.0, factor + i * n + first, 1, B + first * n, n, i - first, n);
+    }
+    for (int end = n, first; end > 0; end = first) {
+        first = end > PANEL ? end - PANEL : 0;
+        add_product(B + first * n, n, -1.0, factor + first * n + end, n, 1, B + end * n, n, end - first, n - end, n);
+        for (int i = end - 1; i >= first; --i) {
+            double *RESTRICT own = B + i * n;
+            add_rows(own, -1.0, factor + i * n + i + 1, 1, B + (i + 1) * n, n, end - 1 - i, n);
+            const double inverse = 1.0 / factor[i * n + i];
+            for (int c = 0; c < n; ++c) own[c] *= inverse;
+        }
     }
 }
 
@@ -66,11 +75,10 @@ static void tangent_step(
     for (int i = 0; i < m * n; ++i) inner[i] = (inner[i] - dZ[i]) / SHARE, dY2[i] = dY1[i] + 2.0 * GAP * inner[i];
     memcpy(dX, inner, sizeof(double) * n * n);
     product(next, dX, n, n, n, Z);
-    for (int i = 0; i < n; ++i) /* dE+ X = dY - E+ dX, transposed */
-        for (int j = 0; j < n; ++j) right[j * n + i] = dE[i * n + j] + inner[(n + i) * n + j] - Z[i * n + j];
+    for (int i = 0; i < n * n; ++i) Z[i] = dE[i] + inner[n * n + i] - Z[i]; /* dE+ X = dY - E+ dX, transposed */
+    turn(Z, n, n, n, right, n);
     divide_transposed(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, right);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) dE[i * n + j] = 0.5 * (right[i * n + j] + right[j * n + i]);
+    symmetric_part(right, n, n, Z, dE);
 }
 
 /* The tangent of what reading j does: dE becomes that after it; those of K, A and E+ are kept. */

@@ -1,14 +1,22 @@
 /* Slopes, from the last step to the first. */
 /* M <- X^-1 M, M (n x r) row by row; X' = P' L U. */
 static void divide(const double *RESTRICT factor, const double *RESTRICT swaps, int n, int r, double *RESTRICT M) {
-    for (int i = 0; i < n; ++i) {
-        const double inverse = 1.0 / factor[i * n + i];
-        double *RESTRICT own = M + i * r;
-        add_rows(own, -1.0, factor + i, n, M, r, i, r);
-        for (int c = 0; c < r; ++c) own[c] *= inverse;
+    for (int first = 0, end; first < n; first = end) {
+        end = first + PANEL < n ? first + PANEL : n;
+        add_product(M + first * r, r, -1.0, factor + first, 1, n, M, r, end - first, first, r);
+        for (int i = first; i < end; ++i) {
+            const double inverse = 1.0 / factor[i * n + i];
+            double *RESTRICT own = M + i * r;
+            add_rows(own, -1.0, factor + first * n + i, n, M + first * r, r, i - first, r);
+            for (int c = 0; c < r; ++c) own[c] *= inverse;
+        }
     }
-    for (int i = n - 2; i >= 0; --i)
-        add_rows(M + i * r, -1.0, factor + (i + 1) * n + i, n, M + (i + 1) * r, r, n - 1 - i, r);
+    for (int end = n, first; end > 0; end = first) {
+        first = end > PANEL ? end - PANEL : 0;
+        add_product(M + first * r, r, -1.0, factor + end * n + first, 1, n, M + end * r, r, end - first, n - end, r);
+        for (int i = end - 2; i >= first; --i)
+            add_rows(M + i * r, -1.0, factor + (i + 1) * n + i, n, M + (i + 1) * r, r, end - 1 - i, r);
+    }
     for (int k = n - 1; k >= 0; --k) exchange(M, r, k, (int)swaps[k]);
 }
 
@@ -59,11 +67,10 @@ static void congruent(const Passage *p, int n, int k, double *RESTRICT P, double
     const double *factor = p->factor + (size_t)k * n * n;
     const double *swaps = p->swaps + (size_t)k * n;
     divide(factor, swaps, n, n, P);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) spare[i * n + j] = P[j * n + i];
+    turn(P, n, n, n, spare, n);
     divide(factor, swaps, n, n, spare);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) P[i * n + j] = 0.5 * (spare[i * n + j] + spare[j * n + i]);
+    turn(spare, n, n, n, P, n);
+    for (int i = 0; i < n * n; ++i) P[i] = 0.5 * (P[i] + spare[i]);
 }
 
 /* What follows has the slopes P as a matrix (few = 0) or as M C M' with few columns; M' (few x n) is kept. */

@@ -7,6 +7,7 @@
 #include "kept.h"
 #include "along.h"
 #include "transitions.h"
+#include "columns.h"
 
 /* Half-vectors that are wanted, from the first one; kicks are added to them as they pass, NULL: none. */
 EXPORT void NAME(passage_forward)(

@@ -50,17 +50,17 @@ static void change(
     const Passage *p, int n, int k, int columns, const double *RESTRICT Y1, const double *RESTRICT Z0, double *RESTRICT V
 ) {
     const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz;
-    memcpy(V, Y1, sizeof(double) * 2 * n * columns);
-    for (int q = 0; q < p->nnz; ++q) {
-        const double share = -GAP * h1[q];
-        double *RESTRICT own = V + p->row[q] * columns;
-        const double *RESTRICT y = Y1 + p->col[q] * columns;
-        for (int j = 0; j < columns; ++j) own[j] += share * y[j];
+    double *RESTRICT shares = p->sizes;
+    for (int i = 0; i < 2 * n; ++i) {
+        const int first = p->begin[i], count = p->begin[i + 1] - first;
+        const double *RESTRICT before = Y1 + (size_t)i * columns, *other = Z0 && i >= n ? Z0 + (i - n) * n : NULL;
+        double *RESTRICT own = V + (size_t)i * columns;
+        for (int t = 0; t < count; ++t) shares[t] = h1[p->which[first + t]];
+        for (int j = 0; j < columns; ++j) own[j] = before[j] - (other ? other[j] : 0.0);
+        if (!other) own[i] -= 1.0;
+        add_chosen(own, -GAP, shares, p->across + first, count, Y1, columns, columns);
+        for (int j = 0; j < columns; ++j) own[j] *= 1.0 / SHARE;
     }
-    for (int i = 0; i < (Z0 ? n : 2 * n); ++i) V[i * columns + i] -= 1.0;
-    if (Z0)
-        for (int i = 0; i < n * n; ++i) V[n * n + i] -= Z0[i];
-    for (int i = 0; i < 2 * n * columns; ++i) V[i] *= 1.0 / SHARE;
 }
 
 /* D [I; E] of a (2n x 2n) matrix. */
@@ -68,8 +68,8 @@ static void applied(const double *RESTRICT D, const double *RESTRICT E, int n, d
     for (int i = 0; i < 2 * n; ++i) {
         double *RESTRICT own = product + i * n;
         memcpy(own, D + i * 2 * n, sizeof(double) * n);
-        add_rows(own, 1.0, D + i * 2 * n + n, 1, E, n, n, n);
     }
+    add_product(product, n, 1.0, D + n, 2 * n, 1, E, n, 2 * n, n, n);
 }
 
 /* Whether a step measures so much that the covariance loses most of its size where it is measured: then rounding of E
@@ -109,16 +109,16 @@ static void step(Passage *p, int n, int k, double *RESTRICT E) {
     } else
         change(p, n, k, n, Y1, E, Y2);
     /* X' E+ = Y', side by side */
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) {
-            b[i * m + j] = Y2[j * n + i] + (i == j);
-            b[i * m + n + j] = Y2[(n + j) * n + i] + E[j * n + i];
-        }
+    turn(Y2, n, n, n, b, m);
+    turn(Y2 + n * n, n, n, n, b + n, m);
+    for (int i = 0; i < n; ++i) {
+        b[i * m + i] += 1.0;
+        for (int j = 0; j < n; ++j) b[i * m + n + j] += E[i * n + j];
+    }
     for (int i = 0; i < m * n; ++i) Y2[i] = Y1[i] + 2.0 * GAP * Y2[i];
     eliminate(b, n, m, swaps);
     for (int i = 0; i < n; ++i) memcpy(factor + i * n, b + i * m, sizeof(double) * n);
-    for (int i = 0; i < n; ++i)
-        for (int j = 0; j < n; ++j) E[i * n + j] = 0.5 * (b[i * m + n + j] + b[j * m + n + i]);
+    symmetric_part(b + n, m, n, a, E);
 }
 
 /* Where readings compute: past what steps use. */

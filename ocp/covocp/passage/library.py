@@ -13,7 +13,7 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 9
+VERSION = 10
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -27,11 +27,12 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "exported_forward": (None, (_ADDRESS,) * 6),
     "exported_slopes": (None, (_ADDRESS,) * 7),
     "transitions": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 5),
+    "columns": (_WHOLE, (_WHOLE, _ADDRESS, _ADDRESS, _WHOLE, _WHOLE, _ADDRESS, _ADDRESS, _WHOLE)),
     "passed_back": (_WHOLE, (_WHOLE,) * 2 + (_ADDRESS,) * 2 + (_WHOLE,) * 3 + (_ADDRESS,) * 7),
 }
 
 # What the library has twice, the second time for newer processors (newer.c).
-_TWICE = ("passage_forward", "passage_reverse", "passage_tangent", "transitions", "passed_back")
+_TWICE = ("passage_forward", "passage_reverse", "passage_tangent", "transitions", "passed_back", "columns")
 
 
 @lru_cache(maxsize=1)

@@ -43,6 +43,99 @@ INLINE void add_to_two(
     add_rows(next, sign, further + j * step, step, B + j * wide, wide, rows - j, columns);
 }
 
+#if defined(__AVX2__) && defined(__GNUC__)
+/* Rows and columns of a block of sums that stays in the registers of a processor with AVX2, columns of one row of them. */
+enum { TALL = 4, BROAD = 8, BROADER = 16 };
+typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
+
+/* A block of C += sign A B; see `add_product`. */
+INLINE void add_block(
+    double *C, int wide, double sign, const double *A, int tall, int step, const double *B, int across, int inner
+) {
+    Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
+    for (int k = 0; k < inner; ++k, A += step, B += across) {
+        const Four left = *(const Four *)B, right = *(const Four *)(B + 4);
+        const double one = A[0], two = A[tall], three = A[2 * tall], four = A[3 * tall];
+        a += one * left, b += one * right, c += two * left, d += two * right;
+        e += three * left, f += three * right, g += four * left, h += four * right;
+    }
+    *(Four *)C += sign * a, *(Four *)(C + 4) += sign * b, C += wide;
+    *(Four *)C += sign * c, *(Four *)(C + 4) += sign * d, C += wide;
+    *(Four *)C += sign * e, *(Four *)(C + 4) += sign * f, C += wide;
+    *(Four *)C += sign * g, *(Four *)(C + 4) += sign * h;
+}
+
+/* The first columns of own += sign (sum of shares of chosen rows of B). */
+INLINE void add_broad(
+    double *own, double sign, const double *share, const int *rows, int count, const double *B, int wide
+) {
+    Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
+    int j = 0;
+    for (; j + 2 <= count; j += 2) {
+        const double one = share[j], two = share[j + 1];
+        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
+        const Four *second = (const Four *)(B + (size_t)rows[j + 1] * wide);
+        a += one * first[0], b += one * first[1], c += one * first[2], d += one * first[3];
+        e += two * second[0], f += two * second[1], g += two * second[2], h += two * second[3];
+    }
+    if (j < count) {
+        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
+        a += share[j] * first[0], b += share[j] * first[1], c += share[j] * first[2], d += share[j] * first[3];
+    }
+    Four *at = (Four *)own;
+    at[0] += sign * (a + e), at[1] += sign * (b + f), at[2] += sign * (c + g), at[3] += sign * (d + h);
+}
+#else
+enum { TALL = 2 };
+#endif
+
+/* own += sign (sum of shares of chosen rows of B, which lie `wide` apart), four at a time. */
+INLINE void add_chosen(
+    double *RESTRICT own, double sign, const double *share, const int *rows, int count, const double *B, int wide,
+    int columns
+) {
+    int j = 0;
+#if defined(__AVX2__) && defined(__GNUC__)
+    for (; columns >= BROADER; columns -= BROADER, own += BROADER, B += BROADER)
+        add_broad(own, sign, share, rows, count, B, wide);
+#endif
+    for (; j + 4 <= count; j += 4) {
+        const double a = sign * share[j], b = sign * share[j + 1], c = sign * share[j + 2], d = sign * share[j + 3];
+        const double *RESTRICT one = B + (size_t)rows[j] * wide, *RESTRICT two = B + (size_t)rows[j + 1] * wide,
+                     *RESTRICT three = B + (size_t)rows[j + 2] * wide, *RESTRICT four = B + (size_t)rows[j + 3] * wide;
+        for (int i = 0; i < columns; ++i) own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
+    }
+    for (; j < count; ++j) {
+        const double a = sign * share[j];
+        const double *RESTRICT one = B + (size_t)rows[j] * wide;
+        for (int i = 0; i < columns; ++i) own[i] += a * one[i];
+    }
+}
+
+/* C += sign A B, (rows x inner) (inner x columns): rows of C and of B lie `wide` and `across` apart, entries of A `tall`
+ * down and `step` along. */
+INLINE void add_product(
+    double *RESTRICT C, int wide, double sign, const double *A, int tall, int step, const double *B, int across, int rows,
+    int inner, int columns
+) {
+    int i = 0;
+    for (; i + TALL <= rows; i += TALL) {
+        double *own = C + (size_t)i * wide;
+        const double *share = A + (size_t)i * tall;
+#if defined(__AVX2__) && defined(__GNUC__)
+        int j = 0;
+        for (; j + BROAD <= columns; j += BROAD) add_block(own + j, wide, sign, share, tall, step, B + j, across, inner);
+        for (int r = 0; r < TALL && j < columns; r += 2)
+            add_to_two(own + r * wide + j, own + (r + 1) * wide + j, sign, share + r * tall, share + (r + 1) * tall, step,
+                       B + j, across, inner, columns - j);
+#else
+        add_to_two(own, own + wide, sign, share, share + tall, step, B, across, inner, columns);
+#endif
+    }
+    for (; i < rows; ++i)
+        add_rows(C + (size_t)i * wide, sign, A + (size_t)i * tall, step, B, across, inner, columns);
+}
+
 /* Two rows of w entries change places. */
 INLINE void exchange(double *RESTRICT a, int w, int one, int other) {
     for (int j = 0; one != other && j < w; ++j) {
@@ -72,16 +165,6 @@ INLINE void panel(double *RESTRICT a, int m, int w, int begin, int end, double *
     }
 }
 
-/* Rows `end` to m past column `end`, by rows k to `end`, whose shares lie before it. */
-INLINE void update(double *RESTRICT a, int m, int w, int k, int end) {
-    int i = end;
-    for (; i + 2 <= m; i += 2) {
-        double *own = a + i * w, *next = own + w;
-        add_to_two(own + end, next + end, -1.0, own + k, next + k, 1, a + k * w + end, w, end - k, w - end);
-    }
-    if (i < m) add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, end - k, w - end);
-}
-
 /* The columns past the first m solved, which are triangular, two rows at a time from the last on. */
 INLINE void solve_upper(double *RESTRICT a, int m, int w) {
     for (int k = m - 1; k >= 0; k -= 2) {
@@ -100,8 +183,32 @@ INLINE void solve_upper(double *RESTRICT a, int m, int w) {
     }
 }
 
-/* Columns that are made triangular at a time. */
-enum { PANEL = 8 };
+/* Columns that are made triangular at a time, rows that are solved so; rows below which they are solved in pairs. */
+enum { PANEL = 8, FEW_ROWS = 20 };
+
+/* The same, some rows at a time where blocks of sums are faster. */
+INLINE void solve_blocks(double *RESTRICT a, int m, int w) {
+    const int columns = w - m;
+    for (int end = m, begin; end > 0; end = begin) {
+        begin = end > PANEL ? end - PANEL : 0;
+        double *first = a + begin * w, *done = a + end * w + m;
+        add_product(first + m, w, -1.0, first + end, w, 1, done, w, end - begin, m - end, columns);
+        for (int k = end - 1; k >= begin; --k) {
+            double *RESTRICT own = a + k * w;
+            add_rows(own + m, -1.0, own + k + 1, 1, own + w + m, w, end - 1 - k, columns);
+            const double inverse = 1.0 / own[k];
+            for (int j = m; j < w; ++j) own[j] *= inverse;
+        }
+    }
+}
+
+/* What is left of `m` rows that were made triangular. */
+INLINE void solve_rest(double *RESTRICT a, int m, int w) {
+    if (TALL > 2 && m >= FEW_ROWS)
+        solve_blocks(a, m, w);
+    else
+        solve_upper(a, m, w);
+}
 
 /* The first m of w columns made triangular with partial pivoting (rows that were exchanged: swaps, unless NULL), the
  * others solved. */
@@ -111,9 +218,9 @@ static void eliminate(double *RESTRICT a, int m, int w, double *RESTRICT swaps) 
         panel(a, m, w, k, end, swaps);
         for (int i = k + 1; i < end; ++i)
             add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
-        update(a, m, w, k, end);
+        add_product(a + end * w + end, w, -1.0, a + end * w + k, w, 1, a + k * w + end, w, m - end, end - k, w - end);
     }
-    solve_upper(a, m, w);
+    solve_rest(a, m, w);
 }
 
 /* Smallest share of a pivot in the sum of the sizes it was made of, without exchanges of rows. */
@@ -143,9 +250,9 @@ static int eliminate_steady(double *RESTRICT a, int m, int w, double *RESTRICT s
             add_rows(a + i * w + end, -1.0, a + i * w + k, 1, a + k * w + end, w, i - k, w - end);
         for (int i = end; i < m; ++i)
             for (int c = k; c < end; ++c) sizes[i] += fabs(a[i * w + c] * a[c * w + i]);
-        update(a, m, w, k, end);
+        add_product(a + end * w + end, w, -1.0, a + end * w + k, w, 1, a + k * w + end, w, m - end, end - k, w - end);
     }
-    solve_upper(a, m, w);
+    solve_rest(a, m, w);
     return 1;
 }
 
@@ -155,18 +262,30 @@ INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) 
         for (int i = j; i < n; ++i, ++t) square[i * n + j] = square[j * n + i] = half[t];
 }
 
+/* B <- A', A (rows x columns): rows lie `across` and `wide` apart; squares of it at a time, which stay in the cache. */
+static void turn(const double *RESTRICT A, int across, int rows, int columns, double *RESTRICT B, int wide) {
+    enum { SIDE = 8 };
+    for (int i = 0; i < rows; i += SIDE)
+        for (int j = 0; j < columns; j += SIDE) {
+            const int last = i + SIDE < rows ? i + SIDE : rows, end = j + SIDE < columns ? j + SIDE : columns;
+            for (int c = j; c < end; ++c)
+                for (int r = i; r < last; ++r) B[(size_t)c * wide + r] = A[(size_t)r * across + c];
+        }
+}
+
+/* S <- half of A + A' (n x n), rows of A `across` apart; B: n x n to work in. */
+static void symmetric_part(const double *RESTRICT A, int across, int n, double *RESTRICT B, double *RESTRICT S) {
+    turn(A, across, n, n, B, n);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) S[i * n + j] = 0.5 * (A[(size_t)i * across + j] + B[i * n + j]);
+}
+
 /* A B, (rows x inner) (inner x columns). */
 static void product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
-    int i = 0;
-    for (; i + 2 <= rows; i += 2) {
-        double *own = result + i * columns;
-        const double *share = A + i * inner;
-        add_to_two(own, own + columns, 1.0, share, share + inner, 1, B, columns, inner, columns);
-    }
-    if (i < rows) add_rows(result + i * columns, 1.0, A + i * inner, 1, B, columns, inner, columns);
+    add_product(result, columns, 1.0, A, inner, 1, B, columns, rows, inner, columns);
 }
 
 /* a . b, in four sums that do not wait for one another. */
@@ -192,5 +311,5 @@ static void turned_product(
     const double *RESTRICT A, const double *RESTRICT B, int rows, int inner, int columns, double *RESTRICT result
 ) {
     memset(result, 0, sizeof(double) * rows * columns);
-    for (int i = 0; i < rows; ++i) add_rows(result + i * columns, 1.0, A + i, rows, B, columns, inner, columns);
+    add_product(result, columns, 1.0, A, 1, rows, B, columns, rows, inner, columns);
 }

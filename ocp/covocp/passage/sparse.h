@@ -5,24 +5,6 @@
  * without exchanges; a step with a pivot that is not good (`eliminate_steady`) is taken as that of a full matrix.
  */
 
-/* own += sign (sum of shares of chosen rows of B), four at a time. */
-INLINE void add_chosen(
-    double *RESTRICT own, double sign, const double *share, const int *rows, int count, const double *B, int columns
-) {
-    int j = 0;
-    for (; j + 4 <= count; j += 4) {
-        const double a = sign * share[j], b = sign * share[j + 1], c = sign * share[j + 2], d = sign * share[j + 3];
-        const double *RESTRICT one = B + rows[j] * columns, *RESTRICT two = B + rows[j + 1] * columns,
-                     *RESTRICT three = B + rows[j + 2] * columns, *RESTRICT four = B + rows[j + 3] * columns;
-        for (int i = 0; i < columns; ++i) own[i] += (a * one[i] + b * two[i]) + (c * three[i] + d * four[i]);
-    }
-    for (; j < count; ++j) {
-        const double a = sign * share[j];
-        const double *RESTRICT one = B + rows[j] * columns;
-        for (int i = 0; i < columns; ++i) own[i] += a * one[i];
-    }
-}
-
 /* Row i (in the order of elimination) of the matrix, at its places in `row`; the sizes that its diagonal is summed from. */
 INLINE double written_row(const Passage *p, int k, int i, double *RESTRICT row) {
     const double *RESTRICT h1 = p->h1 + (size_t)k * p->nnz, *RESTRICT h2 = p->h2 + (size_t)k * p->nnz;
@@ -60,7 +42,7 @@ static int solve_sparse(const Passage *p, int n, int k, int columns, double *RES
             size += fabs(share * upper[p->facing[q]]);
             shares[count] = share, rows[count++] = p->order[j];
         }
-        add_chosen(B + p->order[i] * columns, -1.0, shares, rows, count, B, columns);
+        add_chosen(B + p->order[i] * columns, -1.0, shares, rows, count, B, columns, columns);
         if (!(fabs(row[i]) >= STEADY * size)) return 0; /* NaN neither */
         inverses[i] = 1.0 / row[i];
         for (int q = p->right[i]; q < p->right[i + 1]; ++q) upper[q] = row[p->behind[q]];
@@ -69,7 +51,7 @@ static int solve_sparse(const Passage *p, int n, int k, int columns, double *RES
         const int first = p->right[i], count = p->right[i + 1] - first;
         double *RESTRICT own = B + p->order[i] * columns;
         for (int q = 0; q < count; ++q) rows[q] = p->order[p->behind[first + q]];
-        add_chosen(own, -1.0, upper + first, rows, count, B, columns);
+        add_chosen(own, -1.0, upper + first, rows, count, B, columns, columns);
         for (int c = 0; c < columns; ++c) own[c] *= inverses[i];
     }
     return 1;

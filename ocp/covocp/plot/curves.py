@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -12,10 +13,12 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
+from covocp.solution.reading import other_loop
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
 from covocp.statement.statement import Block, error_size
+from covocp.transcription.before_reading import ESTIMATE
 
 # Curves are sampled at the nodes, on coarser meshes at least this often.
 SAMPLES = 200
@@ -93,6 +96,15 @@ class Panel:
     __repr__ = short_repr
 
 
+class Covariances(NamedTuple):
+    """Of deviations at some times, (K, n, n): E, X = E + Xhat - Z - Z', Xhat, Z; without feedback E is X."""
+
+    E: Array
+    X: Array
+    Xhat: Array
+    Z: Array
+
+
 class Drawn:
     """A solution sampled for drawing."""
 
@@ -105,12 +117,17 @@ class Drawn:
             parts = 1
         inner = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         regular = np.append(inner.ravel(), nodes[-1])
-        # where something happens between the nodes; what a closed loop shows is known at its nodes
-        knots = solution.dense.knots if solution.loop is None else solution.mesh.nodes
+        # where something happens between the nodes
+        knots = solution.dense.knots if self.known_between else solution.mesh.nodes
         t = np.union1d(regular, knots[~np.isin(knots, solution.mesh.nodes)] * solution.duration)
         # before and after what is read at an instant
         self.t = np.sort(np.concatenate([t, solution.t[solution.mesh.instants]]))
         self.early = np.flatnonzero(np.diff(self.t) == 0.0)
+
+    @property
+    def known_between(self) -> bool:
+        """Whether what is drawn is known between the nodes: not where a loop has other statistics than its design's."""
+        return self.solution.loop is None or other_loop(self.solution) is None
 
     def knows(self, name: str) -> bool:
         """Whether a name, or the vector of an entry, is in the solution."""
@@ -139,25 +156,52 @@ class Drawn:
         """Half the width of a band at the times, (K, size); None where nothing is uncertain.
 
         Of a state: of the actual system. Of an unknown constant: of the estimate, which alone changes. Of a control:
-        what the feedback adds to it.
+        what the feedback adds to it; of one that is constant between the nodes at these.
         """
         loop, rows = self.solution.loop, self.rows(block.name)
         if self.covariance is None or (loop is None and block.kind == "control"):
             return None
+        if loop is not None and block.kind == "control":
+            gain, estimate = loop.gain[:, block.span], loop.Xhat
+            if self.solution.mesh.control != "constant":  # which is drawn at the nodes
+                gain, estimate = self.between(gain), self.covariances.Xhat
+            variances = np.einsum("kui,kij,kuj->ku", gain, estimate, gain)
+        else:
+            variances = (self.covariances.E if block.kind == "unknown" else self.covariances.X)[:, rows, rows]
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+    @cached
+    def covariances(self) -> Covariances:
+        """Those of the deviations at the times, between the nodes as the integrator has them where it does.
+
+        Of a closed loop it has E, and Xhat only where this is a state. Else the sum X of both is drawn through its
+        nodes, which no measurement moves: what E falls by Xhat rises by, however fast, so Xhat is the rest.
+        """
+        loop = self.solution.loop
+        assert self.covariance is not None
         if loop is None:
-            return np.sqrt(np.maximum(self.sample[self.covariance.name][:, rows, rows], 0.0))
-        variances = (loop.E if block.kind == "unknown" else loop.X)[:, rows, rows]
-        if block.kind == "control":
-            gain = loop.gain[:, block.span]
-            variances = np.einsum("kui,kij,kuj->ku", gain, loop.Xhat, gain)
-        return self.between(np.sqrt(np.maximum(variances, 0.0)))
+            E = self.sample[self.covariance.name]
+            return Covariances(E, E, np.zeros_like(E), np.zeros_like(E))
+        Z = self.between(loop.Z)
+        both = Z + Z.transpose(0, 2, 1)
+        if not self.known_between:
+            E, Xhat = self.between(loop.E), self.between(loop.Xhat)
+            return Covariances(E, E + Xhat - both, Xhat, Z)
+        # The loop is propagated by more steps than the program has: at its nodes E is what it says.
+        E = self.sample[self.covariance.name] + self.between(loop.E - self.solution.values[self.covariance.name])
+        if ESTIMATE in self.sample.values:
+            Xhat = self.sample[ESTIMATE]
+            return Covariances(E, E + Xhat - both, Xhat, Z)
+        X = self.between(loop.X)
+        Xhat = X - E + both
+        Xhat[np.isin(self.t, self.solution.t)] = loop.Xhat  # without the roundoff of a difference
+        return Covariances(E, X, Xhat, Z)
 
     def block(self, a: Given, b: Given) -> Array:
         """Covariance of the actual deviations between two symbols at the times, (K, size of a, size of b)."""
-        nodes = self.solution.covariance(a, b)
-        if self.solution.loop is not None or self.covariance is None:
-            return self.between(nodes)
-        return self.sample[self.covariance.name][:, self.rows(a)][:, :, self.rows(b)]
+        if self.covariance is None or not (isinstance(a, str) and isinstance(b, str)):
+            return self.between(self.solution.covariance(a, b))  # says what is wrong with them
+        return self.covariances.X[:, self.rows(a)][:, :, self.rows(b)]
 
     def between(self, values: Array) -> Array:
         """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""
@@ -169,21 +213,15 @@ class Drawn:
 
         The deviation of an expression g(x, b, u) is g_x dx + g_u du, with dx = x' - e and du = -C x'.
         """
-        loop, by_state, by_control = self.solution.loop, *self._slopes(key)
-        assert self.covariance is not None
-        E = self.solution.values[self.covariance.name] if loop is None else loop.E
-        error = np.einsum("kri,kij,krj->kr", by_state, E, by_state)
-        if loop is None:
-            return self._roots(error, error, np.zeros_like(error))
-        by_estimate = by_state - by_control @ loop.gain
-        estimate = np.einsum("kri,kij,krj->kr", by_estimate, loop.Xhat, by_estimate)
-        total = error + estimate - 2 * np.einsum("kri,kij,krj->kr", by_state, loop.Z, by_estimate)
-        return self._roots(total, error, estimate)
-
-    def _roots(self, *variances: Array) -> tuple[Array, Array, Array]:
-        """Roots of three variances at the nodes, at the times."""
-        total, error, estimate = (self.between(np.sqrt(np.maximum(v, 0.0))) for v in variances)
-        return total, error, estimate
+        loop, known = self.solution.loop, self.covariances
+        by_state, by_control = self._slopes(key)
+        by_estimate = by_state if loop is None else by_state - by_control @ loop.gain
+        by_state, by_estimate = self.between(by_state), self.between(by_estimate)
+        error = np.einsum("kri,kij,krj->kr", by_state, known.E, by_state)
+        estimate = np.einsum("kri,kij,krj->kr", by_estimate, known.Xhat, by_estimate)
+        total = error + estimate - 2 * np.einsum("kri,kij,krj->kr", by_state, known.Z, by_estimate)
+        roots = (np.sqrt(np.maximum(values, 0.0)) for values in (total, error, estimate))
+        return next(roots), next(roots), next(roots)
 
     def _slopes(self, key: Given) -> tuple[Array, Array]:
         """Slopes of a name or an expression by the augmented state (K, rows, n) and by the control (K, rows, nu)."""
@@ -284,4 +322,8 @@ def _between(nodes: Array, values: Array, times: Array) -> Array:
         columns = values.reshape(values.shape[0], -1).T
         flat = np.array([np.interp(times, nodes, column) for column in columns]).T
         return flat.reshape(times.size, *values.shape[1:])
-    return np.asarray(PchipInterpolator(nodes, values, axis=0)(times))
+    result = np.asarray(PchipInterpolator(nodes, values, axis=0)(times))
+    nearest = np.minimum(np.searchsorted(nodes, times), nodes.size - 1)
+    known = nodes[nearest] == times
+    result[known] = values[nearest[known]]  # without the roundoff of a polynomial
+    return result

@@ -17,7 +17,15 @@ from covocp.base.errors import ProblemError, no_option
 from covocp.base.expressions import Given
 from covocp.base.files import check_target, written_whole
 from covocp.plot.curves import Panel, units_in
-from covocp.plot.legends import place_legend, place_title, plain_text
+from covocp.plot.legends import (
+    LONGEST_ABSCISSA,
+    axis_label,
+    cut,
+    entry_labels,
+    place_legend,
+    place_title,
+    plain_text,
+)
 from covocp.plot.panels import abscissa_label, choose_panels
 from covocp.plot.paths import outline
 from covocp.solution.instants import instant_times
@@ -54,7 +62,6 @@ NEAR = 0.2  # of the range of the curves: bounds farther away are not drawn
 CONSTANT = 1e-5
 CONSTANT_RANGE = 0.05  # of the value, on both sides
 PANEL = (3.3, 2.15)  # width, height in inches
-LONGEST_LINE = 26  # characters along the height of a panel
 SINGLE = (4.8, 3.2)  # of a panel alone
 HEAD = 0.6  # inches for title and legend
 RESOLUTION = 200  # dots an inch
@@ -226,7 +233,7 @@ def _arrange(figure: Figure, axes: Any, count: int, abscissa: str) -> None:
         place.set_visible(False)
     for column in range(columns):
         last = max(row for row in range(rows) if row * columns + column < count)
-        axes[last, column].set_xlabel(plain_text(abscissa))
+        axes[last, column].set_xlabel(plain_text(cut(abscissa, LONGEST_ABSCISSA)))
     figure.align_ylabels(list(axes.ravel()[:count]))
 
 
@@ -421,14 +428,15 @@ def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
     """Which entry is which, within the panel."""
     from matplotlib.lines import Line2D
 
+    shown = sorted({curve.entry for curve in panel.curves})
+    labels, columns = entry_labels([panel.entries[k] for k in shown])
     handles = []
-    for k in sorted({curve.entry for curve in panel.curves}):
+    for k, label in zip(shown, labels, strict=True):
         style = _line(k) if count == 1 else {"color": "#555555", "linestyle": _line(k)["linestyle"]}
-        handles.append(Line2D([], [], label=plain_text(panel.entries[k]), **style))
-    axes.legend(handles=handles, ncols=1 if len(handles) < 4 else 2, fontsize=7, handlelength=2.0, labelspacing=0.3)
+        handles.append(Line2D([], [], label=plain_text(label), **style))
+    axes.legend(handles=handles, ncols=columns, fontsize=7, handlelength=2.0, labelspacing=0.3)
 
 
 def _folded(label: str) -> str:
-    """A label whose unit stands on a line of its own where the axis is too short for both."""
-    name, bracket, unit = label.rpartition(" [")
-    return label if len(label) <= LONGEST_LINE or not name else f"{name}\n{bracket.strip()}{unit}"
+    """A label along the height of a panel, as it is shown; dollar signs are still those of the name."""
+    return axis_label(label)

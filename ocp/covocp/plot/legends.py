@@ -1,4 +1,4 @@
-"""Legends and titles of figures that are never cut: as many columns as fit, and the height that they need."""
+"""Legends, titles and labels that stay within a figure: as many columns as fit, and the height that they need."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 LINE = 0.3
 LETTERS = 11.5  # of a title, an inch
 LEAST_LETTERS = 12
+# Letters along the height of a panel, and along its width: of the axis, of entries in one column and in two.
+LONGEST_LINE, LONGEST_ABSCISSA, LONGEST_ENTRY, LONGEST_HALF = 26, 44, 36, 18
+MOST_LINES = 2  # of a name along the height of a panel
+MANY = 4  # entries of a panel from which on two columns explain them
 EDGE = 0.97  # share of the width that a legend may take
 
 
@@ -69,6 +73,30 @@ def place_title(figure: Figure, lines: Iterable[str], *, warning: bool) -> None:
     figure.set_figheight(figure.get_figheight() + more * LINE / 2)
     if folded:
         figure.suptitle("\n".join(folded), fontsize=10, color=WARNING if warning else "black")
+
+
+def axis_label(label: str) -> str:
+    """A label along the height of a panel: folded, its unit on a line of its own, and cut where that is not enough."""
+    if len(label) <= LONGEST_LINE:
+        return label
+    name, bracket, unit = label.rpartition(" [")
+    if not name or not unit.endswith("]"):
+        name, bracket, unit = label, "", ""
+    lines = textwrap.wrap(name, LONGEST_LINE) or [name]
+    if len(lines) > MOST_LINES:
+        lines = [*lines[: MOST_LINES - 1], cut(lines[MOST_LINES - 1] + " " + lines[MOST_LINES], LONGEST_LINE)]
+    return "\n".join([*lines, *([cut(bracket.strip() + unit, LONGEST_LINE)] if unit else [])])
+
+
+def entry_labels(entries: list[str]) -> tuple[list[str], int]:
+    """Labels of the entries of a panel, cut to its width, and in how many columns they stand."""
+    columns = 2 if len(entries) >= MANY and all(len(entry) <= LONGEST_HALF for entry in entries) else 1
+    return [cut(entry, LONGEST_ENTRY) for entry in entries], columns
+
+
+def cut(text: str, longest: int) -> str:
+    """A text that ends with an ellipsis where it would be longer than so many letters."""
+    return text if len(text) <= longest else text[: longest - 1].rstrip() + "…"
 
 
 def plain_text(text: str) -> str:

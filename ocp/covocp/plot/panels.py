@@ -217,7 +217,7 @@ def _quantity(drawn: list[Drawn], key: Quantity, blocks: Mapping[str, Block], un
         return [panel for of in chosen for panel in rms(drawn, of, blocks, units)]
     labels = drawn[0].solution.augmented
     block = Block(name=key.word, kind="matrix", size=len(labels), offset=0, labels=labels, estimation=True)
-    return _matrix([(d, d.t, d.between(getattr(d.solution.loop, key.word))) for d in drawn], block, units)
+    return _matrix([(d, d.t, getattr(d.covariances, key.word)) for d in drawn], block, units)
 
 
 def _resolved(solutions: list[Solution], key: Given) -> Any:

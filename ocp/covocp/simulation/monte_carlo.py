@@ -62,6 +62,9 @@ class MonteCarlo:
         design, design_error: the same mean squares as the design expects them; they differ where there is a truth.
         intended: mean squares of the deviation at the end that the solution itself promises, (n,); they differ from
             those of the design where the mesh does not resolve its gains. NaN without feedback.
+        grown: what noise that varies with state and control adds to the covariance of deviation and estimate at the end
+            by their spread, which the prediction leaves out, (2n, 2n); zero where the prediction holds or no density
+            bends, NaN where it is not known.
         deviations: at the end, (R, n); of a run that left the domain, just before it did.
         estimates: the filter's estimates of them, (R, n); those of a law at its last step, NaN where it has none.
         costs: of each run, (R,); NaN where it left the domain, or without an expected cost.
@@ -105,6 +108,7 @@ class MonteCarlo:
     predicted_mean: Array
     predicted_control: Array
     intended: Array
+    grown: Array
     design: Array
     design_error: Array
     deviations: Array

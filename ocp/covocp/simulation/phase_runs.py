@@ -14,6 +14,7 @@ from covocp.simulation.course import Course, Legs
 from covocp.simulation.flown import sample_indices
 from covocp.simulation.junction import Junction, junction
 from covocp.simulation.monte_carlo import MonteCarlo
+from covocp.simulation.noise_growth import Find, of_phase
 from covocp.simulation.phase_asked import Asked, Flight, flight
 from covocp.simulation.phase_sample import PhasesMonteCarlo
 from covocp.simulation.plan import Plan, make_plan
@@ -176,7 +177,8 @@ def _sample(
     )
     nominal = nominal_at(leg.setting.solution, *leg.stored)
     told = flown.actual.words, float(flown.actual.costs[number])
-    sample = sample_of(leg.setting, request, leg.step, nominal, (leg.expected, leg.true), own, told)
+    grown: Find = lambda: of_phase(flown.solution, number)  # noqa: E731
+    sample = sample_of(leg.setting, request, leg.step, nominal, (leg.expected, leg.true), own, told, grown)
     if number and leg.pilot is None:  # examined from where runs start: that is known of the first phase only
         return sample
     return examined_sample(sample, leg.setting, reporter, leg.pilot)

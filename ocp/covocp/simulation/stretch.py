@@ -17,6 +17,7 @@ from covocp.simulation.actual import System, design_system
 from covocp.simulation.batches import Batch, Cloud, StoppedError
 from covocp.simulation.constraints import counted_rows, promised
 from covocp.simulation.monte_carlo import MonteCarlo
+from covocp.simulation.noise_growth import Find, grown_at_end, of_solution
 from covocp.simulation.prediction import Prediction, control_spread
 from covocp.simulation.request import Request
 from covocp.simulation.run_parts import Limits, Setting
@@ -174,15 +175,18 @@ def sample_of(
     predictions: tuple[Prediction, ...],
     harvest: Harvest[Batch],
     truth: tuple[str, float],
+    grown: Find | None = None,
 ) -> MonteCarlo:
-    """The batches put together; `truth`: in words, and what linear theory says that it costs."""
+    """The batches put together; `truth`: in words, and what linear theory says that it costs.
+
+    `grown`: what finds what noise that varies adds, where that is not of the solution alone.
+    """
     design, solution, (expected, true) = setting.design, setting.solution, predictions
     unknowns = np.tile(design.start[design.entries :], (nominal.t.size, 1))
     states = _values(design.motion, nominal.x)
     limits, m = setting.limits, design.fed_back
     costs = (solution.cost, truth[1]) if setting.costs else (np.nan, np.nan)
-
-    return MonteCarlo(
+    sample = MonteCarlo(
         **_of_runs(harvest.batches),
         name=solution.name,
         requested=int(request.runs),
@@ -202,6 +206,7 @@ def sample_of(
         predicted_mean=true.mean[:, : design.size],
         predicted_control=control_spread(solution, design, true, nominal),
         intended=np.full(design.size, np.nan) if solution.loop is None else np.diagonal(solution.loop.X[-1]).copy(),
+        grown=np.zeros((2 * design.size, 2 * design.size)),
         design=expected.deviation,
         design_error=expected.error,
         design_cost=costs[0],
@@ -217,6 +222,9 @@ def sample_of(
         augmented=design.statement.augmented,
         symbols=design.statement.symbols,
     )
+    if sample.verdict.holds:  # nothing is to be explained
+        return sample
+    return replace(sample, grown=grown_at_end(grown or (lambda: of_solution(solution)), setting))
 
 
 def _values(motion: Geometry, x: Array) -> list[Array]:

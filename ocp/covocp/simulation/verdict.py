@@ -25,13 +25,15 @@ AS_PROMISED = 0.1
 # Share of the largest predicted deviation of a component on the way below which it is known exactly at the end: what is
 # left is of the steps of nominal and runs.
 EXACT = 1e-6
+# Share of what the sample has in excess of the prediction from which on something explains part of it.
+PART = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Component:
     """One component at the end: predicted standard deviation, that of the sample with its band, the bias.
 
-    exact: standard deviations up to this are zero.
+    exact: standard deviations up to this are zero. grown: predicted with what noise that varies adds; NaN: not known.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Component:
     bias: float
     robust: float
     exact: float = 0.0
+    grown: float = float("nan")
 
     @property
     def inside(self) -> bool:
@@ -49,6 +52,16 @@ class Component:
         if self.sample <= self.exact:
             return self.predicted <= self.exact
         return self.low <= self.predicted <= self.high
+
+    @property
+    def explained(self) -> bool:
+        """Whether it is inside the band with what noise that varies adds, and that is much of the excess."""
+        return self.partly and (self.inside or self.low <= self.grown <= self.high)
+
+    @property
+    def partly(self) -> bool:
+        """Whether noise that varies explains much of what the sample has in excess."""
+        return self.inside or self.grown**2 - self.predicted**2 >= PART * (self.sample**2 - self.predicted**2) > 0
 
     @property
     def ratio(self) -> float:
@@ -68,7 +81,8 @@ class Verdict:
     runs in which it once gave no finite control; they do not count as unstable.
     too_long: what halving the given step changes, in words; "" where it is short enough. unpredicted: components of
     which the prediction is no number. broken: (name, promised, predicted) standard deviations at the end where the
-    gains between the nodes do something else than the solution promises.
+    gains between the nodes do something else than the solution promises. unknown_noise: whether noise varies with what
+    deviates, and what that adds is not known.
     """
 
     deviations: tuple[Component, ...]
@@ -84,6 +98,7 @@ class Verdict:
     too_long: str = ""
     unpredicted: tuple[str, ...] = ()
     broken: tuple[tuple[str, float, float], ...] = ()
+    unknown_noise: bool = False
 
     __repr__ = short_repr
 
@@ -107,19 +122,31 @@ class Verdict:
     def reasons(self) -> tuple[str, ...]:
         """Why it does not hold, () where it holds.
 
-        Of "step", "unpredicted", "gains", "unanswered", "unstable", "saturated"; else "law" or "nonlinear".
+        Of "step", "unpredicted", "gains", "unanswered", "noise", "unstable", "saturated"; else "law" or "nonlinear".
 
-        Control that a law was given, because there were no limits, explains nothing.
+        Control that a law was given, because there were no limits, explains nothing. Where noise that grows with the
+        deviations explains the spread of all components, runs far away are its tails, not unstable.
         """
         if self.holds:
             return ()
         causes = {"step": self.too_long, "unpredicted": self.unpredicted and not self.broken, "gains": self.broken}
         found = [name for name, cause in {**causes, "unanswered": self.unanswered}.items() if cause]
-        if self.unstable >= NOTICEABLE or self.left > self.unanswered:
+        noise = self._noise
+        found += ["noise"] if noise else []
+        if (self.unstable >= NOTICEABLE and noise != "all") or self.left > self.unanswered:
             found.append("unstable")
         if self.asked >= NOTICEABLE and (self.limited or not self.law):
             found.append("saturated")
-        return tuple(found) or ("law" if self.law else "nonlinear",)
+        enough = noise == "all" or any(name != "noise" for name in found)
+        return tuple(found) if enough else (*found, "law" if self.law else "nonlinear")
+
+    @property
+    def _noise(self) -> str:
+        """Whether noise that grows with the deviations explains the spread of "all" components, "part" of it, or ""."""
+        missed = [entry for entry in self.decisive if not entry.inside]
+        if not missed or not all(entry.partly for entry in missed):
+            return ""
+        return "all" if all(entry.explained for entry in missed) else "part"
 
     @property
     def headline(self) -> str:
@@ -155,6 +182,14 @@ class Verdict:
             )
         if reason == "unanswered":
             return f"in {_percent(self.unanswered)} of the runs the law once gave no finite control"
+        if reason == "noise":
+            missed = [entry for entry in self.decisive if not entry.inside]
+            listed = ", ".join(f"{entry.name} {entry.grown:.3g}" for entry in missed)
+            inside = ", inside the band" if self._noise == "all" else ", of which something is left"
+            return (
+                "the density of the noise varies with state and control and grows with their deviations, which the "
+                f"prediction leaves out: with what they add it is {listed}{inside}"
+            )
         if reason == "unstable":
             words = f"{_percent(self.unstable)} of the runs are unstable"
             gone = f" ({_percent(self.left)} left the domain)" if self.left else ""
@@ -168,7 +203,9 @@ class Verdict:
                 "no run is unstable or short of control, so this law is not the filter and feedback of the design, is "
                 "stepped too rarely, or the system is too nonlinear for this spread"
             ) + (f" ({_percent(self.asked)} asked for more control than the nominal has)" if self.asked else "")
-        return "no run is unstable or short of control, so the system is too nonlinear for this spread"
+        grows = ", or the noise, which varies with it, grows with it too much" if self.unknown_noise else ""
+        left = "what is left means that " if "noise" in self.reasons else "no run is unstable or short of control, so "
+        return f"{left}the system is too nonlinear for this spread{grows}"
 
 
 def judge(sample: MonteCarlo) -> Verdict:
@@ -188,9 +225,13 @@ def judge(sample: MonteCarlo) -> Verdict:
     numbers = predicted if sample.fed_back else errors
     largest = np.nan_to_num(standard_deviations(sample.predicted), nan=0.0, posinf=0.0).max(axis=0)
     exact = EXACT * largest
+    to_error = np.hstack([-np.eye(n), np.eye(n)])
+    more = (np.diagonal(v) for v in (sample.grown[:n, :n], to_error @ sample.grown @ to_error.T))
+    grown, grown_errors = (np.sqrt((v**2 + w).clip(0.0)) for v, w in zip((predicted, errors), more, strict=True))
+    level = (stayed, sample.level, exact)
     return Verdict(
-        deviations=_entries(names[:states], predicted, sample.deviations, stayed, sample.level, exact),
-        errors=_entries(names, errors, sample.estimates - sample.deviations, stayed, sample.level, exact)
+        deviations=_entries(names[:states], predicted, grown, sample.deviations, *level),
+        errors=_entries(names, errors, grown_errors, sample.estimates - sample.deviations, *level)
         if sample.estimated
         else (),
         left=sample.left_share,
@@ -203,12 +244,19 @@ def judge(sample: MonteCarlo) -> Verdict:
         unanswered=float(1.0 - answered.mean()),
         too_long="" if sample.step.settled or not sample.step.given else sample.step.reason,
         unpredicted=tuple(name for name, value in zip(names, numbers, strict=True) if not np.isfinite(value)),
+        unknown_noise=bool(np.isnan(sample.grown).any()),
         broken=tuple((names[i], float(intended[i]), float(flown[i])) for i in np.flatnonzero(broken).tolist()),
     )
 
 
 def _entries(
-    names: tuple[str, ...], predicted: Array, values: Array, stayed: Array, level: float, exact: Array
+    names: tuple[str, ...],
+    predicted: Array,
+    grown: Array,
+    values: Array,
+    stayed: Array,
+    level: float,
+    exact: Array,
 ) -> tuple[Component, ...]:
     """The components of some terminal values, (R, rows)."""
     inside = values[stayed]
@@ -228,6 +276,7 @@ def _entries(
                 bias=float(column.mean()) if column.size else np.nan,
                 robust=float(robust_deviation(values[:, i : i + 1])[0]),
                 exact=float(exact[i]),
+                grown=float(grown[i]),
             )
         )
     return tuple(result)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from covocp.base.errors import warn_user
+from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
+from covocp.transcription.scales import choose_scales
 
 # Relative difference of the cost and of that of the loop's own covariances above which these are not resolved.
 COARSE_LOOP = 1e-2
@@ -20,12 +21,16 @@ LOST_LOOP = (
     "deviation is that of the error of the estimate alone. The cost and E do not depend on them. Use more intervals, "
     "or units in which initial variances and densities of the noise differ less."
 )
+# The method whose slopes are integrated, not those of its cost on the mesh; stationarity from which the two differ.
+OWN_SLOPES, NOT_STATIONARY = "gradient", 1e-3
+# Share of their magnitudes below which the controls do nothing.
+NOTHING = 1e-6
 REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or use more intervals."
 
 
 def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
-    error = solution.mesh_error
+    error, fine = solution.mesh_error, False
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
@@ -41,13 +46,43 @@ def mention_doubts(solution: Solution) -> None:
             "its range. Use more intervals or substeps."
         )
     else:
+        fine = True
         _mention_loop(solution)
     mention_spread(solution)
+    _mention_slopes(solution, fine)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         warn_user(
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             "covariance_step='gauss' or more intervals."
+        )
+
+
+def _mention_slopes(solution: Solution, fine: bool) -> None:
+    """Warn of a point that is stationary by the slopes of the method alone, or of no minimum, where it has its own.
+
+    fine: whether the mesh seems to be; else it was said why slopes and costs differ.
+    """
+    if not solution.optimised or solution.method != OWN_SLOPES or solution.statement is None:
+        return
+    extremal = solution.extremal
+    t = extremal.trajectory
+    units = choose_scales(extremal.statement, extremal.mesh, t, extremal.parameters).u
+    if not (np.abs(t.u) > NOTHING * units).any():  # slopes are those of roundoff
+        return
+    try:
+        found = solution.optimality
+    except (CovocpError, RuntimeError, ArithmeticError, ValueError):  # the report says that it is not known
+        return
+    if fine and found.stationarity is not None and found.stationarity > NOT_STATIONARY:
+        warn_user(
+            f"The point is stationary by the slopes that the method integrates, not by those of its cost on this mesh "
+            f"(stationarity {found.stationarity:.1e}). Use more intervals, or method='ipopt' from there (guess=)."
+        )
+    if found.curvature is not None and found.curvature < 0:
+        warn_user(
+            f"This is no minimum: the reduced Hessian has a negative curvature, {found.curvature:.1e} of its largest. "
+            "Start elsewhere, or go on from there by method='ipopt' (guess=)."
         )
 
 
@@ -100,10 +135,11 @@ def mention_limits(solution: Solution) -> None:
             f"interval (points={2 * solution.mesh.points}, method 'ipopt'), or use more intervals."
         )
         return
+    where = "At points where" if passed[0].imposed else "Between the points where"
+    remedy = passed[0].remedy(solution.mesh.points)
     warn_user(
-        f"Between the points where it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
-        f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. Impose it at more points of each "
-        f"interval (points={2 * solution.mesh.points}, method 'ipopt'), use more intervals, or keep a margin."
+        f"{where} it is imposed the limit of '{passed[0].name}' is passed by {passed[0].by:.3g} "
+        f"({100 * passed[0].share:.2g} % of it) at t = {passed[0].time:.4g} s{more}. {remedy[0].upper()}{remedy[1:]}."
     )
 
 

@@ -16,6 +16,7 @@ from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.threads import methods_one_at_a_time
+from covocp.solution.known_links import KnownLink, check_links
 from covocp.solution.report import refinement, sections, starts_told
 from covocp.solution.sample import Sample, asked_times
 from covocp.solution.solution import Solution
@@ -88,6 +89,7 @@ class PhasesSolution:
         violations: of constraints, by name with that of the phase.
         stats: iterations, times, what the method counts.
         links: what passes from each phase to the next; none where it was read from a file without its phases.
+        known_links: of a solution read from a file, what these were, to tell them from others.
     """
 
     name: str
@@ -99,9 +101,19 @@ class PhasesSolution:
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
     links: tuple[Link, ...] = ()
+    known_links: tuple[KnownLink, ...] = ()
 
     # What functions say that take one problem or solution.
     instead = "give one of its phases, solution[name]; what concerns all phases together is not available here"
+
+    def __post_init__(self) -> None:
+        """Links that are given to a solution from a file must be those that it was solved with.
+
+        Raises:
+            ProblemError: they are others (says what differs).
+        """
+        if self.links and self.known_links:
+            check_links(self.known_links, self.links)
 
     if not TYPE_CHECKING:  # else every attribute would pass for known
 

@@ -64,6 +64,10 @@ UNCHECKED = "not checked: explicit steps back would be too many; costates near t
 # Where to begin to worry about a residual, and what a large one means.
 WORRIES: dict[str, tuple[float, str]] = {
     "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
+    "complementarity": (
+        1e-3,
+        "LARGE: multipliers push at bounds that are not reached; a smaller tolerance=, or start again from it",
+    ),
     "costate_difference": (
         1e-2,
         "large: the costates change within an interval (a constraint takes hold, a stiff start or end); costs and "
@@ -445,9 +449,11 @@ def _between_nodes(solution: Solution) -> Section:
     if not worst.defined:
         text = f"limits are imposed at {where}; between them '{worst.name}' is NaN or inf, at t = {worst.time:.4g} s"
         return [Sentence(text + ": check_path() lists all")]
+    less = "more intervals make" if worst.equation else "points= or more intervals make"
+    less = "a smaller tolerance= makes" if worst.imposed else less
     text = (
-        f"limits are imposed at {where}; between them that of '{worst.name}' is passed by up to {worst.by:.2g}, "
-        f"{100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: points= or more intervals make it less, "
+        f"limits are imposed at {where}; {'there' if worst.imposed else 'between them'} that of '{worst.name}' is "
+        f"passed by up to {worst.by:.2g}, {100 * worst.share:.2g} % of it, at t = {worst.time:.4g} s: {less} it less, "
         "check_path() lists all"
     )
     return [Sentence(text)]

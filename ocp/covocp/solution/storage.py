@@ -37,7 +37,7 @@ T = TypeVar("T")
 FORMAT = "covocp solution"
 VERSION = 3
 # Fields with a default that files of this version may lack.
-ADDED = ("readings",)
+ADDED = ("readings", "words", "aspects")
 SUFFIXES = (".npz", ".json")
 REASON = 160  # letters of a reason that an error quotes
 # Fields: of the problem, which is not kept; of the candidate, whose own fields are entries of the file.
@@ -228,7 +228,7 @@ def to_tree(solution: Solution) -> dict[str, Any]:
         stored_problem=_known_problem(solution),
         stats={**solution.stats, **noted(solution.mean_effect)},
     )
-    tree: dict[str, Any] = _plain(known)
+    tree: dict[str, Any] = plain(known)
     return tree
 
 
@@ -250,6 +250,25 @@ def from_tree(tree: Mapping[str, Any]) -> Solution:
     _refuse("entries of the wrong shape: ", _misfits(Solution, solution, "", lengths))
     _refuse("entries of the wrong shape: ", _misfits(Any, solution.mean_effect, "mean_effect", lengths))
     return solution
+
+
+def record(hint: Any, value: Any, place: str) -> Any:
+    """What `plain` took apart of a value of some type, outside the entries of a solution.
+
+    Args:
+        hint: the type.
+        value: what the file has for it.
+        place: its name.
+
+    Raises:
+        DamagedFileError: an entry is missing or of another type.
+    """
+    missing: list[str] = []
+    wrong: list[str] = []
+    made = _made(hint, value, place, missing, wrong)
+    _refuse("it lacks the entries ", missing)
+    _refuse("entries of the wrong type: ", wrong)
+    return made
 
 
 def _refuse(reason: str, entries: Iterable[str]) -> None:
@@ -284,21 +303,21 @@ def _parts(kind: Any) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in fields(kind) if f.name != NOT_KEPT}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Dataclasses as dictionaries, also within tuples."""
     if isinstance(value, tuple):
-        return tuple(_plain(entry) for entry in value)
+        return tuple(plain(entry) for entry in value)
     kind: Any = type(value)
     tree: dict[str, Any] = {}
     for name in _parts(kind):
-        entry = _plain(getattr(value, name))
+        entry = plain(getattr(value, name))
         if name not in OPTIONAL or entry is not None:
             tree |= entry if name == OPENED else {name: entry}
     return tree or value
 
 
 def _made(hint: Any, value: Any, place: str, missing: list[str], wrong: list[str]) -> Any:
-    """The value of a field, with the objects that `_plain` took apart.
+    """The value of a field, with the objects that `plain` took apart.
 
     Args:
         hint: the type of the field.

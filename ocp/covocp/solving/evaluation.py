@@ -33,6 +33,7 @@ from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.missed import check_has_loop, missed_by_loop, told
 from covocp.solving.not_finite import with_shortest_steps
 from covocp.solving.unused import mention_forgotten
+from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement, entry_names
 from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
@@ -131,6 +132,7 @@ def _along(
     st = problem.statement()
     mention_forgotten(problem)
     values = stacked_parameters(st, parameters)
+    check_magnitudes(st, values)
     given = graded(st, first_options(nominal, intervals, options), values)
     outcome = run_along(st, nominal, given, values)
     own_steps = given.substeps == "auto"

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from covocp.base.errors import warn_user
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
-from covocp.extremal.extremal import Guess, Outcome, Prepared
+from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
+from covocp.transcription.scales import choose_scales
+from covocp.transcription.starts import moving_units
+from covocp.transcription.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from covocp.extremal.curvature import Curvature
 
 # A run that ends after so few iterations began at a stationary point, which need not be a minimum.
 SUSPICIOUS_ITERATIONS = 3
-# A run whose control moved no further than this share of it (or in its unit) ended where it began: the same suspicion.
+# A run whose control moved no further than this share of it (or of its unit) ended where it began: the same suspicion.
 UNMOVED = 1e-6
+# A saddle is left by the size of the controls, or by this share of what moves a state by its scale: in these units a
+# step is none too small for the solver to see, nor so large that it leads to another valley.
+DISPLACEMENT = 0.3
 ESCAPES = (1.0, -1.0)
+# Share of the cost by which another end must be cheaper than the saddle, to be another one: not the same with roundoff.
+CHEAPER = 1e-9
+# Share of the cost that is not worth a word: a control that goes from bound to bound between two nodes is between them
+# at a node, where the cost is concave in it.
+HARDLY = 1e-5
 
 
 def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
-    """Where a run ended as soon, or where, it began, look at the curvature, and leave a saddle along it.
+    """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it; leave a saddle along it.
 
     Args:
         prepared: what ran.
@@ -33,25 +49,55 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
     iterations = outcome.stats.get("iterations", -1)
     exact = outcome.stats.get("hessian") == "exact"
     few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
-    before, after = start.trajectory.u, outcome.extremal.trajectory.u
-    stayed = before.size > 0 and bool(np.abs(after - before).max() <= UNMOVED * np.abs(before).max() + UNMOVED)
-    if not outcome.converged or not (few or stayed):
+    suspicious = few or bool(outcome.stats.get("concave")) or _stayed(start.trajectory, outcome.extremal)
+    if not outcome.converged or not suspicious:
         return outcome
     curvature = later("extremal.curvature").smallest_curvature(outcome.extremal)
     if curvature is None or curvature.verdict != "saddle":
         return outcome
     candidates = []
     for sign in ESCAPES:
-        moved = curvature.displaced(outcome.extremal, sign)
+        moved = _displaced(outcome.extremal, curvature, sign)
         displaced = make_guess(outcome.extremal.statement, prepared.mesh, values, moved)
         candidates.append(prepared.solve(values, displaced, reporter))
-    better = [c for c in candidates if c.converged and cost_of(c) < cost_of(outcome)]
+    limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
+    better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
         return outcome
+    best = min(better, key=cost_of)
+    together = counted(outcome, best)
+    if cost_of(outcome) - cost_of(best) <= HARDLY * abs(cost_of(outcome)):
+        return with_stats(best, **together)
     warn_user(
         "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
     )
-    return with_stats(min(better, key=cost_of), left_saddle=True)
+    return with_stats(best, **together, left_saddle=True)
+
+
+def _stayed(before: Trajectory, extremal: Extremal) -> bool:
+    """Whether no control moved by more than a small share of its size or unit."""
+    moved = np.abs(extremal.trajectory.u - before.u).max(axis=0, initial=0.0)
+    sizes = np.abs(before.u).max(axis=0, initial=0.0)
+    if not moved.size:
+        return False
+    if (moved <= UNMOVED * sizes).all():
+        return True
+    units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
+    return bool((moved <= UNMOVED * (sizes + units)).all())
+
+
+def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Trajectory:
+    """The trajectory moved to one side along the direction of the smallest curvature."""
+    t, st = extremal.trajectory, extremal.statement
+    scales = choose_scales(st, extremal.mesh, t, extremal.parameters)
+    units = moving_units(st, extremal.mesh, t, extremal.parameters)
+    controls = np.maximum(np.sqrt(np.mean(t.u**2, axis=0)), DISPLACEMENT * units)
+    shares = [np.abs(curvature.direction) / controls, np.abs(curvature.start) / (DISPLACEMENT * scales.x)]
+    step = sign / max(float(share.max(initial=0.0)) for share in shares)
+    x = t.x.copy()
+    x[0] = np.clip(x[0] + step * curvature.start, *st.state_bounds)
+    u = np.clip(t.u + step * curvature.direction, *st.control_bounds)
+    return Trajectory(x=x, u=u, e=t.e, duration=t.duration)
 
 
 def without_turns(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:

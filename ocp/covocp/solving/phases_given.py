@@ -13,6 +13,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.solution.phases import PhasesSolution
 from covocp.statement.chain import Chain
+from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import name_of, stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import INTERVALS
@@ -68,7 +69,10 @@ def values_of(chain: Chain, parameters: Mapping[str, Any]) -> Arrays:
     if not isinstance(parameters, Mapping):
         stacked_parameters(chain.statements[0], parameters)  # says what it should be
     pairs = zip(chain.statements, given_of_each(chain.statements, parameters), strict=True)
-    return tuple(stacked_parameters(st, given) for st, given in pairs)
+    values = tuple(stacked_parameters(st, given) for st, given in pairs)
+    for st, own in zip(chain.statements, values, strict=True):
+        check_magnitudes(st, own)
+    return values
 
 
 def given_of_each(statements: Sequence[Statement], parameters: Mapping[Any, Any]) -> list[dict[str, Any]]:

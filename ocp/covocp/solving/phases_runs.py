@@ -301,8 +301,10 @@ def nearest_covariances(statement: Statement, halves: Array) -> tuple[Array, boo
     result, sound = halves.copy(), True
     for block in statement.matrices:
         matrix = unpack(halves[block.span], block.size)
-        if not block.covariance or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix).min(initial=0.0) >= 0.0:
+        if not block.covariance or not np.isfinite(matrix).all():
             continue
-        sound = sound and is_semidefinite(matrix[None])
-        result[block.span] = pack(semidefinite_part(matrix))
+        part = semidefinite_part(matrix)
+        if part is not matrix:
+            sound = sound and is_semidefinite(matrix[None])
+            result[block.span] = pack(part)
     return result, sound

@@ -18,7 +18,16 @@ from covocp.extremal.extremal import Guess
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import check_model, control_scale, controls_guess, is_plain, starts
 from covocp.transcription.mesh import Mesh, control_places
-from covocp.transcription.starts import base_run, bend_size, completed, ranked, targets
+from covocp.transcription.starts import (
+    WIDE,
+    base_run,
+    bend_size,
+    completed,
+    ranked,
+    reachable,
+    targets,
+    untold_units,
+)
 from covocp.transcription.steering import Run, steer
 
 RANDOM_AMPLITUDE = 1.0
@@ -146,13 +155,15 @@ def _random_guess(
     start, e0 = statement.started(start, parameters, e0)
     duration = _drawn_duration(statement, float(shares[-1])) if statement.duration.free else statement.duration.guess
     flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
-    wave = _wave(statement, mesh, flat, generator)
+    units = untold_units(statement, mesh, parameters, flat)
+    wave = _wave(statement, mesh, flat, generator) * np.maximum(units, 1.0)
     lower, upper = statement.control_bounds
     size = generator.choice(SIZES)
     if statement.nu and not statement.coupled:
         run = replace(base_run(statement, mesh, parameters, start, flat), duration=duration)
+        wave = wave * reachable(run, flat, np.abs(wave).max(axis=0), WIDE)  # bounds may be far away
         bend = bend_size(run, flat, wave)
-        wave = wave if bend >= 1.0 else np.asarray(size * bend * wave)
+        wave = wave * np.minimum(units, 1.0) if bend >= 1.0 else np.asarray(size * bend * wave)
     for _ in range(HALVINGS):
         u = np.clip(flat + wave, lower, upper)
         try:

@@ -45,6 +45,7 @@ from covocp.solving.refined_meshes import remade
 from covocp.solving.suited_mesh import regraded, suits
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
+from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
 from covocp.transcription.grading import graded
@@ -107,6 +108,7 @@ class Solver:
         self.method = method
         self.nominal = nominal
         self.statement: Statement = problem.statement()
+        check_magnitudes(self.statement, self.statement.values)
         check_between(self.statement, method)
         self._problem = problem
         self._elsewhere = Elsewhere(
@@ -222,6 +224,7 @@ class Solver:
         begin = time.perf_counter()
         check_multistart(guess, starts, seed)
         values = stacked_parameters(self.statement, {} if parameters is None else parameters)
+        check_magnitudes(self.statement, values)
         if self._remade:
             self._keep(*self._first)
         with evaluating(self.statement.name):

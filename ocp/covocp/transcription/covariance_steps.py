@@ -35,9 +35,9 @@ StepKind = Literal["gauss", "strang", "rk4", "rodas"]
 # Rows of a covariance up to which a step of matrices that feed each other is written out in scalars: its exact second
 # derivatives take 5 ms on 40 intervals with two rows, with calls of linear solvers 31; with three rows 22 and 72.
 SCALAR_ROWS = 4
-# The same of matrices that do not: an integrator with one row takes 45 ms on 100 intervals, with calls 66; a lag with
-# two takes 340, with calls 160.
-SCALAR_ROWS_ALONE = 1
+# The same of matrices that do not: a loop with two rows, read at instants, is designed in 1.2 s, with calls of linear
+# solvers in 2.2; with three rows in as long, but with 500 MB more.
+SCALAR_ROWS_ALONE = 2
 
 # Functions of the last statements are kept: transcription, costates and checks all ask for the same ones.
 KEPT = 16

@@ -49,7 +49,7 @@ def is_plain(guess: Given) -> bool:
 
 
 def control_scale(statement: Statement, block: Block, values: Array) -> Array:
-    """Typical magnitudes of a control: given, else half the range of the bounds, else of the guess, else 1."""
+    """How far a control may be varied: its given scale, else half the range of its bounds, else its guess, else 1."""
     given = statement.scales.get(block.name)
     if given is not None:
         return given

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices, unpack
-from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import control_scale, simulate_states
+from covocp.statement.statement import Block, Statement
+from covocp.transcription.first_guess import simulate_states
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
 from covocp.transcription.steering import quadrature_weights
@@ -18,19 +18,38 @@ RESPONSE_STEP = 1e-3
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
 STRETCH = 10.0
+# Least magnitude of a state that starts at (or keeps near) nothing, as a share of the range of its bounds or of 1, the
+# lesser one: at a start, which may not have moved it yet, and at a point that was reached, where less is roundoff.
+AT_START, REACHED = 1e-3, 1e-9
+# Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
+GIVEN_SHARE = 1e-6
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
 SMALL, LARGE = 0.1, 1e3
 
 
 def limit_units(lower: Array, upper: Array) -> Array:
-    """Units of rows between limits: the larger one where it is small or large, else 1."""
+    """Units of rows between limits: the larger one where it is small, the nearer one to zero where it is large, else 1.
+
+    A large limit beside one that is not (-1e9 <= v <= 0.3, 0 <= v <= 1e9) says nothing of what it limits.
+    """
     limits = np.abs(np.stack([lower, upper]))
-    largest = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
-    return np.where((largest > 0) & ((largest < SMALL) | (largest > LARGE)), largest, 1.0)
+    nearest = np.where(np.isfinite(limits), limits, np.inf).min(axis=0)
+    largest = np.where(limits <= LARGE, limits, 0.0).max(axis=0)
+    large = np.isfinite(nearest) & (nearest > LARGE)
+    return np.where((largest > 0) & (largest < SMALL), largest, np.where(large, nearest, 1.0))
 
 
-def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Scales:
-    """Magnitudes from the given scales, bounds, boundary values, standard deviations and the trajectory itself."""
+def magnitudes(statement: Statement, guess: Trajectory, parameters: Array, *, reached: bool = False) -> Scales:
+    """Magnitudes from the given scales, boundary values, standard deviations and the trajectory itself.
+
+    The ranges of the bounds are an upper limit: bounds that are far away say nothing of what moves between them.
+
+    Args:
+        statement: the problem.
+        guess: the trajectory.
+        parameters: of the statement.
+        reached: whether a solver found it: then it tells more than scales that were given.
+    """
     x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     candidates = [np.abs(guess.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
@@ -41,34 +60,67 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array) -> Sc
             deviations = np.zeros(statement.nx)
             deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
             candidates.append(deviations)
-    span = upper - lower
-    x = np.max(candidates, axis=0)
-    bounded = np.isfinite(span) & (span > 0)
-    x = np.where(bounded, np.clip(x, 1e-3 * span, np.where(x > 0, span, np.inf)), x)
+    span = np.where(upper > lower, upper - lower, np.inf)
+    found = np.max(candidates, axis=0)
     limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
-    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)  # a bound far away says nothing of the state
-    x = np.where(x > 0, x, np.where(bounded, span, alone))
-    for block in statement.states:
-        if block.name in statement.scales:
-            x[block.span] = statement.scales[block.name]
+    alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
+    alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
+    least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
+    x = np.where(found > 0, np.clip(found, least, span), alone)
     u = np.ones(statement.nu)
+    for block in statement.states:
+        x[block.span] = _as_given(statement, block, x[block.span], found[block.span] > 0, reached)
     for block in statement.controls:
-        u[block.span] = control_scale(statement, block, guess.u[:, block.span])
+        own = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
+        size = np.minimum(np.where(own > 0, own, 1.0), _half_range(statement, block))
+        u[block.span] = _as_given(statement, block, size, own > 0, reached)
     return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
 
 
-def choose_scales(statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array) -> Scales:
-    """The magnitudes along a guess; controls without bounds on both sides by what they move as well."""
-    scales = magnitudes(statement, guess, parameters)
-    u, response = scales.u.copy(), None
-    for block in statement.controls:
-        bounds = np.concatenate([bound[block.span] for bound in statement.control_bounds])
-        if block.name not in statement.scales and not np.isfinite(bounds).all() and not statement.coupled:
-            if response is None:
-                response = _needed_controls(statement, mesh, guess, scales.x, parameters)
-            magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
-            u[block.span] = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
+def choose_scales(
+    statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array, *, reached: bool = False
+) -> Scales:
+    """The magnitudes along a guess, controls by what they move as well; arguments as of `magnitudes`."""
+    scales = magnitudes(statement, guess, parameters, reached=reached)
+    free = [block for block in statement.controls if reached or block.name not in statement.scales]
+    if statement.coupled or not free:
+        return scales
+    u, response = scales.u.copy(), needed_controls(statement, mesh, guess, scales.x, parameters)
+    for block in free:
+        magnitude = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
+        own = np.maximum(magnitude, np.where(response[block.span] > 0, response[block.span], 1.0))
+        half = _half_range(statement, block)
+        if not reached:  # a bounded component of a vector that does nothing yet has the size of the others
+            least = np.maximum(magnitude.max(initial=0.0), AT_START * np.minimum(half, 1.0))
+            own = np.where(np.isfinite(half), np.maximum(own, least), own)
+        own = np.minimum(own, half)
+        u[block.span] = _as_given(statement, block, own, own > 0, reached)
     return replace(scales, u=u)
+
+
+def with_given(statement: Statement, scales: Scales) -> Scales:
+    """Magnitudes of a point that was reached, in their place the scales that were given."""
+    x, u = scales.x.copy(), scales.u.copy()
+    for values, blocks in ((x, statement.states), (u, statement.controls)):
+        for block in blocks:
+            if block.name in statement.scales:
+                values[block.span] = statement.scales[block.name]
+    return replace(scales, x=x, u=u)
+
+
+def _as_given(statement: Statement, block: Block, found: Array, known: Array, reached: bool) -> Array:
+    """The given scale of a block, or what was found where none is given; both where a solver found it."""
+    given = statement.scales.get(block.name)
+    if given is None:
+        return found
+    size = np.broadcast_to(given, found.shape)
+    return np.where(known, np.clip(found, GIVEN_SHARE * size, size), size) if reached else size
+
+
+def _half_range(statement: Statement, block: Block) -> Array:
+    """Half the range of the bounds of a control; inf where it has not two of them, or both are one."""
+    lower, upper = (bound[block.span] for bound in statement.control_bounds)
+    return np.where(upper > lower, 0.5 * (upper - lower), np.inf)
 
 
 def evened(scales: Scales, mesh: Mesh) -> Scales:
@@ -77,7 +129,7 @@ def evened(scales: Scales, mesh: Mesh) -> Scales:
     return replace(scales, x=STRETCH * scales.x, u=scales.u * np.sqrt(weights.mean() / weights)[:, None])
 
 
-def _needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
+def needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
     """Constant changes of each control that move some state by its scale, to first order; 0 where none does."""
     needed = np.zeros(statement.nu)
     base = simulate_states(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.passage.columns import Owner, in_columns
 
 Whole = NDArray[np.intp]
 
@@ -84,6 +85,7 @@ def slopes(
     second: bool,
     sizes: Sequence[int] | None = None,
     options: Mapping[str, Any] = NONE,
+    owner: Owner | None = None,
 ) -> dict[str, ca.Function]:
     """Slopes of a program, as CasADi's NLP solvers take them.
 
@@ -95,13 +97,14 @@ def slopes(
         second: whether second slopes are wanted.
         sizes: how many parameters each part has; None: there is one part.
         options: of CasADi's functions.
+        owner: what the functions are not used longer than: they may run in compiled code then (`in_columns`).
 
     Returns:
         "grad_f" and "jac_g", and "hess_lag" where it is wanted.
     """
     sizes = [p.shape[0] - 1] if sizes is None else sizes
     parameters = ca.vertsplit(p, np.cumsum([0, *sizes, 1]).tolist())
-    placed = [_Placed(piece, w, parameters) for piece in found]
+    placed = [_Placed(piece, w, parameters, owner) for piece in found]
     made = {"grad_f": _gradient(placed, w, p), "jac_g": _jacobian(placed, w, p, height)}
     if second:
         made["hess_lag"] = _second(placed, w, p, height)
@@ -111,7 +114,8 @@ def slopes(
 class _Placed:
     """A piece, with the variables of a program at its places."""
 
-    def __init__(self, piece: Piece, w: Any, parameters: Sequence[Any]) -> None:
+    def __init__(self, piece: Piece, w: Any, parameters: Sequence[Any], owner: Owner | None) -> None:
+        self._owner = owner
         self._parameters = [ca.repmat(parameters[i], 1, piece.count) for i in piece.parameters]
         own = w[piece.variables.ravel(order="F").tolist()] * ca.DM(piece.units.ravel(order="F"))
         self.piece, self._at = piece, ca.reshape(own, *piece.units.shape)
@@ -122,7 +126,10 @@ class _Placed:
         piece = self.piece
         function = ca.Function("piece", [*piece.symbols, *(symbol for symbol, _ in more)], outputs)
         function = function.expand() if self._scalar else function
-        function = function.map(piece.count) if piece.count > 1 else function
+        if piece.count > 1 and self._owner is not None:
+            function = in_columns(self._owner, function, piece.count)
+        elif piece.count > 1:
+            function = function.map(piece.count)
         columns = [self._at, *piece.constants, *self._parameters, *(columns for _, columns in more)]
         return list(function.call(columns))
 

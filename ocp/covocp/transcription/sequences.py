@@ -11,7 +11,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr, sequence_of
+from covocp.base.linear_solve import LINEAR_SOLVER
 from covocp.base.matrices import half_length
+from covocp.passage.columns import in_columns
 from covocp.passage.sweep import Told
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import fed, gauss_points, moving_step, propagate_step, step_matrix
@@ -74,6 +76,11 @@ def in_sequence(
     return _chosen(every // own, before, passed)
 
 
+def at_columns(statement: Statement, mesh: Mesh, function: ca.Function, count: int) -> ca.Function:
+    """A function mapped over columns, by compiled code but where CasADi writes all out as C."""
+    return in_columns(statement, function, count) if mesh.linear_solver == LINEAR_SOLVER else function.map(count)
+
+
 def _chosen(every: int, before: Any, passed: Any) -> tuple[Any, Any]:
     """Every so many columns, the last of them each time."""
     return (before, passed) if every == 1 else (before[:, every - 1 :: every], passed[:, every - 1 :: every])
@@ -95,7 +102,10 @@ def _steps(
         sizes = [statement.matrices[i].size for i in positions]
         kinds = [gauss_points(statement, i, mesh.step) for i in positions]
         run = partial(_compiled, passage, sizes, kicked, every)
-        return lambda columns, count: ([h for kind in kinds for h in kind.map(count).call(list(columns))], run)
+        return lambda columns, count: (
+            [h for kind in kinds for h in at_columns(statement, mesh, kind, count).call(list(columns))],
+            run,
+        )
     if mesh.step == "rk4":
         step = runge_kutta_step(statement, positions)
         step = _kicked(step) if kicked else step
@@ -150,7 +160,8 @@ def _reading_passage(
     chosen = [column[:, reads] for column in (columns[0], *columns[2:])]
     height = max(len(group) for group in statement.samples.groups)
     told = Told(steps=steps, rows=height, columns=told_at(statement).map(len(reads))(*chosen))
-    points = gauss_points(statement, position, mesh.step).map(len(moving)).call([c[:, moving] for c in columns])
+    function = at_columns(statement, mesh, gauss_points(statement, position, mesh.step), len(moving))
+    points = function.call([c[:, moving] for c in columns])
     size = statement.matrices[position].size
     if kicks is None:
         values = passage(first, points, size, None, told)[:, last.tolist()]

@@ -18,6 +18,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
+from covocp.passage.columns import in_columns
 from covocp.passage.transitions import Steps, passed_back, transitions
 from covocp.statement.interval import Interval
 from covocp.statement.statement import Statement
@@ -114,7 +115,7 @@ def staged(
     )
     return Staged(
         steps=steps,
-        slopes=function.map(mesh.intervals)(x[:, : mesh.intervals], fine, *intervals),
+        slopes=in_columns(statement, function, mesh.intervals)(x[:, : mesh.intervals], fine, *intervals),
         count=len(mesh.segments),
         spans=tuple(spans),
         linear=constant,

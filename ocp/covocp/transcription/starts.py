@@ -36,6 +36,7 @@ from covocp.transcription.first_guess import (
     starts,
 )
 from covocp.transcription.mesh import Mesh, Options, control_places, explicit_substeps
+from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory, at_nodes
@@ -47,8 +48,18 @@ FAINT = 0.05
 HALVINGS = 30
 # Share of the miss that the first step of steering may leave where a problem is plain.
 PLAIN_MISS = 0.3
+# The range of the bounds of a state counts up to so many times its magnitude (1 where it has none).
+WIDE = 1e3
+# A bend is at most so many times the change of a control that moves some state by its magnitude.
+REACH = 4.0
 # A control that steering moved by more than so many bends is not bent.
 FAR = 5.0
+# Where nothing tells the unit of a control, one unit is bent, unless what moves a state by its scale is so many times
+# more or less: then that is. A bend of one would be none where a control is counted in grains, and far away in tons.
+FAR_UNIT = 100.0
+# States that answer to a control so many times more by the end than by half the time are unstable: six integrators in
+# a row give 2^6.
+GROWTH = 64.0
 # Bend that a start of the ranking keeps, in units of the bend, so that none is a symmetric point.
 REMAINDER = 0.1
 # Intervals of the mesh on which starts are compared.
@@ -116,7 +127,10 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
             u = _tracked(statement, mesh, parameters, followed)
         else:
             flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
-            u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat)
+            units = untold_units(statement, mesh, parameters, flat)
+            u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
+    elif statement.nu and statement.coupled:
+        u = _within_reach(statement, mesh, parameters, u)
     return First(trajectory=completed(statement, mesh, parameters, u), plain=plain)
 
 
@@ -148,11 +162,15 @@ def completed(
 
 
 def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
-    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give."""
+    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give.
+
+    Bounds that are far away say little: they count up to so many times what something else tells.
+    """
     final = statement.boundary_values(parameters)[1]
     lower, upper = statement.state_bounds
     span = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), 0.0)
-    scale = np.maximum.reduce([np.abs(start), np.abs(np.nan_to_num(final)), span])
+    known = np.maximum(np.abs(start), np.abs(np.nan_to_num(final)))
+    scale = np.maximum(known, np.minimum(span, WIDE * np.where(known > 0, known, 1.0)))
     for block in statement.states:
         given = statement.scales.get(block.name)
         if given is not None:
@@ -190,25 +208,97 @@ def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[in
     start = starts(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
-    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat))
+    run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat, path))
     return run.clip(resampled(track(run, rows, path[:, list(rows)], flat), coarse, mesh))
 
 
-def _bent(run: Run, bent: Array, flat: Array) -> tuple[Array, bool]:
-    """Controls steered to the final values and bent, and whether the problem is plain.
+def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, bool]:
+    """Controls steered to the final values and bent, in units that nothing else tells; whether the problem is plain.
 
     The bend 1 - s breaks symmetries; where the terminal conditions prefer a direction, it must not oppose them, and a
     control that they move far has no symmetry left to break.
     """
     if not np.isfinite(run.start).all():
         return bent, True
-    bend = bent - flat
+    sizes = np.abs(bent - flat).max(axis=0)
+    bend = (bent - flat) * np.maximum(units, 1.0) * reachable(run, flat, sizes)
     size = bend_size(run, flat, bend)
+    bend *= np.minimum(units, 1.0) if size >= 1.0 else 1.0  # else the states have said how much is too much
     fixed, target = targets(run)
     steered, left = steer(run, fixed, target, flat) if fixed else (flat, 0.0)
     sign = np.where(np.sum((steered - flat) * bend, axis=0) < 0, -1.0, 1.0)
     far = np.linalg.norm(steered - flat, axis=0) > FAR * size * np.linalg.norm(bend, axis=0)
     return run.clip(steered + np.where(far, 0.0, sign) * size * bend), size >= 1.0 and left <= PLAIN_MISS
+
+
+def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Array) -> Array:
+    """Units of the controls (nu,) of which neither scale, bounds nor guess say any, by what they move; 1 of others."""
+    untold = np.zeros(statement.nu, dtype=bool)
+    for block in statement.controls:
+        lower, upper = (bound[block.span] for bound in statement.control_bounds)
+        silent = ~np.isfinite(upper - lower) & ~flat[:, block.span].any(axis=0)
+        untold[block.span] = silent if block.name not in statement.scales else False
+    start, e0 = starts(statement, mesh, parameters)
+    if not untold.any() or statement.coupled or not np.isfinite(start).all():
+        return np.ones(statement.nu)
+    still = Trajectory(
+        x=simulate_states(statement, mesh, start, e0, flat, statement.duration.guess, parameters),
+        u=flat,
+        e=np.tile(e0, (mesh.intervals + 1, 1)),
+        duration=statement.duration.guess,
+    )
+    units = moving_units(statement, mesh, still, parameters)
+    far = (units > FAR_UNIT) | (units < 1.0 / FAR_UNIT)
+    return np.where(untold & far, units, 1.0)
+
+
+def moving_units(statement: Statement, mesh: Mesh, along: Trajectory, parameters: Array) -> Array:
+    """Units of the controls (nu,) by what they move; 1 where it is little only because the plant amplifies it."""
+    units = choose_scales(statement, mesh, along, parameters).u.copy()
+    start, e0, duration = along.x[0], along.e[0], along.duration
+    small = [] if statement.coupled else np.flatnonzero(units < 1.0 / FAR_UNIT).tolist()
+    for i in small:
+        runs = [along.u, along.u + units[i] * np.eye(statement.nu)[i]]
+        base, moved = (simulate_states(statement, mesh, start, e0, u, duration, parameters) for u in runs)
+        change = np.abs(moved - base)
+        if (change.max(axis=0) > GROWTH * change[mesh.nodes <= 0.5].max(axis=0)).any():
+            units[i] = 1.0
+    return units
+
+
+def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH, path: Array | None = None) -> Array:
+    """Shares of the bends of the controls, of these sizes, that do not move the states far beyond their magnitudes.
+
+    Far is so many times, `reach`; magnitudes are those of the unbent run, and of a path that is given.
+
+    A bend of half the range between bounds that are far away would start, and measure all that follows, far from
+    anything that the problem is about.
+    """
+    x = run.states(flat)
+    x = x if np.isfinite(x).all() else run.start[None, :]
+    x = x if path is None else np.vstack([x, path])
+    t = Trajectory(x=x, u=flat, e=np.zeros((1, run.statement.ne)), duration=run.duration)
+    scale = magnitudes(run.statement, t, run.parameters).x  # that of the run counts wide bounds as well
+    return _shares(run.statement, sizes, needed_controls(run.statement, run.mesh, t, scale, run.parameters), reach)
+
+
+def _shares(statement: Statement, sizes: Array, needed: Array, reach: float = REACH) -> Array:
+    """So many times what is needed over these sizes, at most 1; 1 without two bounds, with a scale, without effect."""
+    bounded = np.isfinite(statement.control_bounds).all(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(bounded & (needed > 0) & (sizes > 0), np.minimum(1.0, reach * needed / sizes), 1.0)
+    for block in statement.controls:
+        if block.name in statement.scales:
+            shares[block.span] = 1.0
+    return shares
+
+
+def _within_reach(statement: Statement, mesh: Mesh, parameters: Array, u: Array) -> Array:
+    """Bent controls whose bends do not move states far beyond their magnitudes, where covariances drive the states."""
+    flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+    t = completed(statement, mesh, parameters, flat)
+    needed = needed_controls(statement, mesh, t, magnitudes(statement, t, parameters).x, parameters)
+    return np.asarray(flat + _shares(statement, np.abs(u - flat).max(axis=0), needed) * (u - flat))
 
 
 def targets(run: Run) -> tuple[tuple[int, ...], Array]:
@@ -264,11 +354,13 @@ def _of_vectors(statement: Statement, rows: list[int], sizes: Array) -> Array:
     return np.where(result > 0, result, 1.0)[rows]
 
 
-def _units(run: Run, flat: Array) -> Array:
-    """Sizes of the bends of each control, from their effect on the states: constant changes."""
+def _units(run: Run, flat: Array, path: Array | None = None) -> Array:
+    """Sizes of the bends of each control, from their effect on the states, which may have a path: constant changes."""
     statement, units = run.statement, np.ones(run.statement.nu)
     for block in statement.controls:
         units[block.span] = control_scale(statement, block, flat[:, block.span])
+    units *= np.maximum(untold_units(statement, run.mesh, run.parameters, flat), 1.0)
+    units *= reachable(run, flat, units, path=path)
     for i in range(statement.nu):
         bend = np.zeros_like(flat)
         bend[:, i] = units[i]

@@ -1,0 +1,207 @@
+"""Functions of scalars on many columns in compiled code: the same numbers and derivatives as CasADi's map."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import covocp as co
+from covocp.base.buffered import Buffered
+from covocp.models import mass_chain
+from covocp.passage import columns, library, operations
+from covocp.passage.columns import FEWEST, in_columns
+from covocp.transcription.covariance_steps import KEPT, gauss_points
+
+pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
+
+UNARY = (
+    ca.exp, ca.log, ca.sqrt, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan, ca.floor, ca.ceil, ca.fabs, ca.sign,
+    ca.erf, ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.acosh, ca.atanh, ca.log1p, ca.expm1, ca.logic_not,
+    lambda a: a * a, lambda a: 2 * a, lambda a: -a, lambda a: 1 / a, lambda a: a**3, lambda a: a**2.5,
+)  # fmt: skip
+BINARY = (
+    ca.plus, ca.minus, ca.times, ca.rdivide, ca.power, ca.lt, ca.le, ca.eq, ca.ne, ca.logic_and, ca.logic_or, ca.fmod,
+    ca.copysign, ca.fmin, ca.fmax, ca.atan2, ca.hypot, lambda a, b: ca.if_else(a > 0, b, 3.0),
+)  # fmt: skip
+# As many columns as are worked on together, one more or less, and none of it.
+COUNTS = (FEWEST, 63, 64, 65, 100)
+
+
+class Owner:
+    """What nodes live as long as."""
+
+
+def everything() -> ca.Function:
+    """Every operation of CasADi's scalars, with an output that is sparse and an argument of which little is used."""
+    a, b, c = ca.SX.sym("a", 2), ca.SX.sym("b"), ca.SX.sym("c", 2, 2)
+    values = ca.vertcat(*(f(a[0]) for f in UNARY), *(f(a[1], b) for f in BINARY), c[1, 0], 0.1)
+    sparse = ca.SX(3, 2)
+    sparse[2, 1], sparse[0, 0] = a[0] * b, ca.sin(b)
+    return ca.Function("everything", [a, b, c], [values, sparse])
+
+
+def smooth() -> ca.Function:
+    """A function with slopes of second order."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+    return ca.Function("smooth", [x, p], [ca.vertcat(ca.sin(x[0]) * p[0], ca.exp(x[1] * x[2])), x[2] ** 3 * p[1]])
+
+
+def numbers(function: ca.Function, seed: int) -> list[np.ndarray]:
+    """Arguments among them that are zero, negative, infinite and undefined."""
+    rng = np.random.default_rng(seed)
+    given = [rng.normal(size=function.nnz_in(i)) * 3 for i in range(function.n_in())]
+    for values in given:
+        values[:: max(len(values) // 7, 1)] = rng.choice([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0], 1)[0]
+    return given
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("function", [everything(), smooth()], ids=lambda f: f.name())
+def test_numbers_are_those_of_the_map(function: ca.Function, count: int):
+    """Bit by bit, undefined ones too."""
+    owner, plain = Owner(), function.map(count)
+    node = in_columns(owner, function, count)
+    assert node.class_name() == "CallbackInternal"
+    assert [node.sparsity_in(i) for i in range(node.n_in())] == [plain.sparsity_in(i) for i in range(plain.n_in())]
+    assert [node.sparsity_out(i) for i in range(node.n_out())] == [plain.sparsity_out(i) for i in range(plain.n_out())]
+    for seed in range(4):
+        given = numbers(plain, seed)
+        with np.errstate(all="ignore"):
+            own, expected = Buffered(node)(*given), Buffered(plain)(*given)
+        assert own is not None
+        assert expected is not None
+        for one, other in zip(own, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_every_kind_of_operation_is_met():
+    """The function of all operations has each that the library knows, but those CasADi never lists for it."""
+    function = everything()
+    met = {function.instruction_id(k) for k in range(function.n_instructions())}
+    known = set(operations.NUMBERS)
+    assert known - met <= {ca.OP_ASSIGN, ca.OP_CONSTPOW, ca.OP_POW, ca.OP_LE, ca.OP_NE, ca.OP_LT, ca.OP_TWICE}
+    assert met <= known
+
+
+@pytest.mark.parametrize("masses", [1, 5])
+def test_what_is_read_at_once_is_what_casadi_tells_one_by_one(masses: int):
+    """All operations and constants; no text of another kind is read as such."""
+    own = gauss_points(mass_chain.problem(masses).statement(), 0, "gauss")
+    for function in (everything(), smooth(), own, own.reverse(1), own.forward(1)):
+        rows, constants = operations.asked_one_by_one(function)
+        read = operations.read_at_once(function)
+        assert read is not None
+        np.testing.assert_array_equal(read[0], rows)
+        np.testing.assert_array_equal(read[1], constants)
+
+
+def test_a_text_that_is_not_understood_is_not_believed(monkeypatch: pytest.MonkeyPatch):
+    """Where CasADi kept functions otherwise, or a number is off, operations are asked for one by one."""
+    function = gauss_points(mass_chain.problem(5).statement(), 0, "gauss")
+    expected = operations.asked_one_by_one(function)
+    whole = operations._listed
+
+    def shifted(records: np.ndarray):
+        return whole(records[:, [0, 1, 3, 2]])
+
+    for wrong in (shifted, lambda records: None):
+        monkeypatch.setattr(operations, "_listed", wrong)
+        assert operations.read_at_once(function) is None
+        for one, other in zip(operations.program(function), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("which", ["gradient", "tangent", "product", "jacobian"])
+def test_derivatives_are_those_of_the_map(which: str):
+    """Of first and second order, along one direction and along several."""
+    owner, function, count = Owner(), smooth(), 64
+    made = []
+    for mapped in (in_columns(owner, function, count), function.map(count)):
+        x, p = ca.MX.sym("x", 3, count), ca.MX.sym("p", 2, count)
+        v = ca.MX.sym("v", 3, count)
+        first, second = mapped(x, p)
+        number = ca.sumsqr(first) + ca.dot(second, ca.cos(second))
+        if which == "gradient":
+            result = ca.gradient(number, x)
+        elif which == "tangent":
+            result = ca.jtimes(ca.vec(first), x, v)
+        elif which == "product":
+            result = ca.jtimes(ca.gradient(number, p), x, v)
+        if which == "jacobian":
+            y = ca.MX.sym("y", 3 * count)
+            first, second = mapped(ca.reshape(y, 3, count), p)
+            result = ca.jacobian(ca.vertcat(ca.vec(first), ca.vec(second)), y)
+            made.append(ca.Function("f", [y, p], [result]))
+        else:
+            made.append(ca.Function("f", [x, p, v], [result]))
+    rng = np.random.default_rng(5)
+    given = [rng.normal(size=made[0].size_in(i)) for i in range(made[0].n_in())]
+    own, expected = (np.asarray(f(*given)) for f in made)
+    np.testing.assert_allclose(own, expected, rtol=1e-14, atol=1e-14)
+    if which == "jacobian":
+        assert made[0].sparsity_out(0) == made[1].sparsity_out(0)
+
+
+def test_few_columns_and_other_functions_stay_maps():
+    """Where it does not pay, and where CasADi calls something that is no operation of scalars."""
+    owner, x = Owner(), ca.MX.sym("x", 2)
+    other = ca.Function("other", [x], [ca.norm_fro(x) * x])
+    assert in_columns(owner, smooth(), FEWEST - 1).class_name() == "Map"
+    assert in_columns(owner, other, 100).class_name() == "Map"
+
+
+def test_nodes_end_with_their_owner():
+    """Nothing stays of problems that are gone; the same is given again as long as they are there."""
+    owner, function = Owner(), smooth()
+    node = in_columns(owner, function, 64)
+    assert in_columns(owner, function, 64) is node
+    gone = weakref.ref(node)
+    del node, owner
+    gc.collect()
+    assert gone() is None
+
+
+def test_threads_do_not_meet():
+    """Four threads on the same node, each with its own numbers."""
+    owner, function = Owner(), smooth()
+    node, plain = in_columns(owner, function, 100), function.map(100)
+    wrong: list[int] = []
+
+    def run(k: int) -> None:
+        own, other = Buffered(node), Buffered(plain)
+        for seed in range(20):
+            given = numbers(plain, 100 * k + seed)
+            for one, expected in zip(own(*given) or (), other(*given) or (), strict=True):
+                if not np.array_equal(one, expected, equal_nan=True):
+                    wrong.append(k)
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_many_problems_leave_nothing_behind():
+    """Problems that were solved and are gone keep no nodes, but the last ones, of which functions are kept."""
+
+    def solved(noise: float) -> None:
+        ocp = co.Problem(duration=1.0)
+        x = ocp.state("x", initial=0.0, variance=1.0)
+        u = ocp.control("u", guess=0.1)
+        ocp.dynamics(x, -x + u, noise=0.1)
+        ocp.measurement("y", x, noise=noise + x**2)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=u**2, terminal=E[x, x])
+        co.Solver(ocp, intervals=60, max_iterations=2).solve(progress=False, allow_failure=True, assess=False)
+
+    for k in range(3 * KEPT):
+        solved(0.1 + 0.01 * k)
+    gc.collect()
+    assert len(columns._KEPT) < 2 * KEPT

@@ -1,0 +1,94 @@
+"""The units that a problem is stated in change nothing: where it starts, how a saddle is left, what it costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problems import solve
+
+import covocp as co
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Guess
+from covocp.models import unknown_lag
+from covocp.solving.other_minima import away_from_saddle
+
+# One unit of state, control and time of the lag, in those of the problem.
+UNITS = [
+    (1e7, 1e7, 1.0),
+    (1e-7, 1e-7, 1.0),
+    (1e-7, 1.0, 1.0),
+    (1.0, 1e7, 1e-7),
+    (1e4, 1e-4, 1e4),
+    (1e-4, 1e4, 1e7),
+    (1e7, 1e-7, 1e-4),
+]
+# The minimum for x(T) = 1, of two; that for x(T) = 0 has a closed form.
+TRANSIENT = 7.08523968
+
+
+def rescaled_lag(state: float, control: float, time: float, final: float = 0.0) -> co.Problem:
+    """The lag of `unknown_lag` with the weight 10 in other units; its cost keeps its own."""
+    ocp = co.Problem(10.0 * time)
+    x = ocp.state("x", initial=0.0, final=final * state, variance=state**2)
+    b = ocp.unknown("b", mean=1.0 / time, variance=5.0 / time**2)
+    u = ocp.control("u")
+    ocp.dynamics(x, -b * x + u * (state / control / time), noise=state**2 / time)
+    ocp.measurement("position", x, noise=state**2 * time)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * (u / control) ** 2 / time, terminal=10.0 * E[b, b] * time**2)
+    return ocp
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+@pytest.mark.parametrize("units", UNITS)
+def test_default_start_is_in_the_units_of_the_problem(units, method):
+    """One unit of the control would be no bend where it moves nothing, and elsewhere one that leads far away."""
+    assert solve(rescaled_lag(*units), method=method).cost == pytest.approx(unknown_lag.exact().cost, rel=1e-6)
+    assert solve(rescaled_lag(*units, final=1.0), method=method).cost == pytest.approx(TRANSIENT, rel=1e-6)
+
+
+@pytest.mark.parametrize("units", UNITS)
+@pytest.mark.filterwarnings("ignore:The run ended at a saddle")
+def test_saddle_is_left_in_the_units_of_the_problem(units):
+    solution = solve(rescaled_lag(*units), guess={"u": np.zeros(101)})
+    assert solution.stats["left_saddle"]
+    assert solution.cost == pytest.approx(unknown_lag.exact().cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e7, 1.0), (1.0, 1e7), (1e-7, 1e7)])
+@pytest.mark.filterwarnings("ignore:The run ended at a saddle")
+def test_saddle_in_one_of_two_controls_is_left(units):
+    """The other one is 0.1, as it should be; where it is the smaller number the curvature had been rounding."""
+    one, two = units
+    ocp = co.Problem(10.0)
+    x, z = ocp.state("x", initial=0.0, final=0.0, variance=1.0), ocp.state("z", initial=0.0, final=1.0)
+    b, u, w = ocp.unknown("b", mean=1.0, variance=5.0), ocp.control("u"), ocp.control("w")
+    ocp.dynamics(x, -b * x + u / one, noise=1.0)
+    ocp.dynamics(z, w / two)
+    ocp.measurement("position", x, noise=1.0)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * (u / one) ** 2 + 0.5 * (w / two) ** 2, terminal=10.0 * E[b, b])
+    solution = solve(ocp, guess={"u": np.zeros(101), "w": np.full(101, 0.1 * two)})
+    assert solution.stats["left_saddle"]
+    assert solution.optimality.curvature > 1e-3
+    assert solution.cost == pytest.approx(unknown_lag.exact().cost + 0.05, rel=1e-6)  # of w = 0.1 for 10 s
+
+
+def test_saddle_that_is_cheaper_by_roundoff_has_not_been_left():
+    """Runs from both sides that come back to the saddle differ from it by the last digits of the cost."""
+    solver = co.Solver(rescaled_lag(1.0, 1.0, 1.0), intervals=20)
+    still = solver.solve(guess={"u": np.zeros(21)}, progress=False, assess=False).extremal
+    start = Guess(trajectory=still.trajectory)
+    outcome = solver._prepared.solve(still.parameters, start, Progress("", False))
+    assert outcome.converged
+    terms = {name: value * (1.0 - 1e-13) for name, value in outcome.cost_terms.items()}
+
+    class ComesBack:
+        mesh = solver._prepared.mesh
+
+        def solve(self, *_):
+            return replace(outcome, cost_terms=terms)
+
+    assert away_from_saddle(ComesBack(), outcome, still.parameters, Progress("", False), start) is outcome
