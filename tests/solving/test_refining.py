@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -10,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 
 import covocp as co
-from covocp.solving import refining
+from covocp.solving import refined_meshes, refining
 from covocp.transcription import domain
 
 
@@ -234,3 +235,48 @@ def test_all_meshes_have_the_units_of_the_first_solution(monkeypatch):
     assert len(solution.stats["mesh_intervals"]) > 2
     assert solution.cost == pytest.approx(2.0, rel=1e-6)
     assert asked == {"units": 1, "bounds": 2}  # beyond both bounds of the control
+
+
+@pytest.mark.parametrize(("off", "ramp"), [(3e-4, 1e-4), (1e-3, 1e-4), (1e-3, 1e-5), (1e-4, 1e-5)])
+def test_jumps_that_are_not_where_they_should_be_are_seen(off, ramp):
+    """Half of the error was seen: meshes that only divide intervals do not move a jump that has nodes beside it."""
+    ocp = co.Problem(3.0)
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    a, b = ocp.control("a", lower=0.0, upper=1.0), ocp.control("b", lower=0.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, a - b)
+    ocp.minimize(running=a + b)
+    optimum = 3.0 - np.sqrt(5.0)  # thrust over half of it, coast, brake
+    begin, end = optimum / 6.0 + off, optimum / 6.0 + off + ramp
+    grid = np.array([0.0, begin, end, 0.35, 0.5, 0.65, 1.0 - end, 1.0 - begin, 1.0])
+    truth = co.solve(ocp, grid=grid, progress=False).cost / optimum - 1.0
+    errors = co.solve(ocp, grid=grid, refine=1e-6, progress=False).stats["mesh_errors"]
+    assert truth > 0.8 * off
+    assert errors[0] / refined_meshes.LEFT > 0.9 * truth
+    assert max(errors[1:]) < 0.1 * errors[0]
+
+
+def measured(cost: float, error: float, intervals: int) -> Any:
+    """A mesh that was measured, as far as the choice of the next one looks at it."""
+    return SimpleNamespace(cost=cost, error=error, least=1e-9, intervals=(intervals,))
+
+
+def test_a_mesh_is_not_made_coarser_while_that_is_not_much_better():
+    begun = [measured(1.1, 0.1, 16)]
+    assert refined_meshes._fewest(begun) == 0
+    assert refined_meshes._fewest([*begun, measured(1.0, 1e-4, 21)]) == 0
+    assert refined_meshes._fewest([*begun, measured(1.03, 0.03, 45)]) == 45
+    assert refined_meshes._fewest([*begun, measured(1.03, 0.03, 45), measured(1.03, 0.025, 48)]) == 60
+
+
+def test_the_cost_of_another_mesh_counts_against_an_estimate():
+    """What another mesh finds for less, by more than its own error, is missed."""
+    known = [(1.0, 1e-4), (1.02, 1e-5), (0.995, 1e-3)]
+    assert refined_meshes._seen(measured(1.01, 1e-5, 20), known) == pytest.approx(0.015 / 0.995 - 1e-3)
+    assert refined_meshes._seen(measured(0.995, 1e-5, 20), known) == 1e-5
+
+
+@pytest.mark.parametrize(("error", "reason"), [(5e-9, "tolerance of the method"), (1e-4, "not where it is looked for")])
+def test_why_no_further_mesh_is_tried(error, reason):
+    """Errors far above what the tolerance leaves were called that all the same."""
+    assert reason in refined_meshes._given_up([measured(1.0, error, 20)] * 5)

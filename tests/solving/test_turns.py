@@ -97,3 +97,50 @@ def test_turns_are_taken_out(values, expected):
 @pytest.mark.parametrize("values", [[0.0, 1.0, 2.0], [0.0, 3.0, 0.0], [1.0, -1.0, 1.0, -1.0]])
 def test_where_there_is_none_nothing_is_taken_out(values):
     assert _without_turns(np.array(values), 2 * np.pi) is None
+
+
+def raised(unit=1.0, **bounds):
+    """As far out from a circular orbit as low thrust reaches in 3.32 (Moyer and Pinkham 1964); it turns through pi."""
+    ocp = co.Problem(3.32)
+    r = ocp.state("r", initial=1.0)
+    out, along = ocp.state("u", initial=0.0, final=0.0), ocp.state("v", initial=1.0)
+    phi = ocp.control("phi", **{name: value / unit for name, value in bounds.items()})
+    thrust = 0.1405 / (1.0 - 0.07489 * ocp.time)
+    ocp.dynamics(r, out)
+    ocp.dynamics(out, along**2 / r - 1.0 / r**2 + thrust * ca.sin(unit * phi))
+    ocp.dynamics(along, -out * along / r + thrust * ca.cos(unit * phi))
+    ocp.subject_to(along - 1.0 / ca.sqrt(r), equals=0.0, at="final")
+    ocp.minimize(terminal=-r)
+    return ocp
+
+
+def test_bounds_that_are_a_turn_apart_are_told_where_they_hold_an_angle():
+    """A part in two thousand is lost to a turn between two nodes; without the bounds it is not."""
+    with pytest.warns(co.CovocpWarning, match="Bounds of 'phi' are one turn apart: leave them out"):
+        held = co.solve(raised(lower=-np.pi, upper=np.pi), intervals=50, progress=False)
+    free = co.solve(raised(), intervals=50, progress=False)
+    assert -free.cost == pytest.approx(1.5253, abs=1e-4)
+    assert held.cost > free.cost * (1.0 - 5e-4)
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse:covocp.CovocpWarning")  # for a turn between two nodes
+def test_they_are_told_of_degrees():
+    with pytest.warns(co.CovocpWarning, match="Bounds of 'phi' are one turn apart"):
+        co.solve(raised(np.pi / 180.0, lower=-np.pi, upper=np.pi), intervals=50, progress=False)
+
+
+@pytest.mark.parametrize("bounds", [{"lower": -10.0, "upper": 10.0}, {"lower": 0.0, "upper": 6.0}])
+def test_bounds_that_hold_nothing_or_exclude_directions_are_not_told(bounds, recwarn):
+    co.solve(raised(**bounds), intervals=50, progress=False)
+    assert not [warning for warning in recwarn if "turn apart" in str(warning.message)]
+
+
+def test_bounds_of_what_is_no_angle_are_not_told(recwarn):
+    """The force of the fastest motion is at both of its bounds, which happen to be a turn apart."""
+    ocp = co.Problem(co.Free(1.0))
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, ocp.control("u", lower=-np.pi, upper=np.pi))
+    ocp.minimize(terminal=ocp.duration)
+    co.solve(ocp, intervals=20, progress=False)
+    assert not [warning for warning in recwarn if "turn apart" in str(warning.message)]

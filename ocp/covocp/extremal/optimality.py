@@ -20,10 +20,12 @@ from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import prolongation, refined
+from covocp.extremal.finer_cost import change_on_finer_mesh
 from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
 from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
+from covocp.extremal.path_limits import acting
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.statement.interval import model_symbols
@@ -32,8 +34,6 @@ from covocp.transcription.steering import quadrature_weights
 
 # A multiplier of a control bound above this share of the largest slope counts the bound as active.
 ACTIVE = 1e-5
-# A condition along the path is at its limit where it is closer than this, in its range or the limit itself.
-TOUCHED = 1e-4
 # A stationarity above which it is asked what it does to the cost.
 LARGE_SLOPE = 1e-5
 # Costs below this count as zero.
@@ -51,8 +51,8 @@ class Optimality:
             all controls change by their magnitudes, relative to a tenth of it: what is zero has no terms.
         complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
             cost: a multiplier of a bound that is not active makes a slope look like none.
-        control_slope: root mean square of H_u at the nodes with free controls, None where a condition along the path
-            reaches its limit; of the order of the square of the
+        control_slope: root mean square of H_u at the nodes with free controls, None where a condition along the path or
+            the bound of a state acts; of the order of the square of the
             interval for piecewise-linear controls; same normalisation.
         costate_difference: largest difference between the costates of the multipliers and those integrated backward,
             relative to the largest costate of each kind: back to the last interval that would take too many explicit
@@ -63,8 +63,10 @@ class Optimality:
         mesh_error: relative change of the cost by halving the integration steps.
         node_error: largest change of a state or of an entry of a matrix at a node by halving the integration steps,
             relative to its range.
-        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; None
-            also where implicit steps pass a nominal so stiff that H is not known pointwise, and H_uu is not positive.
+        control_error: estimated relative cost of the piecewise form of the control, 1/2 int H_u H_uu^-1 H_u dt; where a
+            condition along the path or the bound of a state acts, the change by a finer mesh, with what limits that are
+            missed between the nodes are worth; nan where that was not to be had. None where implicit steps pass a
+            nominal so stiff that H is not known pointwise, and H_uu is not positive.
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
@@ -136,18 +138,22 @@ def assess(
     scale = max(float(size.max(initial=0.0)), np.finfo(float).tiny)
     left = slopes + _limit_slopes(extremal) + extremal.multipliers.controls
     free = np.abs(extremal.multipliers.controls) <= ACTIVE * np.abs(slopes).max(initial=0.0) if st.nu else None
-    control_slope, control_error = (None, None) if _path_acts(extremal) else (0.0, 0.0)
-    if st.nu and free is not None and control_slope is not None:
+    others = 0.0 if within is None else within.size
+    control_slope: float | None = 0.0
+    control_error: float | None = 0.0
+    if st.nu and acting(extremal):
+        known = change_on_finer_mesh(extremal, absolute_cost(extremal) + others, within)
+        control_slope, control_error = None, np.nan if known is None else known
+    elif st.nu and free is not None:
         free = free if free.shape[0] == slope.shape[0] else np.vstack([free, free[-1:]])
         beside = _beside(extremal)[:, None]
         free = free & ~beside
         control_slope = float(np.sqrt(np.mean(np.where(free, slope, 0.0) ** 2))) / scale
-        others = 0.0 if within is None else within.size
         whole = free[:-1] & free[1:]
         bounded = ~whole & ~(beside[:-1] | beside[1:])
         control_error = estimate_control_error(extremal, (whole, bounded), others)
     return Optimality(
-        stationarity=_stationarity(extremal, left, scale, 0.0 if within is None else within.size) if st.nu else 0.0,
+        stationarity=_stationarity(extremal, left, scale, others) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
@@ -157,7 +163,7 @@ def assess(
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
         curvature=_curvature(extremal) if within is None else None,
-        complementarity=complementarity(extremal, 0.0 if within is None else within.size),
+        complementarity=complementarity(extremal, others),
         decisions=_decisions(extremal, costates, within),
         cost_identity=cost_identity,
         **_loop_identities(loop),
@@ -174,18 +180,6 @@ def _stationarity(extremal: Extremal, slopes: Array, scale: float, others: float
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
     changed = float((np.abs(slopes) * units).sum())
     return min(value, changed / max(VANISHING * (absolute_cost(extremal) + others), np.finfo(float).tiny))
-
-
-def _path_acts(extremal: Extremal) -> bool:
-    """Whether a condition along the path reaches a limit: H_u is then no measure of the form of the controls."""
-    for conditions, place, values in extremal.inequalities():
-        for limits in (conditions.lower, conditions.upper) if place == "path" else ():
-            known = np.isfinite(limits)
-            limits = np.where(known, limits, 0.0)
-            near = np.abs(values - limits) <= TOUCHED * (np.ptp(values, axis=0) + np.abs(limits))
-            if (near & known).any():
-                return True
-    return False
 
 
 def complementarity(extremal: Extremal, others: float = 0.0) -> float:

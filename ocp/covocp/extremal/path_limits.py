@@ -14,6 +14,7 @@ from covocp.base.expressions import Expr
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import OF_RANGE, mapped
 from covocp.extremal.extremal import Extremal
+from covocp.extremal.fine_mesh import refined
 from covocp.extremal.polynomials import Dense
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
@@ -24,6 +25,8 @@ from covocp.transcription.mesh import Mesh
 TOGETHER = 1 << 15
 # Share of a limit by which it may be passed between the points where it is imposed without a word.
 NOTED = 1e-4
+# A limit acts where a value is closer to it than this, in its range or the limit itself.
+TOUCHED = 1e-4
 # Share of what a limit is passed by that is much of it, and parts of an interval within which a point is one.
 MUCH, SAME_PLACE = 0.5, 1e-9
 
@@ -73,6 +76,44 @@ def limited(extremal: Extremal) -> bool:
 def limited_along(statement: Statement) -> bool:
     """The same of a problem."""
     return bool(statement.path.size) or bool(np.isfinite(statement.state_bounds).any())
+
+
+def acting(extremal: Extremal) -> dict[str, float]:
+    """Conditions along the path, and states, that are at a limit, by the share of the time in which they are.
+
+    States at bounds where they are given, at the ends, are not held by them.
+
+    Args:
+        extremal: the solution.
+    """
+    if not limited(extremal):
+        return {}
+    extremal = refined(extremal)  # limits act at all its nodes
+    st, steps = extremal.statement, np.diff(extremal.mesh.nodes)
+    shares = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    bounded = st.bounded_states
+    near = _touching(extremal.trajectory.x[:, bounded], *(bound[bounded] for bound in st.state_bounds))
+    near[[0, -1]] = False
+    rows = [(st.state_names[i], near[:, j]) for j, i in enumerate(bounded)]
+    for conditions, place, values in extremal.inequalities():
+        if place == "path":
+            near = _touching(values, conditions.lower, conditions.upper)
+            rows += [(name, near[:, j]) for j, name in enumerate(conditions.names)]
+    found: dict[str, float] = {}
+    for name, at in rows:
+        if at.any():
+            found[name] = max(float(shares @ at), found.get(name, 0.0))
+    return found
+
+
+def _touching(values: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+    """Which values (K, rows) are at a limit; those of equations always are."""
+    result = np.broadcast_to(lower == upper, values.shape).copy()
+    for limits in (lower, upper):
+        known = np.isfinite(limits)
+        limits = np.where(known, limits, 0.0)
+        result |= known & (np.abs(values - limits) <= TOUCHED * (np.ptp(values, axis=0) + np.abs(limits)))
+    return result
 
 
 def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed, ...]:

@@ -11,7 +11,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
-from covocp.extremal.path_limits import NOTED
+from covocp.extremal.path_limits import NOTED, acting
 from covocp.solution.chances import chance_section
 from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical, Origin
@@ -85,7 +85,7 @@ WORRIES: dict[str, tuple[float, str]] = {
     ),
     "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
     "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
-    "control_error": (1e-3, "large: a freer control would cost that much less: more intervals, or control='linear'"),
+    "control_error": (1e-3, "large: the cost is off by about that: more intervals, refine=, or control='linear'"),
     "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
     "cross_covariance": (
         1e-2,
@@ -414,12 +414,26 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
         return "semidefinite" if solution.semidefinite else "INDEFINITE"
     if name == "mesh_error" and np.isnan(value) and solution.converged:
         return "not assessed"
+    if name == "control_error" and np.isnan(value) and solution.converged:
+        return _not_known(solution)
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
     return words if solution.converged and abs(value) > level else ""
+
+
+def _not_known(solution: Solution) -> str:
+    """What is said in place of the effect of the form of the controls: which limits act, and what tells more."""
+    reason = ""
+    if solution.statement is not None:
+        shares = acting(solution.extremal)
+        if not shares:
+            return ""
+        where = max(shares, key=lambda name: shares[name])
+        reason = f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
+    return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="
 
 
 def _between_nodes(solution: Solution) -> Section:

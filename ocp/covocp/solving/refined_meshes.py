@@ -27,7 +27,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.instants import completed
 from covocp.transcription.mesh import Graded, Mesh, Options
 from covocp.transcription.nlp import Scales
-from covocp.transcription.remeshing import HIDING, Jump, demand, divided, jumps_of, remeshed
+from covocp.transcription.remeshing import CHANGING, CLOSEST, HIDING, Jump, demand, divided, jumps_of, remeshed
 from covocp.transcription.stiffness import nominal_along
 
 # How often the intervals of a first mesh are doubled where it is not solved.
@@ -42,6 +42,13 @@ LEFT, CANCELLED = 2.0, 0.25
 AIMED, BOLD = 0.3, 1e-4
 # Meshes without a better one among them, after which a tolerance counts as out of reach, and how much better.
 PATIENCE, BETTER = 3, 0.7
+# A mesh that is better than the one before by this may be followed by a coarser one; one that is no better by one with
+# so many times the intervals. How often what a mesh aims at is halved for that.
+MUCH_BETTER, MORE, SHARPENED = 0.1, 1.25, 20
+# Errors above the least one by this are not left by the tolerance of the method.
+ABOVE = 10.0
+# Ratio of the distances of nodes beside a jump: its place is found to that.
+GROWING = 4.0
 # Power of the length with which the error of an interval falls: of controls that are linear, or constant over it.
 ORDERS = {"linear": 5, "constant": 3}
 
@@ -173,6 +180,7 @@ def refine_mesh(first: Measured, runs: Runs) -> Measured:
     """
     allowed = float(first.refine or 0.0)
     done: list[Measured] = []
+    known: list[tuple[float, float]] = []
     made = [first.outcome]
     current, reason = first, ""
     while not runs.progress.stop:
@@ -182,18 +190,20 @@ def refine_mesh(first: Measured, runs: Runs) -> Measured:
             break
         pairs = zip(current.extremals, finer.extremals, strict=True)
         errors = tuple(local_errors(coarse, fine) for coarse, fine in pairs)
-        current = replace(current, error=max(current.least, _error(current, finer, errors)))
-        done.append(current)
+        error = max(current.least, _error(current, finer, errors))
+        known += [(current.cost, error), (finer.cost, error)]
+        done = [replace(entry, error=_seen(entry, known)) for entry in [*done, replace(current, error=error)]]
+        current = done[-1]
         if current.error <= allowed:
             following = _with_more_points(current, runs, made)
             if following is None:
                 break
-            current = following
+            current, known = following, []  # limits at more points cost more
             continue
         reason = _given_up(done)
         if reason:
             break
-        nodes = _next_nodes(runs.statements, current, finer, errors, allowed)
+        nodes = _next_nodes(runs.statements, current, finer, errors, allowed, _fewest(done))
         if sum(own.size - 1 for own in nodes) > MOST_INTERVALS:
             reason = f"the next mesh would have more than {MOST_INTERVALS} intervals"
             break
@@ -251,10 +261,40 @@ def _solved(
 
 
 def _finer_nodes(measured: Measured) -> tuple[Array, ...]:
-    return tuple(
-        divided(extremal.mesh.nodes, extremal.trajectory.u, extremal.mesh.control == "constant")
-        for extremal in measured.extremals
-    )
+    """Nodes of the meshes that tell the error: others between all of them, closer and closer to where controls jump."""
+    result = []
+    for extremal in measured.extremals:
+        nodes, constant = extremal.mesh.nodes, extremal.mesh.control == "constant"
+        finer = divided(nodes, extremal.trajectory.u, constant)
+        result.append(distinct(finer, _beside_jumps(distinct(nodes), extremal, finer)))
+    return tuple(result)
+
+
+def _beside_jumps(nodes: Array, extremal: Extremal, others: Array) -> Array:
+    """Nodes in the intervals beside those in which a control changes much, at distances that grow from their length.
+
+    A jump that has nodes close on both sides and is not quite where it should be costs, in what is long beside it, less
+    than a ramp over half of that would: without a node close to it neither mesh would move it, nor tell of it.
+    """
+    h, span = np.diff(nodes), np.ptp(extremal.controls, axis=0)
+    least = CHANGING * np.where(span > 0, span, np.inf)
+    inside = extremal.controls_at(nodes[:-1]), extremal.controls_at(nodes[1:], before=True)
+    steep = np.any(np.abs(inside[1] - inside[0]) >= least, axis=1)
+    if extremal.mesh.control == "constant":  # which jumps at nodes, between two intervals
+        jump = np.any(np.abs(np.diff(inside[0], axis=0)) >= least, axis=1)
+        steep[1:], steep[:-1] = steep[1:] | jump, steep[:-1] | jump
+    added = []
+    for k in np.flatnonzero(steep):
+        for side, end in ((-1, nodes[k]), (1, nodes[k + 1])):
+            beside = k + side
+            if 0 <= beside < h.size and not steep[beside]:
+                count = int(np.ceil(np.log(max(h[beside] / (2.0 * h[k]), 1.0)) / np.log(GROWING)))
+                added.append(end + side * h[k] * GROWING ** np.arange(count))
+    result = np.concatenate([np.zeros(0), *added])
+    others = np.append(-1.0, others)
+    near = np.searchsorted(others, result).clip(1, others.size - 1)
+    distance = np.minimum(np.abs(result - others[near]), np.abs(result - others[near - 1]))
+    return np.asarray(result[distance > CLOSEST])
 
 
 def _error(coarse: Measured, fine: Measured, errors: tuple[Array, ...]) -> float:
@@ -263,10 +303,35 @@ def _error(coarse: Measured, fine: Measured, errors: tuple[Array, ...]) -> float
     return LEFT * change / max(abs(fine.cost), NO_COST)
 
 
+def _seen(measured: Measured, known: list[tuple[float, float]]) -> float:
+    """Its error, at least what other meshes show of it: costs that are lower by more than their own errors."""
+    lower = [(measured.cost - cost) / max(abs(cost), NO_COST) - error for cost, error in known]
+    return max(measured.error, *lower)
+
+
+def _fewest(done: list[Measured]) -> int:
+    """Intervals that the next mesh has at least: a coarser one is tried where the last one was much better.
+
+    Local errors that forecast less than is then measured are not trusted with fewer intervals.
+    """
+    if len(done) < 2:
+        return 0
+    counts, error = [sum(entry.intervals) for entry in done], done[-1].error
+    if error < MUCH_BETTER * done[-2].error:
+        return 0
+    better = error <= BETTER * min(entry.error for entry in done[:-1])
+    return counts[-1] if better else int(np.ceil(MORE * max(counts[-1], counts[-2])))
+
+
 def _next_nodes(
-    statements: tuple[Statement, ...], coarse: Measured, fine: Measured, errors: tuple[Array, ...], allowed: float
+    statements: tuple[Statement, ...],
+    coarse: Measured,
+    fine: Measured,
+    errors: tuple[Array, ...],
+    allowed: float,
+    fewest: int,
 ) -> tuple[Array, ...]:
-    """Nodes of meshes whose error should be small enough, all together."""
+    """Nodes of meshes whose error should be small enough, all together, with so many intervals at least."""
     cost = max(abs(fine.cost), NO_COST)
     whole = max(AIMED * allowed, BOLD * coarse.error) * cost
     given = []
@@ -275,10 +340,15 @@ def _next_nodes(
     jumps = [_jumps(extremal) for extremal in fine.extremals]
     demands = [demand(*own, found) for own, found in zip(given, jumps, strict=True)]
     total = max(sum(demands), np.finfo(float).tiny)
-    return tuple(
-        remeshed(*own, whole * share / total, found, np.array(st.instants))
-        for own, share, found, st in zip(given, demands, jumps, statements, strict=True)
-    )
+    for _ in range(SHARPENED):
+        nodes = tuple(
+            remeshed(*own, whole * share / total, found, np.array(st.instants))
+            for own, share, found, st in zip(given, demands, jumps, statements, strict=True)
+        )
+        if sum(own.size - 1 for own in nodes) >= fewest:
+            break
+        whole /= 2.0
+    return nodes
 
 
 def _jumps(extremal: Extremal) -> list[Jump]:
@@ -301,7 +371,10 @@ def _given_up(done: list[Measured]) -> str:
         return "the rest is what the tolerance of the method leaves on every mesh"
     before = [entry.error for entry in done[:-PATIENCE]]
     if before and min(entry.error for entry in done[-PATIENCE:]) > BETTER * min(before):
-        return f"{PATIENCE} further meshes were no better: this is what the tolerance of the method and roundoff leave"
+        further = f"{PATIENCE} further meshes were no better: "
+        if min(entry.error for entry in done) <= ABOVE * done[-1].least:
+            return f"{further}this is what the tolerance of the method and roundoff leave"
+        return f"{further}what is left is not where it is looked for; give more intervals= to begin with, or a grid="
     return ""
 
 

@@ -3,6 +3,9 @@
 Where a control is an angle, its values at two neighbouring nodes may belong to one course and yet differ by a turn:
 what lies between them runs through all directions. As long as the interval is short this costs little, so that no
 small change of the nodes gains anything; the cost is off by the length of the interval all the same.
+
+Bounds that are one turn apart exclude no direction. A course that would turn through one of them has to stop there, or
+to make such a turn: a warning says to leave them out.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from covocp.base.errors import warn_user
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.transcription.trajectory import Trajectory
@@ -21,11 +25,16 @@ TURNS = (2.0 * np.pi, 360.0)
 STEEP, LEFT = 1 / 8, 1 / 4
 # Difference below which two values are the same, as a share of the largest one along the nodes.
 SAME = 1e-9
+# Share of a turn by which a value may be off a bound that holds it, and the distance of bounds off a turn.
+SAME_TURN = 1e-5
+# Share of a turn after which an angle on which something depends makes a difference.
+NO_TURN = 0.3
 
 
 def unwound(extremal: Extremal) -> Trajectory | None:
     """The trajectory without the turns of its controls; None where there are none, or where they are no angles."""
     st, t = extremal.statement, extremal.trajectory
+    _mention_bounds(extremal)
     if extremal.mesh.control != "linear" or not st.nu or st.coupled:
         return None
     u = t.u.copy()
@@ -40,6 +49,22 @@ def unwound(extremal: Extremal) -> Trajectory | None:
             if inside:
                 u[:, i] = course + min(inside, key=abs)
     return None if np.array_equal(u, t.u) else replace(t, u=u)
+
+
+def _mention_bounds(extremal: Extremal) -> None:
+    """Warn of bounds of angles that exclude no direction, where a course is held by one of them."""
+    st, u = extremal.statement, extremal.trajectory.u
+    lower, upper = st.control_bounds
+    for i, name in enumerate(st.control_names):
+        for turn in TURNS:
+            if not abs(upper[i] - lower[i] - turn) <= SAME_TURN * turn:
+                continue
+            held = np.minimum(u[:, i] - lower[i], upper[i] - u[:, i]) <= SAME_TURN * turn
+            if held.any() and _is_angle(extremal, i, turn) and not _is_angle(extremal, i, NO_TURN * turn):
+                warn_user(
+                    f"Bounds of '{name}' are one turn apart: leave them out. They exclude no direction, but they hold "
+                    "an angle that would turn through one of them."
+                )
 
 
 def _without_turns(values: Array, turn: float) -> Array | None:
