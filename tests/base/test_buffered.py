@@ -1,10 +1,9 @@
 """Functions called through their buffers: the numbers of CasADi's own calls."""
 
-import threading
-
 import casadi as ca
 import numpy as np
 import pytest
+from side_by_side import in_threads
 
 from covocp.base.buffered import Buffered, Matrices, swept
 
@@ -66,15 +65,12 @@ def test_threads_share_matrices():
         y = ca.sin(y) + x
     shared, wrong = Matrices(ca.Function("f", [x], [y])), []
 
-    def run(number):
-        (expected,) = shared.evaluated(np.full(50, number))
-        wrong.extend(1 for _ in range(100) if not np.array_equal(shared.evaluated(np.full(50, number))[0], expected))
+    def run(k):
+        number = np.full(50, float(k))
+        (expected,) = shared.evaluated(number)
+        wrong.extend(1 for _ in range(100) if not np.array_equal(shared.evaluated(number)[0], expected))
         if np.ptp(expected):
-            wrong.append(number)
+            wrong.append(k)
 
-    threads = [threading.Thread(target=run, args=(float(k),)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(run)
     assert not wrong

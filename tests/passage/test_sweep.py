@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-
 import casadi as ca
 import numpy as np
 import pytest
 from longer import in_long_double
 from scipy.integrate import solve_ivp
+from side_by_side import in_threads
 
 import covocp as co
 from covocp.base.linear_solve import LINEAR_SOLVER, linear_solve
@@ -245,11 +244,7 @@ def test_threads_do_not_meet():
             if any(not np.array_equal(a, b) for a, b in zip(found, known[k], strict=True)):
                 wrong.append(k)
 
-    threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(run)
     assert not wrong
 
 

@@ -5,7 +5,7 @@
 /* Columns that are worked on together. */
 enum { LANES = 32 };
 
-/* CasADi's operations of scalars by the numbers that columns.py gives them. */
+/* CasADi's operations of scalars by the numbers that operations.py gives them. */
 enum {
     OP_ASSIGN, OP_ADD, OP_SUB, OP_MUL, OP_DIV, OP_NEG, OP_EXP, OP_LOG, OP_POW, OP_SQRT, OP_SQ, OP_TWICE, OP_SIN,
     OP_COS, OP_TAN, OP_ASIN, OP_ACOS, OP_ATAN, OP_LT, OP_LE, OP_EQ, OP_NE, OP_NOT, OP_AND, OP_OR, OP_FLOOR, OP_CEIL,

@@ -42,9 +42,11 @@ def in_columns(owner: Owner, function: ca.Function, count: int) -> ca.Function:
         What `function.map(count)` is, by the same operations. It can be differentiated like that.
     """
     kept = _KEPT.setdefault(owner, _Kept())
-    if (function, count) not in kept.nodes:
-        kept.nodes[function, count] = kept.columns(function, count)
-    return kept.nodes[function, count]
+    found = kept.nodes.get((function, count))
+    if found is not None:
+        return found
+    # two threads may make it at once: one of both stays, and is what both are given
+    return kept.nodes.setdefault((function, count), kept.columns(function, count))
 
 
 class _Kept:
@@ -123,10 +125,11 @@ class _Columns(Node):
 
     def _derivative(self, kind: str, directions: int, name: str, options: Given) -> ca.Function:
         """Of one direction the same of columns, of several what CasADi's map gives."""
-        if (kind, directions) not in self._derived:
-            if directions > 1:
-                made = getattr(self._function.map(self._count), kind)(directions)
-            else:
-                made = self._kept.columns(getattr(self._function, kind)(1), self._count, name, options)
-            self._derived[kind, directions] = made
-        return self._derived[kind, directions]
+        found = self._derived.get((kind, directions))
+        if found is not None:
+            return found
+        if directions > 1:
+            made = getattr(self._function.map(self._count), kind)(directions)
+        else:
+            made = self._kept.columns(getattr(self._function, kind)(1), self._count, name, options)
+        return self._derived.setdefault((kind, directions), made)
