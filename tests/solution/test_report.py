@@ -10,7 +10,8 @@ import covocp as co
 from covocp.base.pages import Table
 from covocp.extremal.optimality import Optimality
 from covocp.models import free_time_integrator, mars_entry, mass_chain, unknown_lag
-from covocp.solution.report import RESIDUALS, summary
+from covocp.solution.report import summary
+from covocp.solution.residual_section import RESIDUALS
 
 
 @pytest.fixture(scope="module")

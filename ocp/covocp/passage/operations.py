@@ -39,9 +39,16 @@ COMPARED, MANY = 24, 200
 
 
 def program(function: ca.Function) -> Program | None:
-    """The operations of a function of scalars; None where one of them is not known, or CasADi lists none.
+    """The operations of a function of scalars.
 
     To ask CasADi for one after the other takes four times as long as to read all of them at once.
+
+    Args:
+        function: any of CasADi's.
+
+    Returns:
+        For each of K operations its kind and three numbers as in columns.h, (K, 4), and its constant, (K,); None where
+        one of them is not known, or CasADi lists none.
     """
     if not function.is_a("SXFunction") or not function.n_instructions():
         return None
@@ -50,7 +57,7 @@ def program(function: ca.Function) -> Program | None:
 
 
 def asked_one_by_one(function: ca.Function, places: range | list[int] | None = None) -> Program | None:
-    """The same of some places, all by default, as CasADi tells of each."""
+    """The same as CasADi tells of each; `places`: of the operations that are asked for, None: of all."""
     places = range(function.n_instructions()) if places is None else places
     kinds = [NUMBERS.get(kind, UNKNOWN) for kind in map(function.instruction_id, places)]
     if UNKNOWN in kinds:
@@ -71,6 +78,7 @@ def read_at_once(function: ca.Function) -> Program | None:
 
     There each operation is four whole numbers: its kind, its register, and what it is made of, or its constant; of an
     input the register, the argument and the place there; of an output the result, the register and the place there.
+    That is no promise of CasADi's: what is found is compared with what it tells of some of them (`_agrees`).
     """
     count = function.n_instructions()
     digits = np.frombuffer(function.serialize().encode(), np.uint8) - ord("a")

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from covocp.base.errors import CovocpError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
-from covocp.extremal.path_limits import NOTED, acting
+from covocp.extremal.path_limits import NOTED
 from covocp.solution.chances import chance_section
 from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical, Origin
+from covocp.solution.residual_section import residual_section
 from covocp.statement.statement import Block, Role, entry_names, error_names
 
 if TYPE_CHECKING:
@@ -39,60 +39,6 @@ ASKED = "gain_asked"
 NEGLIGIBLE = 1e-6
 # Relative difference of costs below which two starts count as having found the same optimum.
 SAME_OPTIMUM = 1e-5
-
-RESIDUALS = {
-    "stationarity": "stationarity (relative)",
-    "complementarity": "complementarity (relative to the cost)",
-    "control_slope": "H_u at the nodes, root mean square (relative)",
-    "costate_difference": "costates: multipliers against backward integration (relative)",
-    "hamiltonian_variation": "variation of the Hamiltonian along the path (relative)",
-    "transversality": "condition of the free duration, k_T + H(T) (relative)",
-    "decisions": "condition of the decisions, int H_d dt + end terms (relative)",
-    "mesh_error": "cost: change by halving the integration steps (relative)",
-    "node_error": "nodes: change by halving the integration steps (of the range)",
-    "control_error": "cost: estimated effect of the piecewise form of the controls (relative)",
-    "smallest_eigenvalue": "smallest eigenvalue of the covariances at all nodes",
-    "cost_identity": "expected cost: as optimised against from the covariances (relative)",
-    "cross_covariance": "correlation of the estimate and its error, zero by the statistics of the design",
-    "conservation": "variances E + Xhat that no control changes: error (relative)",
-    "curvature": "smallest curvature of the reduced Hessian (relative to its largest)",
-}
-
-
-# Of costates that nothing is compared with.
-UNCHECKED = "not checked: explicit steps back would be too many; costates near the end may be off"
-# Where to begin to worry about a residual, and what a large one means.
-WORRIES: dict[str, tuple[float, str]] = {
-    "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
-    "complementarity": (
-        1e-3,
-        "LARGE: multipliers push at bounds that are not reached; a smaller tolerance=, or start again from it",
-    ),
-    "costate_difference": (
-        1e-2,
-        "large: the costates change within an interval (a constraint takes hold, a stiff start or end); costs and "
-        "controls may be right all the same: worry if the mesh error is large, or if it stays on twice the intervals",
-    ),
-    "hamiltonian_variation": (
-        1e-2,
-        "large: the controls or costates change within an interval; worry if it stays on twice the intervals",
-    ),
-    "transversality": (1e-2, "LARGE: the duration is not the best one, or the mesh too coarse: more intervals"),
-    "decisions": (1e-4, "LARGE: the decisions are not the best ones yet; a smaller tolerance=, or start from here"),
-    "control_slope": (
-        0.1,
-        "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
-    ),
-    "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
-    "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
-    "control_error": (1e-3, "large: the cost is off by about that: more intervals, refine=, or control='linear'"),
-    "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
-    "cross_covariance": (
-        1e-2,
-        "large: the gains change faster than the steps that check them; worry if the expected costs differ as well",
-    ),
-    "conservation": (1e-3, "LARGE: the covariances are known to no more than this: more intervals"),
-}
 
 
 def summary(solution: Solution) -> str:
@@ -129,7 +75,7 @@ def sections(solution: Solution) -> list[Section]:
         _feedback(solution),
         _gains(solution),
         *(_matrix(solution, block) for block in solution.blocks if block.kind == "matrix" and shown(block)),
-        _optimality(solution),
+        residual_section(solution),
         _between_nodes(solution),
         _effort(solution),
     ]
@@ -384,56 +330,6 @@ def _matrix(solution: Solution, block: Block) -> Section:
         if abs(value) > NEGLIGIBLE * abs(solution.cost) and not block.backward  # bounds at the end leave tiny ones
     ]
     return [Table(columns=columns, rows=rows), *_table(["fixed at T", "multiplier"], fixed)]
-
-
-def _optimality(solution: Solution) -> Section:
-    """The residuals of the necessary conditions in words."""
-    try:
-        values = solution.optimality.as_dict()
-    except (CovocpError, RuntimeError, ArithmeticError, ValueError) as error:
-        return [Sentence(f"necessary conditions: not evaluated ({str(error).splitlines()[0][:100]})")]
-    rows = []
-    for name, value in values.items():
-        if value is None and name == "costate_difference" and values["stationarity"] is not None:
-            rows.append([RESIDUALS[name], "-", UNCHECKED])
-        if value is None or (name == "smallest_eigenvalue" and np.isinf(value)):
-            continue
-        rows.append(
-            [
-                RESIDUALS.get(name, name.replace("_", " ")),
-                "-" if np.isnan(value) else f"{value:.2e}",
-                _verdict(solution, name, value),
-            ]
-        )
-    return [Table(columns=["necessary conditions", "", ""], rows=rows, words=(0, 2))]
-
-
-def _verdict(solution: Solution, name: str, value: float) -> str:
-    """What a sign means, and what a residual does that is larger than usual."""
-    if name == "smallest_eigenvalue":
-        return "semidefinite" if solution.semidefinite else "INDEFINITE"
-    if name == "mesh_error" and np.isnan(value) and solution.converged:
-        return "not assessed"
-    if name == "control_error" and np.isnan(value) and solution.converged:
-        return _not_known(solution)
-    if name == "curvature" and solution.converged:
-        return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
-    if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
-        return "by other statistics than the design's"
-    level, words = WORRIES.get(name, (np.inf, ""))
-    return words if solution.converged and abs(value) > level else ""
-
-
-def _not_known(solution: Solution) -> str:
-    """What is said in place of the effect of the form of the controls: which limits act, and what tells more."""
-    reason = ""
-    if solution.statement is not None:
-        shares = acting(solution.extremal)
-        if not shares:
-            return ""
-        where = max(shares, key=lambda name: shares[name])
-        reason = f", as '{where}' acts in {100 * shares[where]:.2g} % of the time"
-    return f"NOT KNOWN{reason}: compare the cost with that of twice the intervals, or refine="
 
 
 def _between_nodes(solution: Solution) -> Section:
