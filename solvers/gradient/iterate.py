@@ -41,7 +41,7 @@ from covocp.solvers.gradient.penalty import (
     limits,
 )
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
-from covocp.solvers.gradient.unknowns import Unknowns
+from covocp.solvers.gradient.unknowns import ZERO, Unknowns
 from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import choose_scales
 from covocp.transcription.steering import quadrature_weights
@@ -51,8 +51,6 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 SMALLEST_CURVATURE = 1e-3
 # T changes by no more than these shares of itself in one step.
 SHORTEN, LENGTHEN = 0.3, 0.5
-# Controls below this share of their scale at the start are zero.
-ZERO = 1e-12
 CHORD_STEPS = 60
 CHORD_TOLERANCE = 1e-13
 

@@ -22,7 +22,7 @@ from covocp.solvers.gradient.memory import Metric, Pair, damped, learnt
 from covocp.solvers.gradient.penalty import next_weights
 from covocp.solvers.gradient.records import Iterate, Linear, Measures
 from covocp.solvers.gradient.statuses import Status
-from covocp.solvers.gradient.unknowns import Unknowns
+from covocp.solvers.gradient.unknowns import ZERO, Unknowns
 
 # On the slopes, unless the user gives another.
 TOLERANCE = 1e-6
@@ -162,7 +162,7 @@ class Search:
             trial = self._try(current, linear, metric, active)
             if isinstance(trial, Status):
                 return End(current, measures, trial)
-            following, step = trial
+            following, step = self._cleared(trial[0]), trial[1]
             after = space.linearise(following)
             if not after.finite:
                 return End(current, measures, Status.NO_NUMBER)
@@ -170,6 +170,21 @@ class Search:
             current, linear, ell, active = following, after, step.ell, step.active
             measures = space.measure(current, linear)
             control.iterations += 1
+
+    def _cleared(self, iterate: Iterate) -> Iterate:
+        """The iterate with controls that are zero where all of them are roundoff of their scales, and that costs no more.
+
+        Where the best control is none all terms of H_u fall with it, and none becomes small beside the others.
+        """
+        space, point = self.space, iterate.point
+        own = space.is_control
+        roundoff = np.abs(point[own]) <= ZERO * space.unit[own]
+        possible = (space.lower[own] <= 0) & (space.upper[own] >= 0)
+        if not point[own].any() or not (roundoff & possible).all():
+            return iterate
+        without = space.at(np.where(own, 0.0, point))
+        merits = [each.cost + self.control.merit @ np.abs(each.run.miss) for each in (without, iterate)]
+        return without if without.run.finite and merits[0] <= merits[1] else iterate
 
     def _arrived(self, current: Iterate, linear: Linear, measures: Measures, tolerance: float) -> bool:
         """The stop test of a pass: in the scales of the start, and in those of the point that was reached.

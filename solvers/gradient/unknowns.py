@@ -20,6 +20,8 @@ from covocp.solvers.gradient.records import Iterate, Linear, Measures
 # Relative change of T and of free initial values by which their curvature is measured, and of the controls in a probe.
 DIFFERENCE = 1e-4
 SMALLEST_EXTRA = 1e-3
+# Controls below this share of their scale at the start are zero.
+ZERO = 1e-12
 # Terms of H_u that change the cost by less than this share where a control moves by its scale are roundoff.
 FAINT = 1e-8
 
