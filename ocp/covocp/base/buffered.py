@@ -87,7 +87,7 @@ def swept(function: ca.Function, start: Array, *columns: Any) -> tuple[Array, ..
         RuntimeError: a call failed.
     """
     single = [function.size_in(i) for i in range(1, function.n_in())]
-    wide = [np.asarray(ca.DM(column).full()) for column in columns]
+    wide = [c if isinstance(c, np.ndarray) and c.ndim == 2 else np.asarray(ca.DM(c).full()) for c in columns]
     count = next(array.shape[1] // shape[1] for array, shape in zip(wide, single, strict=True) if shape[1])
     rows = [array.T.reshape(count, -1) for array in wide]
     call, value = Buffered(function), start

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -20,6 +21,31 @@ TABLE = "covocp_table_"
 
 # Sequences of steps that are kept.
 SEQUENCES = 64
+
+
+# Types of expressions whose operations are asked for by name below.
+_SYMBOLIC = (ca.SX, ca.MX)
+
+
+def _operation(code: int, plain: Callable[[Any, Any], Any]) -> Callable[[Expr, Expr], Any]:
+    """An operation of two expressions or numbers, entry by entry: what the operator gives.
+
+    CasADi's operators first ask of each operand whether it is a number, an array, a sparse matrix and so on, which
+    takes ten times as long as the operation. Where steps are written out there are hundreds of them.
+    """
+
+    def combined(a: Expr, b: Expr) -> Any:
+        kind: Any = type(a) if type(a) in _SYMBOLIC else type(b)
+        if kind in _SYMBOLIC and all(type(v) is kind or type(v) is float or type(v) is int for v in (a, b)):
+            return kind.binary(code, a, b)
+        return plain(a, b)
+
+    return combined
+
+
+plus = _operation(ca.OP_ADD, operator.add)
+minus = _operation(ca.OP_SUB, operator.sub)
+times = _operation(ca.OP_MUL, operator.mul)
 
 
 def symbol_of(key: Given) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, plus, times
 from covocp.base.linear_solve import linear_solve
 from covocp.base.matrices import Array
 
@@ -28,21 +28,21 @@ def classical_step(rate: Callable[[Any, float], Any], value: Expr, h: Expr, firs
         h: length of the step.
         first: the slope at the start, where it is known already.
     """
+    half = h / 2
     k1 = rate(value, 0.0) if first is None else first
-    k2 = rate(value + h / 2 * k1, 0.5)
-    k3 = rate(value + h / 2 * k2, 0.5)
-    k4 = rate(value + h * k3, 1.0)
-    return value + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    k2 = rate(plus(value, times(half, k1)), 0.5)
+    k3 = rate(plus(value, times(half, k2)), 0.5)
+    k4 = rate(plus(value, times(h, k3)), 1.0)
+    total = plus(plus(plus(k1, times(2, k2)), times(2, k3)), k4)
+    return plus(value, times(h / 6, total))
 
 
 def hermite(start: Expr, end: Expr, slope_start: Expr, slope_end: Expr, c: Expr) -> Any:
     """Cubic Hermite polynomial at c in [0, 1]; slopes per unit of c."""
-    return (
-        (1 + 2 * c) * (1 - c) ** 2 * start
-        + c * (1 - c) ** 2 * slope_start
-        + c**2 * (3 - 2 * c) * end
-        + c**2 * (c - 1) * slope_end
-    )
+    shares = ((1 + 2 * c) * (1 - c) ** 2, c * (1 - c) ** 2, c**2 * (3 - 2 * c), c**2 * (c - 1))
+    values = (start, slope_start, end, slope_end)
+    first, second, third, fourth = (times(share, value) for share, value in zip(shares, values, strict=True))
+    return plus(plus(plus(first, second), third), fourth)
 
 
 def interpolated(values: Array, old: Array, new: Array) -> Array:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import halved, refined
-from covocp.extremal.hamiltonian import hamiltonian
+from covocp.extremal.hamiltonian import by_controls
 from covocp.statement.interval import repeated
 
 # A truth value for each control of each interval.
@@ -58,18 +58,16 @@ def estimate_control_error(extremal: Extremal, kinds: tuple[Mask, Mask], others:
 class _Values(NamedTuple):
     """At start, middle and end of each interval: controls, H_u (3, N, nu), H_uu (3, N, nu, nu), fall of H (3, N).
 
-    above: by how much H is above its value with the control of one of the ends of the interval.
+    definite: intervals in which H_uu is positive definite, (N,).
+    above: by how much H is above its value with the control of one of the ends of the interval; zero where H_uu is
+        positive definite in all of them.
     """
 
     u: Array
     slopes: Array
     curvatures: Array
+    definite: Mask
     above: Array
-
-    @property
-    def definite(self) -> Mask:
-        """Intervals in which H_uu is positive definite, (N,)."""
-        return np.asarray((np.linalg.eigvalsh(self.curvatures)[..., 0] > 0).all(axis=0))
 
 
 def _along(extremal: Extremal, fine: Extremal) -> _Values:
@@ -78,24 +76,24 @@ def _along(extremal: Extremal, fine: Extremal) -> _Values:
     costates, t = discrete_costates(fine)[0], fine.trajectory
     u, h = extremal.controls, np.diff(extremal.time)
     ends = u[:-1] if mesh.control == "constant" else u[1:]
-    function = hamiltonian(st)("point", lambda v, x, w, e, t: [v, ca.gradient(v, w), ca.hessian(v, w)[0]]).map(n)
-    rows = []
-    for j in range(3):
+    function = Matrices(by_controls(st).map(n))
+    controls = [u[:-1] + j / 2 * (ends - u[:-1]) for j in range(3)]
+
+    def there(j: int, control: Array) -> list[Array]:
         at = slice(j, j + 2 * n - 1, 2)  # of the nodes of the halved mesh
-        arguments = (
-            t.x[at].T,
-            (u[:-1] + j / 2 * (ends - u[:-1])).T,
-            t.e[at].T,
-            (extremal.time[:-1] + j / 2 * h)[None, :],
-            *repeated(t.duration, extremal.parameters, n),
-            costates.state[at].T,
-            costates.matrices[at].T,
-        )
-        value, slope, curvature = (stacked(v, n) for v in function(*arguments))
-        held = [stacked(function(arguments[0], w.T, *arguments[2:])[0], n) for w in (u[:-1], ends)]
-        above = (value - np.minimum(np.minimum(*held), value)).ravel()
-        rows.append((arguments[1].T, slope[:, :, 0], curvature, above))
-    return _Values(*(np.array(each) for each in zip(*rows, strict=True)))
+        place = (t.e[at].T, (extremal.time[:-1] + j / 2 * h)[None, :])
+        known = (*repeated(t.duration, extremal.parameters, n), costates.state[at].T, costates.matrices[at].T)
+        return [stacked(v, n) for v in function.evaluated(t.x[at].T, control.T, *place, *known)]
+
+    values, slopes, curvatures = (
+        np.array(each) for each in zip(*(there(j, control) for j, control in enumerate(controls)), strict=True)
+    )
+    definite = np.asarray((np.linalg.eigvalsh(curvatures)[..., 0] > 0).all(axis=0))
+    above = np.zeros((3, n))
+    if not definite.all():
+        held = [np.minimum(*(there(j, w)[0] for w in (u[:-1], ends))) for j in range(3)]
+        above = values[..., 0, 0] - np.minimum(np.array(held), values)[..., 0, 0]
+    return _Values(np.array(controls), slopes[..., 0], curvatures, definite, above)
 
 
 def _by_points(extremal: Extremal, fine: Extremal, values: _Values, kinds: tuple[Mask, Mask]) -> float:

@@ -357,7 +357,9 @@ def backward_interval(statement: Statement, pairs: int, influences: int = 0, *, 
     z, given = ca.MX.sym("z", size, 2 * pairs + 1), ca.MX.sym("given", count, 2 * pairs + 1)
     zero = ca.DM.zeros(count, 2 * pairs + 1)
     interval = Interval.symbols(statement, ca.MX)
-    steps = [backward_pair(statement), backward_pair(statement, cost=False, matrices=matrices)]
+    steps = [backward_pair(statement)]
+    if influences:
+        steps.append(backward_pair(statement, cost=False, matrices=matrices))
     columns, passed = ca.horzsplit(after), []
     for j in range(pairs - 1, -1, -1):
         part = interval.part(j / pairs, (j + 1) / pairs)

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.buffered import Buffered
 from covocp.base.krylov import krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
@@ -223,7 +224,7 @@ class _Reduced:
             tangents=tangents,
             between=between,
             root=root,
-            product=lambda direction: np.asarray(product(*given, direction).full()).ravel(),
+            product=_applied(product, given),
             strict=rows[held.strict],
             loose=-side[:, None] * loose,
         )
@@ -260,6 +261,17 @@ class _Reduced:
     def null_space(self, rows: Array) -> Array:
         """Orthonormal basis of the directions along which no row changes, (V, number)."""
         return null_space(rows, self.root.shape[0])
+
+
+def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], Array]:
+    """A product with a direction, its other arguments given: NaN where it fails."""
+    call, known = Buffered(product), [np.asarray(value, dtype=float).ravel(order="F") for value in given]
+
+    def product_with(direction: Array) -> Array:
+        outputs = call(*known, direction)
+        return np.full(direction.shape, np.nan) if outputs is None else outputs[0]
+
+    return product_with
 
 
 def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:

@@ -8,6 +8,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Statement
@@ -23,9 +24,8 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
     Returns:
         x and e stacked at the starts of the substeps and at the end, (N, substeps + 1, nx + ne).
     """
-    return _inside(
-        extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()), substeps
-    )
+    mesh = replace(extremal.mesh, points=1, substeps=1)  # of which nothing else is seen
+    return _inside(extremal.statement, mesh, extremal.trajectory, tuple(extremal.parameters.tolist()), substeps)
 
 
 @lru_cache(maxsize=2)
@@ -35,8 +35,9 @@ def _inside(
     """The same, remembered: several residuals look at one trajectory; read-only."""
     n, z = mesh.intervals, np.hstack([trajectory.x, trajectory.e])
     columns = interval_columns(mesh, ca.DM(trajectory.u.T), trajectory.duration, ca.DM(np.array(parameters)))
-    inside = inside_interval(statement, substeps, mesh.step).map(n)(z[:-1].T, z[1:].T, *columns)
-    values = np.asarray(inside.full()).T.reshape(n, substeps + 1, z.shape[1])
+    function = Matrices(inside_interval(statement, substeps, mesh.step).map(n))
+    (inside,) = function.evaluated(z[:-1].T, z[1:].T, *columns)
+    values = np.ascontiguousarray(inside.T).reshape(n, substeps + 1, z.shape[1])
     values.setflags(write=False)
     return values
 

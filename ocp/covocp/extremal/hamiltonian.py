@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any
 
 import casadi as ca
@@ -17,6 +18,7 @@ from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +56,13 @@ def hamiltonian(
         return ca.Function(name, [*symbols.values(), costate_x, costate_e], [ca.densify(v) for v in outputs])
 
     return make
+
+
+@lru_cache(maxsize=KEPT)
+def by_controls(statement: Statement) -> ca.Function:
+    """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu; no function is made twice of one statement."""
+    second = (lambda h, u: ca.hessian(h, u)[0]) if statement.nu else (lambda h, u: ca.DM(0, 0))
+    return hamiltonian(statement)("by_controls", lambda h, x, u, e, t: [h, ca.gradient(h, u), second(h, u)])
 
 
 def duration_slope(statement: Statement) -> ca.Function:

@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
@@ -21,7 +20,7 @@ from covocp.extremal.decisions import decision_slopes
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.finer_cost import change_on_finer_mesh
-from covocp.extremal.hamiltonian import Costates, along, duration_slope, hamiltonian
+from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope
 from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
@@ -255,13 +254,7 @@ class _AtNodes(NamedTuple):
 def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     """The Hamiltonian and its slopes at the nodes."""
     st = extremal.statement
-    make = hamiltonian(st)
-
-    def select(h: Expr, x: Expr, u: Expr, e: Expr, t: Expr) -> list[Any]:
-        return [h, ca.gradient(h, u), ca.hessian(h, u)[0] if st.nu else ca.DM(0, 0)]
-
-    function = make("along", select)
-    h, slope, curvature = along(function, extremal, costates)
+    h, slope, curvature = along(by_controls(st), extremal, costates)
     (size,) = along(slope_terms(st), extremal, costates)
     curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
     values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())

@@ -66,6 +66,12 @@ class _Kept:
         return function.map(count) if listed is None else _Columns(self, function, count, listed, name, options)
 
 
+def beside(shape: ca.Sparsity, count: int) -> ca.Sparsity:
+    """A sparsity so many times side by side."""
+    rows, columns = shape.shape
+    return ca.Sparsity.dense(rows, columns * count) if shape.is_dense() else ca.repmat(shape, 1, count)
+
+
 class _Columns(Node):
     """A function of scalars on columns."""
 
@@ -86,7 +92,7 @@ class _Columns(Node):
             *(len(shapes), self._heights.ctypes.data),
         )
         self._places = ctypes.c_void_p * len(self._heights)
-        inputs, outputs = ([ca.repmat(shape, 1, count) for shape in each] for each in (shapes, results))
+        inputs, outputs = ([beside(shape, count) for shape in each] for each in (shapes, results))
         own = {"is_diff_in": [function.is_diff_in(i) for i in range(len(shapes))], **(options or {})}
         super().__init__(name or f"columns_{function.name()}", inputs, outputs, own)
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, minus, plus, times
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
 
@@ -54,19 +54,21 @@ class Interval(NamedTuple):
     @property
     def h(self) -> Expr:
         """Its length [s]."""
-        return self.duration * self.ds
+        return times(self.duration, self.ds)
 
     def control(self, c: Expr) -> Expr:
         """The control at a share of it."""
-        return self.start + c * (self.end - self.start)
+        if isinstance(c, (int, float)) and c in (0, 1):
+            return self.end if c else self.start
+        return plus(self.start, times(c, minus(self.end, self.start)))
 
     def place(self, c: float) -> Expr:
         """The normalised time at a share of it, its ends as limits from inside."""
-        return self.s + one_sided(c) * self.ds
+        return plus(self.s, times(one_sided(c), self.ds))
 
     def time(self, c: float) -> Expr:
         """The time [s] at a share of it."""
-        return self.duration * self.place(c)
+        return times(self.duration, self.place(c))
 
     def at(self, c: float, x: Expr, e: Expr | None = None) -> tuple[Expr, ...]:
         """The arguments of the model at a share of it: (x, u, t, T, p), or with half-vectors (x, u, e, t, T, p)."""
@@ -75,9 +77,11 @@ class Interval(NamedTuple):
 
     def part(self, c: float, d: float) -> Interval:
         """Its part [c, d], 0 <= c <= d <= 1."""
-        s, ds = self.s + c * self.ds, (d - c) * self.ds
-        own = {"start": self.control(c), "end": self.control(d), "reading": (d - c) * self.reading}
-        return self._replace(s=s, ds=ds, **own)
+        if (c, d) == (0, 1):
+            return self
+        s = plus(self.s, times(c, self.ds)) if c else self.s
+        own = {"start": self.control(c), "end": self.control(d), "reading": times(d - c, self.reading)}
+        return self._replace(s=s, ds=times(d - c, self.ds), **own)
 
     def turned(self) -> Interval:
         """The same, passed backward."""

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.expressions import Expr
+from covocp.base.expressions import Expr, plus, times
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
 from covocp.passage.columns import in_columns
@@ -146,9 +146,10 @@ def _stage_slopes(statement: Statement, substeps: int) -> tuple[ca.Function, tup
         for value, c in stages:
             moved, by_x, by_u, by_time, by_duration = rates(*part.at(c, value))
             share, h = (j + c) / substeps, part.h
-            blocks = [h * by_x, (1 - share) * h * by_u, share * h * by_u]
+            blocks = [times(h, by_x), times(times(1 - share, h), by_u), times(times(share, h), by_u)]
             if statement.duration.free:
-                blocks.append(part.ds * moved + h * (by_time * part.place(c) + by_duration))
+                own = plus(times(by_time, part.place(c)), by_duration)
+                blocks.append(plus(times(part.ds, moved), times(h, own)))
             found.append(ca.horzcat(*blocks))
     pattern = found[0].sparsity()
     for slope in found:
