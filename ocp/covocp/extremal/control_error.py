@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import halved, refined
 from covocp.extremal.hamiltonian import by_controls
+from covocp.extremal.nodes import mapped
 from covocp.statement.interval import repeated
 
 # A truth value for each control of each interval.
@@ -140,9 +142,10 @@ def _fall(u: Array, slope: Array, curvature: Array, lower: Array, upper: Array) 
     return np.asarray(np.maximum(-(slope * move + bend / 2 * move**2), 0.0))
 
 
+@lru_cache(maxsize=4)
 def absolute_cost(extremal: Extremal) -> float:
     """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
     st, t = extremal.statement, extremal.trajectory
     terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    running = np.asarray(st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())[2].full()).ravel()
-    return abs(terminal) + abs(float(np.trapezoid(running, extremal.time)))
+    running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())[2]
+    return abs(terminal) + abs(float(np.trapezoid(running.ravel(), extremal.time)))

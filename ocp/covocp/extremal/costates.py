@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import swept
+from covocp.base.buffered import Matrices, swept
 from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, read_only
 from covocp.base.quadrature import classical_step, hermite
@@ -158,8 +158,8 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     weights = jumps[:, nx:].copy()
     weights[-1] = last_e
     weights[-1, behind] = direct
-    outputs = passage_slopes(st, mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
-    by_x, by_u, by_duration, kicks = (np.asarray(v.full()).T for v in outputs)
+    given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    by_x, by_u, by_duration, kicks = (v.T for v in passage_slopes(st, mesh).evaluated(*given))
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
     last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
@@ -181,8 +181,8 @@ def without_passage(extremal: Extremal) -> Extremal:
     weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)
     weights[-1, behind] -= m.final_matrices[behind]
-    outputs = passage_slopes(st, fine.mesh)(t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
-    through = np.asarray(outputs[0].full())[:, -1]
+    given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
+    through = passage_slopes(st, fine.mesh).evaluated(*given)[0][:, -1]
     return replace(extremal, multipliers=replace(m, final=m.final - through))
 
 
@@ -206,7 +206,7 @@ def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float, Array]:
 
 
 @lru_cache(maxsize=KEPT)
-def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
+def passage_slopes(statement: Statement, mesh: Mesh) -> Matrices:
     """Slopes of cost and weighted half-vectors along given nodes of the nominal.
 
     Returns:
@@ -226,7 +226,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> ca.Function:
     slopes = slopes_by(value, (x, u, duration, kicks))
     inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
     values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
-    return ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values))
+    return Matrices(ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values)))
 
 
 def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:

@@ -13,7 +13,8 @@ from typing import Annotated, Any
 
 import casadi as ca
 
-from covocp.base.expressions import slopes_by
+from covocp.base.buffered import Matrices
+from covocp.base.expressions import Expr, slopes_by
 from covocp.base.matrices import Array, stacked
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
@@ -61,8 +62,12 @@ def hamiltonian(
 @lru_cache(maxsize=KEPT)
 def by_controls(statement: Statement) -> ca.Function:
     """(x, u, e, t, T, p, costate of x, costate of e) -> H, H_u, H_uu; no function is made twice of one statement."""
-    second = (lambda h, u: ca.hessian(h, u)[0]) if statement.nu else (lambda h, u: ca.DM(0, 0))
-    return hamiltonian(statement)("by_controls", lambda h, x, u, e, t: [h, ca.gradient(h, u), second(h, u)])
+
+    def select(h: Expr, x: Expr, u: Expr, e: Expr, t: Expr) -> list[Any]:
+        slope = ca.gradient(h, u)
+        return [h, slope, ca.jacobian(slope, u, {"symmetric": True}) if statement.nu else ca.DM(0, 0)]
+
+    return hamiltonian(statement)("by_controls", select)
 
 
 def duration_slope(statement: Statement) -> ca.Function:
@@ -76,9 +81,8 @@ def duration_slope(statement: Statement) -> ca.Function:
 def along(function: ca.Function, extremal: Extremal, costates: Costates) -> list[Array]:
     """A function made by `hamiltonian` at all nodes; each output with the node first."""
     count = extremal.mesh.intervals + 1
-    values = function.map(count)(*extremal.columns(), costates.state.T, costates.matrices.T)
-    outputs = values if isinstance(values, (tuple, list)) else [values]
-    result = [stacked(value, count) for value in outputs]
+    values = Matrices(function.map(count)).evaluated(*extremal.columns(), costates.state.T, costates.matrices.T)
+    result = [stacked(value, count) for value in values]
     return [numbers[:, :, 0] if numbers.shape[2] == 1 else numbers for numbers in result]
 
 

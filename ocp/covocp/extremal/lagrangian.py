@@ -22,6 +22,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps, interval_columns, matrices_along
+from covocp.transcription.staged import interval_transitions, is_staged
 from covocp.transcription.steps import full_interval, moving_interval, nominal_interval
 
 # Rows that hold states alone.
@@ -138,6 +139,8 @@ def interval_slopes(extremal: Extremal) -> tuple[Array, Array, Array]:
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
     common = interval_columns(mesh, ca.DM(t.u.T), t.duration, ca.DM(extremal.parameters))
+    if is_staged(st, mesh):
+        return interval_transitions(st, mesh, z[:-1].T, common)
     values = _interval_slopes(st, mesh)(z[:-1].T, *common)
     A, first, last = (stacked(v, mesh.intervals) for v in values)
     return A, first, last

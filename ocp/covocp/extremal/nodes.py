@@ -21,7 +21,7 @@ def rates_along(extremal: Extremal) -> tuple[Array, Array]:
 
     Each with the control of its interval and the limit of the time from inside it.
     """
-    function = _mapped(extremal.statement, "rates", extremal.mesh.intervals + 1)
+    function = mapped(extremal.statement, "rates", extremal.mesh.intervals + 1)
 
     def stacked(u: Expr, time: Array) -> Array:
         state, matrices, _ = function.evaluated(x, u, e, time[None, :], *rest)
@@ -45,7 +45,7 @@ def filter_gains(extremal: Extremal) -> Array | None:
     block = st.estimation
     x, u, _, t, duration, p = extremal.columns()
     count = extremal.mesh.intervals + 1
-    _, M, U = (stacked(v, count) for v in _mapped(st, "measurement", count).evaluated(x, u, t, duration, p))
+    _, M, U = (stacked(v, count) for v in mapped(st, "measurement", count).evaluated(x, u, t, duration, p))
     E = unpack(extremal.trajectory.e[:, block.span], block.size)
     try:
         return np.asarray(kalman_gain(E, M, U))
@@ -54,6 +54,6 @@ def filter_gains(extremal: Extremal) -> Array | None:
 
 
 @lru_cache(maxsize=2 * KEPT)
-def _mapped(statement: Statement, function: str, count: int) -> Matrices:
+def mapped(statement: Statement, function: str, count: int) -> Matrices:
     """A function of the statement for so many points."""
     return Matrices(getattr(statement, function).map(count))

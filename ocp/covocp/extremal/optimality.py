@@ -24,6 +24,7 @@ from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_s
 from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
+from covocp.extremal.nodes import mapped
 from covocp.extremal.path_limits import acting
 from covocp.extremal.readings import stretches
 from covocp.extremal.slope_terms import slope_sizes, slope_terms
@@ -257,10 +258,9 @@ def _at_nodes(extremal: Extremal, costates: Costates) -> _AtNodes:
     h, slope, curvature = along(by_controls(st), extremal, costates)
     (size,) = along(slope_terms(st), extremal, costates)
     curvature = curvature.reshape(slope.shape[0], st.nu, st.nu)
-    values = st.rates.map(extremal.mesh.intervals + 1)(*extremal.columns())
-    terms = np.abs(costates.state * np.asarray(values[0].full()).T).sum(axis=1)
-    terms = terms + np.abs(costates.matrices * np.asarray(values[1].full()).T).sum(axis=1)
-    terms = terms + np.abs(np.asarray(values[2].full()).ravel())
+    rates, matrix_rates, running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())
+    terms = np.abs(costates.state * rates.T).sum(axis=1) + np.abs(costates.matrices * matrix_rates.T).sum(axis=1)
+    terms = terms + np.abs(running.ravel())
     sizes = slope_sizes(size.reshape(slope.shape), curvature, extremal.controls)
     return _AtNodes(slope, curvature, np.column_stack([h[:, 0], terms]), sizes)
 

@@ -15,7 +15,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.buffered import Matrices
 from covocp.base.expressions import Expr, plus, times
+from covocp.base.matrices import Array, stacked
 from covocp.base.quadrature import classical_step
 from covocp.base.short_repr import short_repr
 from covocp.passage.columns import in_columns
@@ -25,6 +27,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, slopes_wanted
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import compiled_steps
+from covocp.transcription.steps import nominal_interval
 
 # States from which on it is less work where no covariance passes in compiled code.
 SMALLEST_ALONE = 4
@@ -120,6 +123,38 @@ def staged(
         spans=tuple(spans),
         linear=constant,
     )
+
+
+def interval_transitions(
+    statement: Statement, mesh: Mesh, x: Array, intervals: Interval
+) -> tuple[Array, Array, Array]:
+    """Slopes of the state after each interval by that before it and by the controls at its two ends.
+
+    Args:
+        statement: a problem that `is_staged`.
+        mesh: of it.
+        x: states before the intervals, numbers (nx, N).
+        intervals: a column for each, numbers.
+
+    Returns:
+        (N, nx, nx), (N, nx, nu), (N, nx, nu).
+    """
+    n, nx, nu, free = mesh.intervals, statement.nx, statement.nu, int(statement.duration.free)
+    run = Matrices(nominal_interval(statement, mesh.substeps, mesh.step).map(n))
+    fine = run.evaluated(x, *intervals)[1]
+    function, pattern = _stage_slopes(statement, mesh.substeps)
+    rest = (*range(nx + free, nx + free + 2 * nu), *range(nx, nx + free))
+    steps = Steps(
+        rows=nx,
+        pattern=pattern,
+        steps=mesh.substeps,
+        lengths=(1,) * n,
+        places=(rest,) * n,
+        active=(nx + free + 2 * nu,) * n,
+    )
+    slopes = in_columns(statement, function, n)(x, fine, *intervals)
+    values = stacked(transitions(steps, slopes), n)
+    return values[..., :nx], values[..., nx + free : nx + free + nu], values[..., nx + free + nu :]
 
 
 @lru_cache(maxsize=KEPT)
