@@ -176,6 +176,51 @@ def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked, every):
         assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
 
 
+def first_variance(e):
+    return e[0, -1]
+
+
+def two_entries(e):
+    return 2.0 * e[1, -1] - 0.3 * e[-1, -1]
+
+
+def curved_at_the_end(e):
+    return ca.log(2.0 + e[-1, -1] ** 2)
+
+
+def earlier_too(e):
+    return e[0, -1] + 0.7 * e[2, 1]
+
+
+def curved_earlier(e):
+    return e[-1, -1] + e[0, 2] ** 2 + e[1, 0]
+
+
+@pytest.mark.parametrize(
+    "cost", [first_variance, two_entries, curved_at_the_end, earlier_too, curved_earlier], ids=lambda f: f.__name__
+)
+@pytest.mark.parametrize("kicked", [False, True])
+@pytest.mark.parametrize("n", [2, 6, 13])
+def test_tangents_of_slopes_by_few_entries_are_those_of_casadi(n, kicked, cost):
+    """These have few columns, as long as nothing else is asked on the way back."""
+    rng = np.random.default_rng(n)
+    E, h1, h2 = systems(n, n)
+    shape = (half_length(n), STEPS)
+    directions = [rng.normal(size=shape[0]), *systems(n, n + 100)[1:], rng.normal(size=shape)][: 4 if kicked else 3]
+    given = [pack(E), h1, h2, 1e-3 * rng.normal(size=shape)][: len(directions)]
+    arguments, passed = node(n, kicked=kicked)
+    found = []
+    for result in (passed, by_casadi(n, arguments)):
+        value = cost(result)
+        slopes = ca.Function("slopes", arguments, [ca.gradient(value, v) for v in arguments])
+        t = ca.MX.sym("t")
+        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
+        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
+        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+    for own, other in zip(*found, strict=True):
+        assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
+
+
 @pytest.mark.parametrize("kicked", [False, True])
 @pytest.mark.parametrize("every", [1, 2, STEPS])
 def test_values_alone_are_those_that_have_slopes(kicked, every):

@@ -205,50 +205,151 @@ static void back_reading_tangent(
     product(spare, A, n, n, n, P);
 }
 
+/* Slopes and their tangents: P and dP, or P = M C M' and dP = dM C M' + M C dM' with few columns; dM' (few x n) is kept. */
+typedef struct {
+    Slopes s;
+    double *dP, *dM;
+} Moved;
+
+static void write_out_tangent(const Moved *v, int n, double *RESTRICT dP) {
+    const int r = v->s.few;
+    const double *C = v->s.C;
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j <= i; ++j) {
+            double sum = 0.0;
+            for (int a = 0; a < r; ++a)
+                for (int b = 0; b < r; ++b) {
+                    const double *M = v->s.M + b * n, *one = v->s.M + a * n, *dM = v->dM + a * n;
+                    sum += C[a * r + b] * (dM[i] * M[j] + one[i] * v->dM[b * n + j]);
+                }
+            dP[i * n + j] = dP[j * n + i] = sum;
+        }
+}
+
+static int asked(const double *seed, size_t half) {
+    for (size_t t = 0; seed && t < half; ++t)
+        if (seed[t] != 0.0) return 1;
+    return 0;
+}
+
+/* All of P and dP from here on. */
+static void write_both(Moved *v, int n) {
+    if (!v->s.few) return;
+    write_out(&v->s, n, v->s.P);
+    write_out_tangent(v, n, v->dP);
+    v->s.few = 0;
+}
+
+/* `join` with tangents of the seeds. */
+static void join_tangents(Moved *v, int n, int *rows, const double *seed, const double *d_seed) {
+    const size_t half = (size_t)n * (n + 1) / 2, square = sizeof(double) * n * n;
+    const int moved = asked(d_seed, half);
+    if (!moved && !asked(seed, half)) return;
+    if (!v->s.any) {
+        memset(v->dP, 0, square), memset(v->dM, 0, square), memset(v->s.P, 0, square);
+        if (!moved) {
+            join(&v->s, n, rows, seed);
+            return;
+        }
+        v->s.any = 1;
+    }
+    write_both(v, n);
+    add_seed(n, seed, v->s.P);
+    if (moved) add_seed(n, d_seed, v->dP);
+}
+
+/* Tangents of slopes before a step and by its H: few columns. */
+static void few_tangents(const Kept *kept, int n, int k, Moved *v, double *RESTRICT spare, double *out1, double *out2) {
+    const Passage *p = &kept->p;
+    const int r = v->s.few, m = 2 * n;
+    const double *factor = p->factor + (size_t)k * n * n, *swaps = p->swaps + (size_t)k * n, *C = v->s.C;
+    const double *moved = kept->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
+    double *M = v->s.M, *dM = v->dM, *y = spare, *dy = y + m * r, *weighted = dy + m * r, *turned = weighted + m * r;
+    divide_few(factor, swaps, n, r, M);
+    for (int c = 0; c < r; ++c)
+        for (int i = 0; i < n; ++i) dM[c * n + i] -= dot(dX + (size_t)i * n, M + c * n, n); /* X dM = dM+ - dX M */
+    divide_few(factor, swaps, n, r, dM);
+    for (int stage = 0; stage < 2; ++stage) {
+        const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
+        double *out = stage ? out2 : out1, *other = turned + m * r;
+        if (!out) continue;
+        product_turned(Y, M, m, n, r, y);
+        product_turned(dY, M, m, n, r, dy);
+        product_turned(Y, dM, m, n, r, weighted);
+        for (int i = 0; i < m * r; ++i) dy[i] += weighted[i];
+        product(y, C, m, r, r, weighted);
+        product(dy, C, m, r, r, turned);
+        at_nonzeros(p, n, r, dy, weighted, out);
+        at_nonzeros(p, n, r, y, turned, other);
+        for (int q = 0; q < p->nnz; ++q) out[q] += other[q];
+    }
+}
+
+/* The same with all of P. */
+static void all_tangents(const Kept *kept, int n, int k, Moved *v, double *RESTRICT spare, double *out1, double *out2) {
+    const Passage *p = &kept->p;
+    const int m = 2 * n;
+    const double *moved = kept->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
+    double *P = v->s.P, *dP = v->dP, *left = spare + m * n, *other = left + m * n, *K = left;
+    congruent(p, n, k, P, spare);
+    congruent(p, n, k, dP, spare);
+    memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
+    divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, n, K);
+    product(K, P, n, n, n, spare);
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) dP[i * n + j] -= spare[i * n + j] + spare[j * n + i];
+    for (int stage = 0; stage < 2; ++stage) {
+        const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
+        double *out = stage ? out2 : out1;
+        if (!out) continue;
+        product(dY, P, m, n, n, left);
+        product(Y, dP, m, n, n, spare);
+        for (int i = 0; i < m * n; ++i) left[i] += spare[i];
+        at_nonzeros(p, n, n, left, Y, out);
+        product(Y, P, m, n, n, left);
+        at_nonzeros(p, n, n, left, dY, other);
+        for (int q = 0; q < p->nnz; ++q) out[q] += other[q];
+    }
+}
+
+/* Half-vector of the tangents of the slopes. */
+static void pack_tangents(const Moved *v, int n, double *RESTRICT spare, double *RESTRICT half) {
+    Slopes s = {0, v->s.any, v->s.few ? spare : v->dP, NULL, NULL};
+    if (v->s.any && v->s.few) write_out_tangent(v, n, spare);
+    pack_slopes(&s, n, spare, half);
+}
+
 /* How the slopes of `back` move along the tangents. */
 static void back_tangents(
     const Kept *kept, int n, const double *seed, const double *d_seed, double *d_by_first, double *d_by_h1, double *d_by_h2,
     double *d_by_told, double *d_by_kicks
 ) {
     const Passage *p = &kept->p;
-    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz;
-    const int m = 2 * n;
-    double *P = p->work, *dP = P + n * n, *K = dP + n * n, *spare = K + n * n, *left = spare + m * n, *other = left + m * n;
-    memset(P, 0, sizeof(double) * 2 * n * n);
+    const size_t square = (size_t)n * n, half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p);
+    double *work = p->work, *spare = work + 2 * square;
+    Moved v = {{0, 0, work, work + 11 * square, work + 12 * square}, work + square, work + 13 * square};
     for (int at = p->count - 1; at >= 0; --at) {
         const int k = p->place[at];
         const size_t column = at / p->every * half;
-        Slopes s = {0, 1, dP, NULL, NULL};
         if (at_end(p, at)) {
-            add_seed(n, seed + column, P);
-            if (d_seed) add_seed(n, d_seed + column, dP);
-            if (d_by_kicks) pack_slopes(&s, n, spare, d_by_kicks + column);
+            join_tangents(&v, n, p->chosen, seed + column, d_seed ? d_seed + column : NULL);
+            if (d_by_kicks) pack_tangents(&v, n, spare, d_by_kicks + column);
         }
         if (k < 0) {
-            back_reading_tangent(kept, n, -1 - k, P, dP, spare, d_by_told ? d_by_told + (-1 - k) * telling(p) : NULL);
+            double *own = d_by_told ? d_by_told + (-1 - k) * tells : NULL;
+            write_both(&v, n);
+            if (v.s.any)
+                back_reading_tangent(kept, n, -1 - k, v.s.P, v.dP, spare, own);
+            else if (own)
+                memset(own, 0, sizeof(double) * tells);
             continue;
         }
-        const double *moved = kept->moved + (size_t)k * 5 * n * n, *dX = moved + 2 * m * n;
-        congruent(p, n, k, P, spare);
-        congruent(p, n, k, dP, spare);
-        memcpy(K, dX, sizeof(double) * n * n); /* dP -= X^-1 dX P and its transpose */
-        divide(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, n, K);
-        product(K, P, n, n, n, spare);
-        for (int i = 0; i < n; ++i)
-            for (int j = 0; j < n; ++j) dP[i * n + j] -= spare[i * n + j] + spare[j * n + i];
-        for (int stage = 0; stage < 2; ++stage) {
-            const double *Y = (stage ? p->stage2 : p->stage1) + (size_t)k * m * n, *dY = moved + stage * m * n;
-            double *out = stage ? d_by_h2 : d_by_h1;
-            if (!out) continue;
-            product(dY, P, m, n, n, left);
-            product(Y, dP, m, n, n, spare);
-            for (int i = 0; i < m * n; ++i) left[i] += spare[i];
-            at_nonzeros(p, n, n, left, Y, out + k * nnz);
-            product(Y, P, m, n, n, left);
-            at_nonzeros(p, n, n, left, dY, other);
-            for (size_t q = 0; q < nnz; ++q) out[k * nnz + q] += other[q];
-        }
+        double *out1 = d_by_h1 ? d_by_h1 + k * nnz : NULL, *out2 = d_by_h2 ? d_by_h2 + k * nnz : NULL;
+        if (!v.s.any) {
+            if (out1) memset(out1, 0, sizeof(double) * nnz);
+            if (out2) memset(out2, 0, sizeof(double) * nnz);
+        } else
+            (v.s.few ? few_tangents : all_tangents)(kept, n, k, &v, spare, out1, out2);
     }
-    Slopes s = {0, 1, dP, NULL, NULL};
-    if (d_by_first) pack_slopes(&s, n, spare, d_by_first);
+    if (d_by_first) pack_tangents(&v, n, spare, d_by_first);
 }
