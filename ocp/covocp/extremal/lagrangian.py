@@ -35,7 +35,11 @@ def node_size(statement: Statement) -> int:
 
 
 def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
-    """The arguments of `second_order`: nodes and controls stacked, half-vectors at 0, T, parameters, multipliers."""
+    """The arguments of `second_order`: nodes and controls stacked, half-vectors at 0, T, parameters, multipliers, zeros.
+
+    The zeros stand where a tangent is none: CasADi asks what a node does with an argument that is zero by its form, in
+    a time that grows with its entries times their number.
+    """
     st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
     z, costate = t.x, costates.state
     if st.coupled:
@@ -45,6 +49,7 @@ def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
     return (
         *(np.concatenate([z.ravel(), t.u.ravel()]), t.e[0], t.duration, extremal.parameters, costate.T),
         *(m.final, final_matrices, m.start, m.end, m.instants, m.path.T, m.states.T, m.matrices.T),
+        np.zeros(2),
     )
 
 
@@ -77,6 +82,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
     final, final_e, start, end, instants = (ca.MX.sym(name, length) for name, length in lengths.items())
     lengths = {"path": st.path.size, "states": st.nx, "matrices": st.ne}
     path, states, matrices = (ca.MX.sym(name, length, n + 1) for name, length in lengths.items())
+    none = ca.MX.sym("none", 2)
     common = interval_columns(mesh, u, duration, p)
     x = z[: st.nx, :]
     if st.coupled:
@@ -86,7 +92,7 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         ends, fine, cost = nominal_interval(st, mesh.substeps, mesh.step).map(n)(z[:, :-1], *common)
         e = seen = ca.MX(0, n + 1)
         if st.matrices:
-            passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1])
+            passing = (st, mesh, x, fine, common, p, st.started(x[:, 0], p, e0)[1] + none[0])
             e, matrix_cost = matrices_along(*passing, passage=passed_by)
             seen = matrices_along(*passing)[0] if compiled_steps(mesh) and _sees_matrices(st, held) else e
             cost += matrix_cost
@@ -113,9 +119,10 @@ def second_order(statement: Statement, mesh: Mesh, held: Entries) -> tuple[ca.Fu
         own_rows.append(part.conditions.columns(places._replace(matrices=seen[:, k]), duration, p))
     rows["instants"] = ca.vertcat(ca.MX(0, 1), *own_rows)
     kept = [ca.vec(rows[kind])[list(positions)] for kind, positions in held if positions]
-    inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices]
+    inputs = [w, e0, duration, p, costate, final, final_e, start, end, instants, path, states, matrices, none]
     direction = ca.MX.sym("direction", w.shape[0])
-    product = ca.densify(ca.jtimes(ca.gradient(value, w), w, direction))
+    gradient = ca.gradient((1 + none[0]) * value, w)
+    product = ca.densify(ca.forward([gradient], [w, none], [[direction, ca.repmat(none[1], 2, 1)]])[0][0])
     jacobian = ca.jacobian(ca.vertcat(ca.MX(0, 1), *kept), w)
     return ca.Function("product", [*inputs, direction], [product]), ca.Function("held", inputs, [jacobian])
 
