@@ -30,6 +30,9 @@ from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.shooting import interval_columns, matrices_along
 from covocp.transcription.steps import full_interval, nominal_interval
 
+# Operations of the slopes of H up to which the four of a Runge-Kutta step are written out in scalars.
+WRITTEN_OUT = 2000
+
 
 def terminal_costates(extremal: Extremal) -> tuple[Array, Array]:
     """p(T) = k_x + l and the costate of the half-vectors at T, with all multipliers that act there."""
@@ -243,13 +246,14 @@ def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = T
         (costates at the end, stacked x and e at start, middle and end, given costates there, *common of the pair) ->
         costates at the start.
     """
-    symbolic: Any = statement.symbolic
     nx, size, behind = statement.nx, statement.nx + statement.ne, _behind(statement)
+    slope = state_slope(statement, cost=cost, matrices=matrices)
+    written_out = slope.is_a("SXFunction") and slope.n_instructions() <= WRITTEN_OUT
+    symbolic: Any = ca.SX if written_out else ca.MX
     after = symbolic.sym("after", size)
     points = [symbolic.sym(name, size) for name in ("z0", "zm", "z1")]
     given = [symbolic.sym(name, len(behind)) for name in ("k0", "km", "k1")]
-    pair = Interval.symbols(statement)
-    slope = state_slope(statement, cost=cost, matrices=matrices)
+    pair = Interval.symbols(statement, symbolic)
 
     def rate(costate: Expr, c: float) -> Expr:
         z, full = points[round(2 * (1 - c))], _with(costate, behind, given[round(2 * (1 - c))])
