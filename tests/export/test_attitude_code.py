@@ -9,7 +9,7 @@ import attitudes
 import casadi as ca
 import numpy as np
 import pytest
-from exports import FOLDER, STRICT
+from exports import FOLDER, QUICK
 
 import covocp as co
 from covocp.blocks import so3

@@ -10,7 +10,7 @@ import numpy as np
 import phased
 import phased_loops
 import pytest
-from exports import FOLDER, STRICT
+from exports import FOLDER, QUICK
 
 import covocp as co
 from covocp.export import CPackage, export_c
@@ -27,7 +27,7 @@ def bounced() -> co.PhasesSolution:
 @cache
 def package(precision: Any = "double") -> CPackage:
     made = export_c(bounced(), FOLDER / f"bounce_{precision}", name="bounce", precision=precision)
-    made.build(flags=STRICT)
+    made.build(flags=QUICK)
     return made
 
 
@@ -110,7 +110,7 @@ def test_three_phases_matrices_of_one_size_and_names_that_are_no_words_of_c() ->
         problems.append(ocp)
     solution = co.solve(co.Phases(problems), intervals=10, control="constant", **QUIET)
     made = export_c(solution, FOLDER / "legs")
-    made.build(flags=STRICT)
+    made.build(flags=QUICK)
     assert made.check(200).ok
     laws = made.python()
     times = np.append(solution.starts, np.linspace(0.01, solution.duration, 40))
@@ -129,7 +129,7 @@ def test_a_state_that_is_called_like_a_field_of_controllers_is_a_number() -> Non
     ocp.dynamics(x, u)
     ocp.minimize(running=u**2 + x**2)
     made = export_c(co.solve(ocp, intervals=10, **QUIET), FOLDER / "counted")
-    made.build(flags=STRICT)
+    made.build(flags=QUICK)
     assert made.python().sample(0.0)["index"] == 0.3
 
 

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from exports import FOLDER, PLANNER, STRICT, package
+from exports import FOLDER, PLANNER, QUICK, package
 
 import covocp as co
 from covocp.export import export_c
@@ -86,7 +86,7 @@ def test_a_problem_without_a_solution_is_not_called_solved():
     ocp.dynamics(v, a)
     ocp.minimize(running=0.5 * a**2)
     made = export_c(ocp, FOLDER / "double_integrator", intervals=10)
-    made.build(flags=[*STRICT, "-O1"])
+    made.build(flags=QUICK)
     planner = made.python()
     assert planner()["cost"] == pytest.approx(co.solve(ocp, intervals=10, progress=False).cost, rel=1e-6)
     assert planner.status == "OK"
@@ -102,7 +102,7 @@ def test_a_problem_without_a_solution_is_not_called_solved():
 def test_a_free_duration_stays_free():
     problem = brachistochrone.problem()
     made = export_c(problem, FOLDER / "brachistochrone", intervals=10)
-    made.build(flags=[*STRICT, "-O1"])
+    made.build(flags=QUICK)
     plan = made.python()()
     solution = co.solve(problem, intervals=10, progress=False, tolerance=1e-9)
     assert plan["cost"] == pytest.approx(solution.cost, rel=1e-8)
@@ -183,7 +183,7 @@ def test_a_plan_along_which_a_condition_has_no_value_is_none(value):
     ocp.subject_to(value(x), upper=2.0, name="level")
     ocp.minimize(running=(u + 0.1) ** 2)
     made = export_c(ocp, FOLDER / f"undefined_{value.__name__}", intervals=5)
-    made.build(flags=[*STRICT, "-O1"])
+    made.build(flags=QUICK)
     planner = made.python()
     np.testing.assert_allclose(planner(initial_x=0.5)["x"], 0.5 - 0.1 * np.linspace(0.0, 2.0, 6), atol=1e-6)
     assert planner.status == "OK"
