@@ -10,7 +10,7 @@ from fractions import Fraction
 import casadi as ca
 import numpy as np
 import pytest
-from exports import FOLDER, QUICK
+from exports import FOLDER
 
 import covocp as co
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
@@ -87,7 +87,7 @@ def test_costs_are_those_of_the_converged_optimum(case):
 def test_bryson_denham_in_c_reaches_its_closed_form(method):
     """Where the ends of the arc x = l are nodes the optimum is one of the transcription: 4/(9 l), to rounding."""
     made = export_c(bryson_denham.problem(), FOLDER / f"bryson_{method}", intervals=24, substeps=1, method=method)
-    made.build(flags=QUICK)
+    made.build(flags=["-Werror", "-O1"])
     planner = made.python()
     for limit in (1 / 9, 1 / 12):
         assert planner(limit=limit)["cost"] == pytest.approx(4 / (9 * limit), rel=CLOSED_FORM)

@@ -35,10 +35,10 @@ def node_size(statement: Statement) -> int:
 
 
 def arguments(extremal: Extremal, costates: Costates) -> tuple[Any, ...]:
-    """The arguments of `second_order`: nodes and controls stacked, half-vectors at 0, T, parameters, multipliers, zeros.
+    """The arguments of `second_order`: nodes and controls stacked, half-vectors at 0, T, parameters, multipliers.
 
-    The zeros stand where a tangent is none: CasADi asks what a node does with an argument that is zero by its form, in
-    a time that grows with its entries times their number.
+    At last zeros, which stand where a tangent is none: CasADi asks what a node does with an argument that is zero by
+    its form, in a time that grows with its entries times their number.
     """
     st, t, m = extremal.statement, extremal.trajectory, extremal.multipliers
     z, costate = t.x, costates.state
