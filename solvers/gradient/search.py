@@ -172,7 +172,7 @@ class Search:
             control.iterations += 1
 
     def _cleared(self, iterate: Iterate) -> Iterate:
-        """The iterate with controls that are zero where all of them are roundoff of their scales, and that costs no more.
+        """The iterate with controls of zero where all of them are roundoff of their scales, if that costs no more.
 
         Where the best control is none all terms of H_u fall with it, and none becomes small beside the others.
         """

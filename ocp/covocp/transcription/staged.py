@@ -125,9 +125,7 @@ def staged(
     )
 
 
-def interval_transitions(
-    statement: Statement, mesh: Mesh, x: Array, intervals: Interval
-) -> tuple[Array, Array, Array]:
+def interval_transitions(statement: Statement, mesh: Mesh, x: Array, intervals: Interval) -> tuple[Array, Array, Array]:
     """Slopes of the state after each interval by that before it and by the controls at its two ends.
 
     Args:
