@@ -1,10 +1,13 @@
-"""Slopes by several symbols in one sweep."""
+"""Operations by name, and slopes by several symbols in one sweep."""
+
+import operator
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from covocp.base.expressions import slopes_by
+from covocp.base.buffered import Buffered
+from covocp.base.expressions import minus, plus, slopes_by, times
 
 
 @pytest.mark.parametrize("symbolic", [ca.SX, ca.MX])
@@ -16,8 +19,44 @@ def test_slopes_by_several_symbols_are_the_derivatives_by_each(symbolic):
     slopes = slopes_by(value, (a, none, b, c))
     assert [slope.shape for slope in slopes] == [(2, 1), (2, 3), (1, 1), (2, 1)]
     function = ca.Function("slopes", [a, b, c, none], slopes)
-    at, times, angle = np.array([0.3, -1.2]), 1.7, np.array([0.4, 2.0])
-    found = [np.asarray(v.full()) for v in function(at, times, angle, np.zeros((2, 3)))]
-    expected = [times * S @ at + np.sin(angle), np.zeros((2, 3)), 0.5 * at @ S @ at, np.cos(angle) * at]
+    at, factor, angle = np.array([0.3, -1.2]), 1.7, np.array([0.4, 2.0])
+    found = [np.asarray(v.full()) for v in function(at, factor, angle, np.zeros((2, 3)))]
+    expected = [factor * S @ at + np.sin(angle), np.zeros((2, 3)), 0.5 * at @ S @ at, np.cos(angle) * at]
     for numbers, reference in zip(found, expected, strict=True):
         np.testing.assert_allclose(numbers.squeeze(), reference, rtol=1e-14)
+
+
+OPERATIONS = {plus: operator.add, minus: operator.sub, times: operator.mul}
+
+
+@pytest.mark.parametrize("combined", OPERATIONS, ids=lambda f: OPERATIONS[f].__name__)
+@pytest.mark.parametrize("symbolic", [ca.SX, ca.MX])
+def test_operations_by_name_are_those_of_the_operators(symbolic, combined):
+    """Of expressions of the same shape, of a number and a matrix, sparse ones, arrays, on either side."""
+    a, b, c = symbolic.sym("a", 2, 3), symbolic.sym("b", 2, 3), symbolic.sym("c")
+    sparse = symbolic.sym("s", ca.Sparsity.triplet(2, 3, [0, 1], [1, 2]))
+    others = [
+        b,
+        c,
+        sparse,
+        2,
+        0.5,
+        0.0,
+        np.float64(0.3),
+        ca.DM([[1.0, 2.0, 3.0], [0.0, -1.0, 4.0]]),
+        np.eye(2, 3),
+        True,
+    ]
+    rng = np.random.default_rng(0)
+    given = [rng.normal(size=v.nnz()) for v in (a, b, c, sparse)]
+    for other in others:
+        for pair in ((a, other), (other, a)):
+            found, known = combined(*pair), OPERATIONS[combined](*pair)
+            assert type(found) is type(known)
+            function = ca.Function("both", [a, b, c, sparse], [found, known])
+            assert function.sparsity_out(0) == function.sparsity_out(1)
+            results = Buffered(function)(*given)
+            np.testing.assert_array_equal(*results)
+    assert combined(3.0, 4) == OPERATIONS[combined](3.0, 4)
+    with pytest.raises(RuntimeError, match="imension"):
+        combined(a, symbolic.sym("d", 3, 2))

@@ -33,6 +33,18 @@ def test_a_part_is_an_interval_of_its_own():
     assert (part.duration, part.parameters) == (10.0, 7.0)
 
 
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+def test_the_controls_at_the_ends_are_those_at_the_ends(kind):
+    """Not the one at the start and what is between, which is one by rounding; and the whole of it is itself."""
+    interval = Interval(*(kind.sym(name) for name in Interval._fields))
+    assert interval.control(0.0) is interval.start
+    assert interval.control(1.0) is interval.end
+    assert interval.part(0.0, 1.0) is interval
+    last = interval.part(0.5, 1.0)
+    assert last.end is interval.end
+    assert ca.is_equal(last.s, interval.s + 0.5 * interval.ds, 4)
+
+
 def test_turned_round_twice_it_is_itself():
     back = WHOLE.turned()
     assert back.control(0.25) == WHOLE.control(0.75)

@@ -16,7 +16,9 @@ from covocp.solving.warm_start import make_guess
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import NLP
 from covocp.transcription.scales import choose_scales
-from covocp.transcription.staged import is_staged
+from covocp.transcription.shooting import interval_columns
+from covocp.transcription.staged import interval_transitions, is_staged
+from covocp.transcription.steps import nominal_interval
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.transcribing import transcribe
 
@@ -92,6 +94,25 @@ def test_gradient_by_differences():
     step = 1e-5
     ahead, behind = (float(function(w + sign * step * direction, p)[0]) for sign in (1, -1))
     assert (ahead - behind) / (2 * step) == pytest.approx(slope @ direction, rel=1e-8)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_transitions_of_single_intervals_are_the_jacobians_of_their_steps(case):
+    """At states that are no trajectory, by the state before and the controls at both ends."""
+    make, options = CASES[case]
+    statement = make().statement()
+    mesh = resolve_mesh(statement, Options(**options), statement.values)  # type: ignore[arg-type]
+    rng, n = np.random.default_rng(2), mesh.intervals
+    x, u = rng.normal(size=(statement.nx, n)), ca.DM(rng.normal(size=(statement.nu, mesh.control_nodes)))
+    intervals = interval_columns(mesh, u, ca.DM(1.7), ca.DM(statement.values))
+    found = interval_transitions(statement, mesh, x, intervals)
+    step = nominal_interval(statement, mesh.substeps, mesh.step)
+    symbols = step.mx_in()
+    slopes = [ca.densify(ca.jacobian(step(*symbols)[0], symbols[i])) for i in range(3)]
+    known = ca.Function("slopes", symbols, slopes).map(n)(x, *intervals)
+    for own, other in zip(found, known, strict=True):
+        expected = np.asarray(other.full()).reshape(statement.nx, n, -1).transpose(1, 0, 2)
+        assert np.abs(own - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
 def test_stages_of_curved_and_stiff_problems_are_not_taken():
