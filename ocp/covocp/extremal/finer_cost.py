@@ -25,6 +25,7 @@ from covocp.transcription.mesh import Mesh, control_places, readings_at, step_un
 from covocp.transcription.nlp import NLP, QUIET
 from covocp.transcription.remeshing import divided
 from covocp.transcription.scales import choose_scales
+from covocp.transcription.separable import slopes
 from covocp.transcription.trajectory import Trajectory
 from covocp.transcription.transcribing import transcribe
 
@@ -45,9 +46,11 @@ SETTINGS: dict[str, Any] = {
     "bound_frac": 1e-6,
     "bound_relax_factor": 1e-9,
     "fixed_variable_treatment": "make_parameter_nodual",
+    "perturb_always_cd": "yes",  # rows that say the same, as of constant controls at both ends of the last interval
 }
-# Scaled residual at which an iterate meets all constraints; a gain, relative, that is large whatever is left of it.
-MET, LARGE = 1e-6, 1e-3
+# Scaled residual at which an iterate meets all constraints; slope, in the same units, of an optimum: Ipopt passes over
+# it where multipliers are large; a gain, relative, that is large whatever is left of it.
+MET, LEVEL, LARGE = 1e-6, 1e-3, 1e-3
 # Costs below this count as zero.
 NO_COST = 1e-12
 
@@ -79,7 +82,7 @@ def _change(extremal: Extremal, size: float, within: Within | None) -> float | N
     """The same, where nothing fails."""
     st, t, parameters = extremal.statement, extremal.trajectory, extremal.parameters
     mesh, start = _finer(extremal)
-    nlp = transcribe(st, mesh, choose_scales(st, mesh, start, parameters))
+    nlp = transcribe(st, mesh, choose_scales(st, mesh, start, parameters), taken=within is None)
     w, p = nlp.pack(start), np.append(parameters, size)
     bounds = nlp.bounds(parameters)
     cost = nlp.f
@@ -92,6 +95,8 @@ def _change(extremal: Extremal, size: float, within: Within | None) -> float | N
             ends = slice(count * st.nx + last * st.ne, count * (st.nx + st.ne))
             cost += ca.dot(within.end_matrices * nlp.scales.e / size, nlp.w[ends] - w[ends])
     settings: dict[str, Any] = {**QUIET, "ipopt": SETTINGS}
+    if nlp.pieces:
+        settings |= slopes(nlp.pieces, nlp.w, nlp.p, nlp.g.shape[0], second=True, owner=st)
     solver = ca.nlpsol("finer", "ipopt", {"x": nlp.w, "p": nlp.p, "f": cost, "g": nlp.g}, settings)
     found = {name: np.asarray(value).ravel() for name, value in solver(x0=w, p=p, **bounds).items()}
     before = refined_run(st, extremal.mesh, t, parameters, 1).running
@@ -99,7 +104,10 @@ def _change(extremal: Extremal, size: float, within: Within | None) -> float | N
     gained = before / size - float(found["f"][0])
     if not np.isfinite(gained):
         return None
-    if not solver.stats()["success"]:  # one that meets all constraints shows what can be gained at least
+    stats: dict[str, Any] = solver.stats()
+    if not (
+        stats["success"] and stats["iterations"]["inf_du"][-1] <= LEVEL
+    ):  # one that meets all constraints shows what can be gained at least
         excess = np.maximum(bounds["lbg"] - found["g"], found["g"] - bounds["ubg"])
         return WHOLE * gained if gained > LARGE and excess.max(initial=0.0) < MET else None
     return WHOLE * abs(gained)
