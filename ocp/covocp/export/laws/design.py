@@ -80,6 +80,11 @@ class Design:
         return sum(times is None for times in self.instants)
 
     @property
+    def reads(self) -> bool:
+        """Whether something is read at instants."""
+        return self.always < self.sizes[2]
+
+    @property
     def reads_first(self) -> bool:
         """Whether something is read at time zero, where the covariance of the error jumps from the prior."""
         return any(times is not None and times[0] == 0.0 for times in self.instants)
@@ -90,6 +95,11 @@ class Design:
             ca.MX(1) if times is None else ca.mmin(ca.fabs(time - ca.DM(times))) <= margin for times in self.instants
         ]
         return ca.vertcat(ca.MX(0, 1), *rows)
+
+    def passed(self, begin: Expr, end: Expr) -> Any:
+        """Whether something is read after one time and before another; an MX expression."""
+        times = ca.DM(np.concatenate([own for own in self.instants if own is not None]))
+        return ca.mmax(ca.logic_and(times > begin, times < end))
 
     __repr__ = short_repr
 
