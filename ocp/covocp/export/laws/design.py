@@ -12,6 +12,7 @@ from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
 from covocp.statement.statement import Block, Statement
@@ -162,6 +163,21 @@ def design_of(solution: Solution, limits: Given) -> Design:
         measured=measured_blocks(statement),
         instants=_instants(statement, solution.duration),
     )
+
+
+def check_designed(solution: Solution) -> None:
+    """Refuse a solution that was evaluated under another truth: the laws are those of its design, and see no truth.
+
+    Raises:
+        ExportError: names it.
+    """
+    if solution.origin is Origin.OTHER_TRUTH:
+        raise ExportError(
+            "This solution was evaluated under other statistics, of which a controller knows nothing.",
+            expected="the solution of the design",
+            received=f"'{solution.name}', {solution.message}",
+            remedy="export the design, whose filter and feedback these are; feedback=False exports the histories alone",
+        )
 
 
 def check_measured(names: list[str], designs: list[Design]) -> None:
