@@ -12,6 +12,8 @@ import pytest
 
 import covocp as co
 from covocp.export import export_c
+from covocp.export.laws.law import CODES
+from covocp.export.text.self_test import reference
 from covocp.models import unknown_lag
 
 x, X = ca.MX.sym("x", 2), ca.SX.sym("x", 2)
@@ -73,7 +75,7 @@ def test_compiled_functions_are_refused(tmp_path: Path) -> None:
 def test_functions_of_which_nothing_would_be_compared_are_refused(values: list[ca.SX], tmp_path: Path) -> None:
     function = ca.Function("law", [X], values, ["x"], ["y", "z"][: len(values)])
     message = _refused(function, tmp_path, r"'law' has finite results at no point.*\n(.*\n)*.*ranges=")
-    assert "of 40 points none: 'y' is" in message
+    assert "of 80 points none: 'y' is" in message
 
 
 def test_ranges_say_where_a_function_has_values(tmp_path: Path) -> None:
@@ -158,3 +160,14 @@ def test_laws_named_like_what_a_mapping_has_are_items(tmp_path: Path) -> None:
         np.testing.assert_array_equal(laws[name]([1.0, 2.0]), [2.0, 4.0])
     assert dict(laws.items()) == {name: laws[name] for name in laws}
     assert laws.law is laws["law"]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_check_of_few_points_compares_something(count: int, tmp_path: Path) -> None:
+    """At zero, the first point, this function has no value."""
+    (law,) = export_c(ca.Function("law", [X], [1 / X], ["x"], ["y"]), tmp_path / "law").laws
+    known = reference(law, count, 0, "double")
+    assert known.rows.shape[0] == count
+    finite = known.status == CODES["OK"]
+    assert finite.any()
+    np.testing.assert_allclose(known.values[finite] * known.rows[finite], 1.0, rtol=1e-15)
