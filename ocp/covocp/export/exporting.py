@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from covocp.base.arguments import checked, mapping, optional, positive, truth
+from covocp.base.arguments import checked, mapping, optional, positive, texts_by_name, truth
 from covocp.base.errors import ExportError, no_export_option, warn_user
 from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
@@ -22,7 +22,7 @@ from covocp.export.compiled.folder import check_folder, check_names, package_fil
 from covocp.export.compiled.linking import Linking
 from covocp.export.compiled.package import CPackage
 from covocp.export.laws.controller import controller_law
-from covocp.export.laws.design import check_measured, design_of
+from covocp.export.laws.design import check_designed, check_measured, design_of
 from covocp.export.laws.functions import function_laws
 from covocp.export.laws.history import history
 from covocp.export.laws.law import Law, stacked_size
@@ -30,7 +30,7 @@ from covocp.export.laws.limits import warn_outside
 from covocp.export.laws.phase_controller import check_first_readings, legs_of, phases_controller
 from covocp.export.laws.phases import histories
 from covocp.export.laws.sampled import discretised, sampled_law
-from covocp.export.laws.solver import solver_law
+from covocp.export.laws.solver import OPTIONS, solver_law
 from covocp.export.laws.spread import LARGEST_SPREAD, check_flight, sampled_flight
 from covocp.export.laws.trajectory import sample_law
 from covocp.export.text.casadi_code import Generated, Sizes, generate
@@ -68,7 +68,7 @@ class Content:
     overwrite=truth,
     feedback=truth,
     ranges=optional(mapping),
-    units=optional(mapping),
+    units=optional(texts_by_name),
 )
 def export_c(
     what: Given,
@@ -122,7 +122,8 @@ def export_c(
     Raises:
         ExportError: something has no C code, a name, a precision or a folder is not possible, the loop does not hold
             what the solution predicts.
-        ProblemError: options of the mesh that mean nothing.
+        ProblemError: an option of another kind (overwrite, feedback, ranges, units), limits of unknown controls or that
+            mean nothing, values of the options of the mesh that mean nothing.
     """
     target, package = check_settings(directory, name=name, precision=precision, overwrite=overwrite, period=period)
     allowed = TOLERANCES[precision] if tolerance is None else _positive("tolerance", tolerance)
@@ -142,13 +143,14 @@ def export_c(
         _check_spread(largest_spread)
         content = _phases(what, precision, allowed, limits, feedback, largest_spread)
     elif isinstance(what, Problem):
-        _check_options("a problem", given, ("method",))
+        _check_options("a problem", given, ("method",), OPTIONS)
         content = _problem(what, precision, method, options, tolerance)
     else:
         _check_options("functions", {**given, **options}, ("ranges", "units"))
         content = _functions(what, ranges or {}, units or {}, allowed)
     check_identifiers(package, content.laws)
-    generated = generate(package, content.laws, precision)
+    linked = content.linking.header if content.linking is not None else ""
+    generated = generate(package, content.laws, precision, linked)
     return _written(package, target, precision, content, generated, tolerance)
 
 
@@ -230,6 +232,7 @@ def _solution(
     tables = history(solution, precision)
     laws = [sample_law(solution, tables, tolerance)]
     if solution.loop is not None and feedback:
+        check_designed(solution)
         check_begins(solution, "A controller")
         design = design_of(solution, limits)
         check_measured([solution.name], [design])
@@ -267,6 +270,8 @@ def _phases(
                 received=f"'{solution.name}', read from a file",
                 remedy="load(path, phases) with the phases that were solved",
             )
+        for phase in solution:
+            check_designed(phase)
         designs = [design_of(phase, own) for phase, own in zip(solution, limits_of_each(solution, limits), strict=True)]
         check_measured([phase.name for phase in solution], designs)
         check_first_readings(solution, designs)
@@ -335,9 +340,9 @@ def _work_bytes(law: Law, sizes: Sizes, precision: str) -> int:
     return BYTES[precision] * reals + 4 * (sizes.integers + 1) + POINTER * (sizes.arguments + sizes.results)
 
 
-def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    """Refuse options that mean nothing to what is exported."""
-    allowed = ("name", "precision", "overwrite", "tolerance", *known)
+def _check_options(what: str, given: Mapping[str, Any], known: tuple[str, ...], all_: tuple[str, ...] = ()) -> None:
+    """Refuse options that mean nothing to what is exported; `all_`: those that there are, where more are looked at."""
+    allowed = all_ or ("name", "precision", "overwrite", "tolerance", *known)
     for name, value in given.items():
         if value is not None and name not in known:
             raise no_export_option(what, name, value, allowed)

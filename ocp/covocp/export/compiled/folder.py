@@ -44,13 +44,20 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             target.lstat()
     except TypeError as error:
-        raise _refused(repr(directory), "the name of a folder", type(directory).__name__, "give a name") from error
+        raise _refused(_told(directory), "the name of a folder", type(directory).__name__, "give a name") from error
     except (OSError, ValueError) as error:  # too long, a null byte, a parent that may not be looked into
-        raise _refused(repr(directory)[:60], "a folder that can be made", str(error)[:200], "choose another") from error
+        raise _refused(_told(directory), "a folder that can be made", str(error)[:200], "choose another") from error
     _recover(target)
     parent = target.parent
     if target.exists() or target.is_symlink():
         whole = target.is_dir() and not target.is_symlink()
+        if overwrite and whole and _works_in(target):
+            raise _refused(
+                target.name,
+                "with overwrite=True: a folder that this process does not work in, as another takes its place",
+                f"{target}, which holds the current folder",
+                "os.chdir() to its parent before, and give the path from there; nothing was changed",
+            )
         if not overwrite:
             raise _refused(
                 target.name,
@@ -70,6 +77,20 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
     if not os.access(parent, os.W_OK):
         raise _refused(target.name, "a place that can be written to", str(parent), "choose another place")
     return target
+
+
+def _works_in(target: Path) -> bool:
+    """Whether the current folder of this process is a folder, or lies in it."""
+    try:
+        current = Path.cwd().resolve()
+    except OSError:  # it has none
+        return False
+    return target.resolve() in (current, *current.parents)
+
+
+def _told(directory: object) -> str:
+    """What was given as a folder, as it may stand between quotes."""
+    return repr(str(directory))[1:-1][:60]
 
 
 def package_files(package: str) -> tuple[str, ...]:

@@ -371,7 +371,8 @@ def _shaped(values: Array, port: Port) -> Any:
 class Laws(Mapping[str, Call]):
     """The laws of a package by name, also as attributes; calling it calls the principal one.
 
-    That is the controller, else the solver, else the first.
+    That is the controller, else the solver, else the first. As an attribute a law is not found where a mapping has one
+    of its name (`items`, `keys`, `values`, `get`), nor where it is called `principal`: it is as an item.
     """
 
     def __init__(self, calls: Mapping[str, Call]) -> None:

@@ -213,8 +213,9 @@ class CPackage:
     def python(self) -> Laws:
         """The compiled laws as functions of Python, through ctypes.
 
-        Each law by its name, as an attribute or an item; calling the whole calls the controller, else the solver, else
-        the first law. A controller has `init()`, `step(measurement, time)`, `state`; every law `status`.
+        Each law by its name, as an item, or as an attribute where a mapping has none of that name (such as `items` or
+        `get`) and it is not `principal`; calling the whole calls the controller, else the solver, else the first law.
+        A controller has `init()`, `step(measurement, time)`, `state`; every law `status`.
 
         The arguments of a solver are numbers or arrays, by position or by name, and those that are left out are those
         of the export: `initial_<state>` for each state with a fixed initial value, `initial_<matrix>` for each matrix

@@ -3,8 +3,10 @@
 The control that a step returns is held until the next one. A step from time s to t = s + h, with y the estimate of the
 deviation from the nominal, computes
 
-    y- :  y' = F y + G (u_held - u(time)) over [s, t], one step of the two-stage Gauss method: order 4, stable for any h
-    P- =  Phi E(s) Phi' + h Q                of the error before the measurement; Phi of the same step, E of the design
+    y- :  y' = F y + G (u_held - u(time)) over [s, t], a step of the two-stage Gauss method from each node of the mesh
+          to the next (`prediction`): order 4 where u jumps or has kinks too, stable for any h
+    P- :  P <- Phi P Phi' + d Q              of the error before the measurement, from E(s) of the design over the same
+                                             pieces, of lengths d and transitions Phi
     L  =  h P- M' (h M P- M' + U)^-1         K h to first order; the spectrum of L M is in [0, 1): stable for any h, and
                                              right where a first measurement tells more than all that was known before
     y+ =  y- + L (m - h(x, u, t) - M y- - H (u_held - u(t)))
@@ -12,11 +14,12 @@ deviation from the nominal, computes
 
 with F, G, Q, M, H, U and the measurement h expected there from the model's own functions along the nominal, and C at t.
 A measurement stands for the h seconds before it: white noise of density U, averaged over them. What is read at an
-instant has its variance in place of U/h.
+instant has its variance in place of U/h. Where it did not come E of the design is not what is known: P is kept then.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -24,37 +27,46 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.gains import innovation_gain
-from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
-from covocp.base.matrices import Array
-from covocp.base.quadrature import GAUSS_NODES, gauss_step
-from covocp.blocks.updates import without
+from covocp.base.matrices import Array, half_length, pack, pack_symbolic, unpack_symbolic
+from covocp.blocks.updates import joseph_form, without
 from covocp.export.laws.design import Design, measured_blocks
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, QUATERNION, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
+from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, Piece, next_piece, predicted, solved
 from covocp.export.laws.trajectory import times
 from covocp.statement.statement import Statement, entry_names, error_names
 
-# Up to this size linear systems are written out in scalars.
-SCALAR_SIZE = 8
+# What is kept of a step that is under way, and after an instant at which a reading did not come.
+ABOUT_KEPT = {
+    "elapsed": "how long a step has been under way that goes on after a node; 0 between two calls",
+    "spread": "half-vector of P, which counts in the place of E of the design within a step, and where overdue is 1",
+    "overdue": "1 where something that is read at an instant did not come, until all that is due at a later one does",
+}
 STATUSES = (
     "OK", "MEASUREMENT_MISSING", "TIME_BEFORE", "TIME_AFTER", "TIME_BACKWARDS", "TIME_NOT_FINITE", "ESTIMATE_LOST",
     "FAILED",
 )  # fmt: skip
-HELD = {"estimate": "estimate", "last": "time", "held": "control"}
+HELD = {
+    "estimate": "estimate", "last": "time", "held": "control", "elapsed": "elapsed", "spread": "spread",
+    "overdue": "overdue",
+}  # fmt: skip
 # Time or index of the last step before the first one, where something is read at time zero.
 NO_STEP = -1.0
 ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
-    "u), one step of the two-stage Gauss method, stable for any h; it is corrected by L (m - what is expected) with "
-    "L = h P M' (h M P M' + U)^-1, P = Phi E(s) Phi' + h Q the covariance of its error before; the control is u - C y.",
+    "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h; it is "
+    "corrected by L (m - what is expected) with L = h P M' (h M P M' + U)^-1, P the covariance of its error before: "
+    "from E(s) of the design, P becomes Phi P Phi' + d Q in each piece of length d; the control is u - C y.",
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
 ABOUT_INSTANTS = (
-    "Rows of the measurement that are read at instants count with their variance in the step in which they are finite; "
-    "NaN between the instants is no missing row.",
+    "Rows of the measurement that are read at instants count with their variance in every call in which they are "
+    "finite, in a second one at the same time as another reading: give each reading once, NaN after it. NaN between "
+    "the instants is no missing row. A reading that comes after its instant, or in a second call at it, is weighed by "
+    "what is known without it.",
 )
 ABOUT_FIRST = (
     "Something is read at time zero: give it to a first step at time zero, which corrects the estimate and the control "
@@ -67,101 +79,144 @@ ABOUT_ATTITUDES = (
 
 
 def controller_law(design: Design, tables: History, tolerance: float) -> Law:
-    """The law (estimate, last time, held control, measurement, time) -> control and all that the struct keeps."""
-    n, m, r = design.sizes
-    y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
-    measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
-    begun = ca.fmax(last, 0.0)
+    """The law (struct of the last step, measurement, time) -> control and all that the struct keeps."""
+    ports = input_ports(design)
+    symbols = {port.name: ca.MX.sym(port.name, port.size) for port in ports}
+    time, given = symbols["time"], Given.of(symbols)
+    begun = ca.fmax(given.last, 0.0)
     clock = tables.clock(time, begun)
     backwards = clock.time < begun
     valid = ca.if_else(backwards, 0.0, clock.within)
-    found = stepped(design, tables, (y, last, held, measured), clock.time, valid)
+    found = stepped(design, tables, given, clock.time, valid)
     conditions = [
         *clock.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(found.good), "ESTIMATE_LOST"),
         (found.missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
-    fields = {"time": ca.if_else(valid, clock.time, last), **found.fields, "status": status_of(conditions)}
-    inputs = [y, last, held, measured, time]
-    core = ca.Function("step", inputs, [flat(v) for v in fields.values()])
+    fields = {**found.fields, "status": ca.if_else(found.more, CONTINUE, status_of(conditions))}
+    core = ca.Function("step", list(symbols.values()), [flat(v) for v in fields.values()])
     return Law(
         name="step",
         kind="controller",
-        about=(*about(design), limits_text(design.statement, design.limits)),
-        notes=limits_notes(design.statement, design.limits),
-        constants=limit_constants(design.statement, design.limits),
+        about=(
+            *about(design, (*ABOUT, *(ABOUT_INSTANTS if design.reads else ()))),
+            limits_text(*(design.statement, design.limits)),
+        ),
+        notes=limits_notes(*(design.statement, design.limits)),
+        constants=limit_constants(*(design.statement, design.limits)),
         core=core,
-        inputs=input_ports(design),
+        inputs=ports,
         outputs=field_ports(design, fields),
         statuses=STATUSES,
-        held=HELD,
+        held={name: kept for name, kept in HELD.items() if name in symbols},
         start=first_fields(design, tables, fields, "time"),
         points=lambda random, count: points(design, tables, random, count),
         tolerance=tolerance,
     )
 
 
+class Given(NamedTuple):
+    """What a step begins with: the fields of the struct that it goes on from, and what is measured.
+
+    estimate; last: time of the last step (`NO_STEP`: there was none), or of the node that this one has come to; held:
+    control since then; measured; elapsed: how long this step has been under way already; spread: half-vector of P at
+    `last`, which counts in the place of E of the design where a step is under way or something is overdue; overdue: 1
+    where a reading that was due at an instant did not come.
+    """
+
+    estimate: Any
+    last: Any
+    held: Any
+    measured: Any
+    elapsed: Any
+    spread: Any
+    overdue: Any
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> Given:
+        """Of inputs by name; nothing is overdue where nothing is read at instants."""
+        estimate, last, held, measured = (values[name] for name in ("estimate", "last", "held", "measurement"))
+        kept = values["elapsed"], values["spread"], values.get("overdue", ca.MX(0))
+        return Given(estimate, last, held, measured, *kept)
+
+
 class Stepped(NamedTuple):
-    """What a step makes: fields of the struct by name, whether the estimate may be used, whether a row is missing."""
+    """What a step makes: fields of the struct by name, whether it goes on, whether the estimate may be used, whether a
+    row is missing.
+    """
 
     fields: dict[str, Any]
+    more: Any
     good: Any
     missing: Any
 
 
-def stepped(design: Design, tables: History, given: tuple[Any, ...], time: Expr, valid: Expr) -> Stepped:
-    """One step to a time.
+def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Expr) -> Stepped:
+    """One step to a time, or to the next node of the mesh where one lies before it.
 
     Args:
         design: the model.
         tables: the nominal.
-        given: estimate, time of the last step (`NO_STEP`: there was none), control held since, measurement.
+        given: what it begins with.
         time: within the range, no earlier than the last one [s].
         valid: where it is zero nothing is predicted, counted and fed back.
     """
-    y, last, held, measured = given
     m = design.sizes[1]
-    begun = ca.fmax(last, 0.0)
-    h = ca.if_else(valid, time - begun, 0.0)
-    middle = [begun + c * h for c in GAUSS_NODES]
-    before = design.error(tables.at(begun).e)
-    if design.reads_first:  # the tables have what is known after it
-        before = ca.if_else(last < 0.0, ca.DM(design.prior), before)
-    predicted, spread = _predict(design, (y, before, held), [tables.at(t) for t in middle], middle, h)
-    now = tables.at(time)
-    due = design.due(time, tables.margin * tables.duration)
-    taken = ca.if_else(valid, measured, 2.0 * LARGEST)  # what was read when nobody knows corrects nothing
-    corrected, C, L, missing = _corrected(design, (predicted, spread), (held, taken, h, due), now, time)
-    feedback = C @ corrected
-    good = finite(corrected, feedback)
+    piece = next_piece(tables, ca.fmax(given.last, 0.0), time, valid)
+    y, P = predicted(design, tables, (given.estimate, _known(design, tables, given, piece), given.held), piece)
+    # a prediction that overflows is not gone on with: the step ends with the nominal control of its time
+    more = ca.logic_and(piece.more, finite(y))
+    end = ca.if_else(more, piece.end, time)
+    now = tables.at(end)
+    due = design.due(end, tables.margin * tables.duration)
+    counts = ca.logic_and(valid, ca.logic_not(piece.more))
+    taken = ca.if_else(counts, given.measured, 2.0 * LARGEST)  # what was read when nobody knows corrects nothing
+    elapsed = given.elapsed + piece.length
+    found = _corrected(design, (y, P), (given.held, taken, elapsed, due), now, end)
+    feedback = found.C @ found.y
+    good = finite(found.y, feedback)
     nominal = now.u[:m]
     moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
     fields = {
-        "estimate": ca.if_else(good, corrected, y),
-        "control": clipped(moved, design.limits),
+        "time": ca.if_else(valid, end, given.last),
+        "estimate": ca.if_else(more, y, ca.if_else(good, found.y, given.estimate)),
+        "control": ca.if_else(more, given.held, clipped(moved, design.limits)),
         "nominal_state": now.x,
         "nominal_control": nominal,
-        "feedback_gain": C,
-        "filter_gain": L,
+        "feedback_gain": found.C,
+        "filter_gain": found.L,
+        "elapsed": ca.if_else(more, elapsed, 0.0),
+        "spread": ca.if_else(valid, ca.if_else(more, pack_symbolic(P), found.spread), given.spread),
     }
-    return Stepped(fields=fields, good=good, missing=missing)
+    if design.reads:
+        fields["overdue"] = ca.if_else(valid, _overdue(design, tables, given, (piece, more, end), found), given.overdue)
+    return Stepped(fields=fields, more=more, good=good, missing=found.missing)
 
 
-def about(design: Design, own: tuple[str, ...] = ABOUT) -> tuple[str, ...]:
-    """What is said of a law, with what is read at instants where something is."""
-    read = ABOUT_INSTANTS if design.always < design.sizes[2] else ()
+def _known(design: Design, tables: History, given: Given, piece: Piece) -> Any:
+    """Covariance of the error of the estimate where a piece begins."""
+    known = design.error(tables.at(piece.begin).e)
+    if design.reads_first:  # the tables have what is known after it
+        known = ca.if_else(given.last < 0.0, ca.DM(design.prior), known)
+    own = ca.logic_or(given.elapsed > 0.0, given.overdue) if design.reads else given.elapsed > 0.0
+    return ca.if_else(own, unpack_symbolic(given.spread, design.sizes[0]), known)
+
+
+def about(design: Design, own: tuple[str, ...]) -> tuple[str, ...]:
+    """What is said of a law, with what its attitudes are and that something is read at time zero."""
     turns = (ABOUT_ATTITUDES,) if any(block.tangent for block in design.statement.states) else ()
-    return (*own, *read, *turns, *(ABOUT_FIRST if design.reads_first else ()))
+    return (*own, *turns, *(ABOUT_FIRST if design.reads_first else ()))
 
 
-def finite(estimate: Expr, feedback: Expr) -> Any:
-    """Whether an estimate and the control that follows from it may be used; false for NaN, which mmax leaves out."""
-    return ca.sum1(ca.fabs(estimate)) + ca.sum1(ca.fabs(feedback)) <= LARGEST
+def finite(*values: Expr) -> Any:
+    """Whether an estimate, and the control that follows from it, may be used; false for NaN, which mmax leaves out."""
+    return sum(ca.sum1(ca.fabs(value)) for value in values) <= LARGEST
 
 
 def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
     n, m, r = design.sizes
-    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1}
+    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1, "spread": half_length(n)}
+    sizes |= {"overdue": 1} if design.reads else {}
     ports = {name: Port(name=name, rows=rows) for name, rows in sizes.items()}
     ports["measurement"] = measurement_port(design)
     ports["time"] = Port(name="time", unit="s", about="of the measurement")
@@ -178,8 +233,8 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     """Ports of the fields of the struct."""
     st, (n, m, r) = design.statement, design.sizes
     shapes = {"feedback_gain": (m, n), "filter_gain": (n, r), "estimate": (n, 1), "nominal_state": (st.nx, 1)}
-    shapes |= {"control": (m, 1), "nominal_control": (m, 1)}
-    units = {"time": "s"}
+    shapes |= {"control": (m, 1), "nominal_control": (m, 1), "spread": (half_length(n), 1)}
+    units = {"time": "s", "elapsed": "s"}
     about = {
         "time": "of the last step",
         "estimate": "of the deviation of the state (and of unknown constants) from the nominal",
@@ -188,6 +243,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
         "nominal_control": "the nominal at that time",
         "feedback_gain": "C",
         "filter_gain": "L of the last step; zero for rows that were left out",
+        **ABOUT_KEPT,
         "index": "of the last sample",
         "status": "of the last step",
     }
@@ -202,7 +258,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     for name in fields:
         rows, columns = shapes.get(name, (1, 1))
         unit, listed = units.get(name, ""), entries.get(name, ())
-        whole = name in ("index", "status")
+        whole = name in ("index", "overdue", "status")
         port = Port(name=name, rows=rows, columns=columns, unit=unit, about=about[name], entries=listed, whole=whole)
         ports.append(port)
     return tuple(ports)
@@ -237,51 +293,50 @@ def first_fields(
     return np.concatenate(list(zeros.values()))
 
 
-def solved(matrix: Expr, right: Expr) -> Any:
-    """matrix^-1 right: written out in scalars where the expressions are SX, by QR factors otherwise."""
-    return ca.solve(matrix, right) if isinstance(matrix, ca.SX) else linear_solve(matrix, right, COMPILED_SOLVER)
-
-
 def solved_in_units(spread: Expr, right: Expr) -> Any:
     """`solved` for a covariance, in units of its standard deviations."""
     units = ca.diag(1.0 / ca.sqrt(ca.diag(spread)))
     return units @ solved(units @ spread @ units, units @ right)
 
 
-def _predict(
-    design: Design, given: tuple[Any, Any, Any], nominal: list[Nominal], at: list[Any], h: Expr
-) -> tuple[Any, Any]:
-    """Estimate and covariance of its error before the measurement, computed in units of typical deviations.
+def _overdue(design: Design, tables: History, given: Given, until: tuple[Piece, Any, Any], found: _Corrected) -> Any:
+    """Whether P is another than the design expects, as something that is read at an instant did not come, 1 or 0.
 
     Args:
         design: the model.
-        given: estimate, covariance of its error and control held since the last step.
-        nominal: at both Gauss points of the step.
-        at: their times [s].
-        h: length of the step [s].
+        tables: the nominal.
+        given: what the step begins with.
+        until: the piece, whether the step goes on after it, where it is [s].
+        found: what the measurement told.
     """
-    st, (n, m, _) = design.statement, design.sizes
-    units, inverse = ca.diag(ca.DM(design.units)), ca.diag(1.0 / ca.DM(design.units))
-    kind = design.symbolic if n <= SCALAR_SIZE else ca.MX
-    own, error, du, dt = kind.sym("y", n), kind.sym("E", n, n), kind.sym("held", m), kind.sym("h")
-    symbols = [[kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("t")] for _ in at]
-    slopes = [design.model(*three)[:2] for three in symbols]
-    points = [dt * (inverse @ F @ units) for F, _ in slopes]
-    forcing = [dt * (inverse @ (G @ (du - three[1][:m]))) for (_, G), three in zip(slopes, symbols, strict=True)]
-    change, transition = gauss_step(points, forcing, inverse @ own, ca.DM.eye(n), solved)
-    value, move = own + units @ change, units @ transition @ inverse
-    spread = move @ error @ move.T + dt * design.noise(*symbols[1])
-    inputs = [own, error, du, dt, *symbols[0], *symbols[1]]
-    function = ca.Function("predict", inputs, [ca.densify(value), ca.densify(spread)])
-    nodes = [(now.x, now.u, t) for now, t in zip(nominal, at, strict=True)]
-    value, spread = function(*given, h, *nodes[0], *nodes[1])
-    return value, spread
+    piece, more, end = until
+    slack = tables.margin * tables.duration
+    # before the first step something that is read at time zero is still to come
+    missed = design.passed(
+        ca.if_else(given.last < 0.0, given.last, piece.begin + slack), ca.if_else(more, end + slack, end - slack)
+    )
+    late = ca.logic_or(missed, ca.if_else(more, 0.0, found.late))
+    return ca.if_else(late, 1.0, ca.if_else(ca.logic_and(found.came, ca.logic_not(more)), 0.0, given.overdue))
+
+
+class _Corrected(NamedTuple):
+    """Estimate after the measurement, feedback gain, filter gain, half-vector of P after it, whether a row is missing;
+    whether one of those that are due at an instant is, and whether all of these came.
+    """
+
+    y: Any
+    C: Any
+    L: Any
+    spread: Any
+    missing: Any
+    late: Any
+    came: Any
 
 
 def _corrected(
     design: Design, predicted: tuple[Any, Any], given: tuple[Any, ...], now: Nominal, time: Expr
-) -> tuple[Any, ...]:
-    """Estimate after the measurement, feedback gain, filter gain, whether a row of the measurement is missing.
+) -> _Corrected:
+    """What a measurement tells.
 
     Args:
         design: the model.
@@ -290,7 +345,7 @@ def _corrected(
         now: the nominal.
         time: of the measurement.
     """
-    st, (n, m, r) = design.statement, design.sizes
+    st, (n, m, r), always = design.statement, design.sizes, design.always
     kind = design.symbolic if r <= SCALAR_SIZE else ca.MX
     y, held, measured, h = kind.sym("y", n), kind.sym("held", m), kind.sym("measurement", r), kind.sym("h")
     due = kind.sym("due", r)
@@ -300,19 +355,25 @@ def _corrected(
     E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
     if r == 0:  # a phase that measures nothing: prediction alone, which the feedback goes on acting on
         gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C)])
-        return predicted[0], gain(now.x, now.u, now.e, time), ca.MX(n, 0), ca.MX(0)
+        C, none = gain(now.x, now.u, now.e, time), ca.MX(0)
+        return _Corrected(predicted[0], C, ca.MX(n, 0), pack_symbolic(predicted[1]), none, none, none)
     present = ca.fabs(measured) <= LARGEST
     residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
-    if design.always == r:
+    if not design.reads:
         L, _ = innovation_gain(h * E, *without(present, M, U), solved_in_units)
+        after = E  # P after the last piece: the next step begins with that of the design
     else:  # sqrt(h) of what is measured all the time, so that its noise is U; what is read has its variance
-        roots = ca.vertcat(ca.repmat(ca.sqrt(h), design.always, 1), kind.ones(r - design.always))
-        L, _ = innovation_gain(E, *without(present, ca.diag(roots) @ M, U), solved_in_units)
+        roots = ca.vertcat(ca.repmat(ca.sqrt(h), always, 1), kind.ones(r - always))
+        rows, noise = without(present, ca.diag(roots) @ M, U)
+        L, _ = innovation_gain(E, rows, noise, solved_in_units)
+        after = joseph_form(E, L, rows, noise)
         L = L @ ca.diag(roots)
-    missing = ca.sum1(due * (1 - present)) > 0
-    outputs = [ca.densify(v) for v in (y + L @ residual, C, L, missing)]
+    absent = due * (1 - present)
+    late = ca.sum1(absent[always:]) > 0
+    flags = [ca.sum1(absent) > 0, late, ca.logic_and(ca.sum1(due[always:]) > 0, ca.logic_not(late))]
+    outputs = [ca.densify(v) for v in (y + L @ residual, C, L, pack_symbolic(after), *flags)]
     function = ca.Function("correct", [y, E, held, measured, h, due, x, u, e, t], outputs)
-    return tuple(function(*predicted, *given, now.x, now.u, now.e, time))
+    return _Corrected(*function(*predicted, *given, now.x, now.u, now.e, time))
 
 
 def points(design: Design, tables: History, random: np.random.Generator, count: int) -> Array:
@@ -341,6 +402,12 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
         first = random.uniform(size=count) < 0.2
         last[first] = NO_STEP
         time[first & (random.uniform(size=count) < 0.5)] = 0.0
+    kept = pack(np.array([E[:, k * n : (k + 1) * n] for k in range(count)]))
+    under_way = random.uniform(size=count) < 0.2
+    rows[:, span(ports, "spread")] = kept * random.uniform(0.5, 2.0, (count, 1))
+    rows[:, span(ports, "elapsed")] = (under_way * steps)[:, None]
+    if design.reads:
+        rows[:, span(ports, "overdue")] = random.uniform(size=(count, 1)) < 0.2
     rows[:, span(ports, "last")] = last[:, None]
     rows[:, span(ports, "time")] = time[:, None]
     for k, wrong in zip(range(count // 3, count), (np.nan, np.inf, -np.inf, 1e200, np.nan, 1e29), strict=False):

@@ -12,6 +12,7 @@ from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, unpack, unpack_symbolic
 from covocp.base.short_repr import short_repr
+from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 from covocp.statement.names import control_limits
 from covocp.statement.statement import Block, Statement
@@ -80,6 +81,11 @@ class Design:
         return sum(times is None for times in self.instants)
 
     @property
+    def reads(self) -> bool:
+        """Whether something is read at instants."""
+        return self.always < self.sizes[2]
+
+    @property
     def reads_first(self) -> bool:
         """Whether something is read at time zero, where the covariance of the error jumps from the prior."""
         return any(times is not None and times[0] == 0.0 for times in self.instants)
@@ -90,6 +96,11 @@ class Design:
             ca.MX(1) if times is None else ca.mmin(ca.fabs(time - ca.DM(times))) <= margin for times in self.instants
         ]
         return ca.vertcat(ca.MX(0, 1), *rows)
+
+    def passed(self, begin: Expr, end: Expr) -> Any:
+        """Whether something is read after one time and before another; an MX expression."""
+        times = ca.DM(np.concatenate([own for own in self.instants if own is not None]))
+        return ca.mmax(ca.logic_and(times > begin, times < end))
 
     __repr__ = short_repr
 
@@ -152,6 +163,21 @@ def design_of(solution: Solution, limits: Given) -> Design:
         measured=measured_blocks(statement),
         instants=_instants(statement, solution.duration),
     )
+
+
+def check_designed(solution: Solution) -> None:
+    """Refuse a solution that was evaluated under another truth: the laws are those of its design, and see no truth.
+
+    Raises:
+        ExportError: names it.
+    """
+    if solution.origin is Origin.OTHER_TRUTH:
+        raise ExportError(
+            "This solution was evaluated under other statistics, of which a controller knows nothing.",
+            expected="the solution of the design",
+            received=f"'{solution.name}', {solution.message}",
+            remedy="export the design, whose filter and feedback these are; feedback=False exports the histories alone",
+        )
 
 
 def check_measured(names: list[str], designs: list[Design]) -> None:

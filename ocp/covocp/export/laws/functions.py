@@ -32,12 +32,13 @@ def function_laws(
         ExportError: a function without outputs, two of the same name, a range or unit of nothing.
     """
     laws, names = [], set[str]()
-    known = {name for f in functions for name in (*f.name_in(), *f.name_out())}
-    for what, given in (("ranges", ranges), ("units", units)):
+    inputs = {name for f in functions for name in f.name_in()}
+    both = inputs | {name for f in functions for name in f.name_out()}
+    for what, given, known, kind in (("ranges", ranges, inputs, "input"), ("units", units, both, "input or output")):
         for name in given:
             if name not in known:
                 raise ExportError(
-                    f"{what} names '{name}', which is no input or output.",
+                    f"{what} names '{name}', which is no {kind}.",
                     expected="one of " + ", ".join(sorted(known)),
                     received=repr(name),
                     remedy=f"correct {what}=",

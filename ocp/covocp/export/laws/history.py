@@ -93,6 +93,10 @@ class History:
         """A time made safe; one that is not finite becomes `fallback`."""
         return clock(time, self.duration, self.margin, fallback)
 
+    def node_after(self, time: Expr) -> Any:
+        """The first node after a time before the end, the end where there is none; an MX expression."""
+        return ca.MX(ca.DM(self.nodes))[_piece(self.nodes, time) + 1]
+
     def at(self, time: Expr) -> Nominal:
         """The nominal at a time within [0, T], an MX expression."""
         k = _piece(self.knots, time)

@@ -1,10 +1,10 @@
 """Filter and feedback through several phases as one law, for any time between two steps.
 
-Within a phase a step is that of its own controller, in the time of the phase. A step that reaches the end of a phase or
-goes beyond it passes the junction: the estimate y of the deviation is predicted to the end with the control that is
-held, goes on as J y, J the tangent of the jump along the nominal (zero for what appears: it starts at its mean), and
-the later phase goes on from there. Of the controls the later phase holds those of the same name as they were, the
-others as its nominal begins.
+Within a phase a step is that of its own controller, in the time of the phase, piece by piece from node to node. A step
+that reaches the end of a phase or goes beyond it passes the junction: the estimate y of the deviation is predicted to
+the end with the control that is held, goes on as J y, J the tangent of the jump along the nominal (zero for what
+appears: it starts at its mean), and the later phase goes on from there. Of the controls the later phase holds those of
+the same name as they were, the others as its nominal begins.
 
 A reading stands for the time before it. A step exactly where two phases meet takes that of the earlier one, which ends
 there, and gives out the control of the later one. A step across a junction takes that of the later phase, for the time
@@ -16,6 +16,7 @@ reading is ignored.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,13 +25,26 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, half_length
 from covocp.base.short_repr import short_repr
-from covocp.export.laws.controller import ABOUT, HELD, STATUSES, about, first_fields, points, stepped, with_units
+from covocp.export.laws.controller import (
+    ABOUT,
+    ABOUT_INSTANTS,
+    ABOUT_KEPT,
+    HELD,
+    STATUSES,
+    Given,
+    about,
+    first_fields,
+    points,
+    stepped,
+    with_units,
+)
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History, clock
 from covocp.export.laws.law import RETURNED, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import limit_constants, limits_notes, limits_text
+from covocp.export.laws.prediction import CONTINUE
 from covocp.solution.phases import PhasesSolution
 from covocp.statement.statement import entry_names
 
@@ -45,7 +59,6 @@ ABOUT_PHASES = (
     "phase at that time or, outside of it, at its nearer end. Time, phase, estimate and control of the struct stay, "
     "so the next step computes what it would have computed without this one.",
 )
-FIELDS = ("estimate", "control", "nominal_state", "nominal_control", "feedback_gain", "filter_gain")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,21 +83,39 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Room:
-    """Sizes that are enough for every phase: estimate, control, measurement, state."""
+    """Sizes that are enough for every phase: estimate, control, measurement, state; whether one reads at instants."""
 
     n: int
     m: int
     r: int
     nx: int
+    reads: bool
 
     __repr__ = short_repr
 
     @property
     def shapes(self) -> dict[str, tuple[int, int]]:
-        """Of the fields."""
+        """Of the fields but time, phase and status, in their order."""
         n, m = self.n, self.m
         shapes = {"estimate": (n, 1), "control": (m, 1), "nominal_state": (self.nx, 1), "nominal_control": (m, 1)}
-        return {**shapes, "feedback_gain": (m, n), "filter_gain": (n, self.r)}
+        shapes |= {
+            "feedback_gain": (m, n),
+            "filter_gain": (n, self.r),
+            "elapsed": (1, 1),
+            "spread": (half_length(n), 1),
+        }
+        return shapes | ({"overdue": (1, 1)} if self.reads else {})
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(self.shapes)
+
+    @property
+    def kept(self) -> dict[str, int]:
+        """Sizes of the inputs that a struct keeps, but the time of the last step."""
+        shapes = self.shapes
+        return {name: shapes[field][0] for name, field in HELD.items() if field in shapes}
 
 
 def legs_of(
@@ -158,14 +189,18 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
     return Law(
         name="step",
         kind="controller",
-        about=(*about(legs[0].design, ABOUT), *ABOUT_PHASES, *_limits(legs)),
+        about=(
+            *about(legs[0].design, (*ABOUT, *(ABOUT_INSTANTS if room.reads else ()))),
+            *ABOUT_PHASES,
+            *_limits(legs),
+        ),
         notes=_notes(legs),
         constants=_constants(legs),
         core=_core(legs, room, duration, margin),
         inputs=_inputs(legs, room),
         outputs=_outputs(legs, room),
         statuses=STATUSES,
-        held=HELD,
+        held={name: field for name, field in HELD.items() if field in ("time", *room.fields)},
         returned=RETURNED,
         start=_first(legs[0], room),
         points=lambda random, count: _points(legs, room, duration, random, count),
@@ -174,53 +209,56 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
 
 
 def _core(legs: tuple[Leg, ...], room: _Room, duration: float, margin: float) -> ca.Function:
-    """(estimate, last, held, measurement, time) -> fields, control that is handed out, status."""
-    y, last, held = ca.MX.sym("estimate", room.n), ca.MX.sym("last"), ca.MX.sym("held", room.m)
-    measured, time = ca.MX.sym("measurement", room.r), ca.MX.sym("time")
-    starts = [leg.start for leg in legs]
-    now = clock(time, duration, margin, last)
+    """(inputs of the law) -> fields, control that is handed out, status.
+
+    One call goes to the next node of the mesh, over a junction, or to the time that is asked for.
+    """
+    symbols = {port.name: ca.MX.sym(port.name, port.size) for port in _inputs(legs, room)}
+    own = {name: symbols[name] for name in room.kept}
+    last, measured = symbols["last"], symbols["measurement"]
+    starts, lengths = ca.MX(ca.DM([leg.start for leg in legs])), ca.MX(ca.DM([leg.tables.duration for leg in legs]))
+    now = clock(symbols["time"], duration, margin, last)
     asked = now.time
-    for start in starts[1:]:
-        asked = ca.if_else(ca.fabs(asked - start) <= margin * duration, start, asked)
+    for leg in legs[1:]:
+        asked = ca.if_else(ca.fabs(asked - leg.start) <= margin * duration, leg.start, asked)
     backwards = asked < last
     valid = ca.if_else(backwards, 0.0, now.within)
-    before, after = (sum((t >= start for start in starts[1:]), ca.MX(0)) for t in (last, asked))
+    before, after = (sum((t >= leg.start for leg in legs[1:]), ca.MX(0)) for t in (last, asked))
     after = ca.if_else(valid, after, before)  # a time that is not valid must not lead out of the phase
-    begun = ca.MX(ca.DM(starts))
-    meets = ca.logic_and(asked == begun[after], before < after)
-    at = ca.if_else(ca.logic_and(valid, before < after), 0.0, last - begun[before])
-    own, kept, good, missing = y, held, ca.MX(1), ca.MX(0)
-    for k, leg in enumerate(legs[:-1]):
-        crosses = ca.logic_and(valid, ca.logic_and(before <= k, after > k))
-        reads = ca.logic_and(meets, after == k + 1)
-        since = ca.if_else(before == k, last - leg.start, 0.0)
-        reading = ca.if_else(reads, measured, np.nan)
-        across: Any = ca.Function.if_else(f"across_{k}", _crossing(leg, legs[k + 1], room), _staying(room))
-        own, kept, fine, unread = across(crosses, own, since, kept, reading)
-        good, missing = ca.logic_and(good, fine), ca.logic_or(missing, ca.logic_and(reads, unread))
+    crosses = before < after
     steps = [_step(leg, room) for leg in legs]
+    over = [_crossing(legs[k : k + 2], steps[k + 1], room, k) for k in range(len(legs) - 1)]
+    leave: Any = ca.Function.conditional("leave", over, _staying(room))
+    meets = ca.logic_and(asked == starts[after], after == before + 1)
+    since = ca.fmin(last - starts[before], lengths[before])  # of a struct that was never set
+    left = leave(ca.if_else(crosses, before, len(over)), *own.values(), since, measured, meets)
+    lost = ca.logic_and(crosses, ca.logic_not(left[-2]))  # then the later phase begins with its nominal
+    own |= {name: ca.if_else(crosses, 0.0, own[name]) for name in ("estimate", "overdue") if name in own}
     which: Any = ca.Function.conditional("which", steps[:-1], steps[-1])
-    inside = ca.fmin(ca.fmax(asked - begun[after], 0.0), ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])
-    at = ca.fmin(at, ca.MX(ca.DM([leg.tables.duration for leg in legs]))[after])  # of a struct that was never set
-    *fields, fine, unread = which(after, own, at, kept, ca.if_else(meets, np.nan, measured), inside, valid)
-    found = dict(zip(FIELDS, fields, strict=True))
-    good = ca.logic_and(good, fine)
-    missing = ca.logic_or(missing, ca.logic_and(ca.logic_not(meets), unread))
-    found["estimate"] = ca.if_else(valid, found["estimate"], y)
+    inside = ca.fmin(ca.fmax(asked - starts[after], 0.0), lengths[after])
+    flies = ca.logic_and(valid, ca.logic_not(crosses))
+    gone = which(after, *own.values(), ca.if_else(crosses, inside, since), measured, inside, flies)
+    gone = [ca.if_else(ca.logic_and(gone[-3], flies), starts[after] + gone[0], asked), after, *gone[1:]]
+    crossed = ca.logic_and(crosses, ca.logic_not(lost))
+    time, phase, *fields, more, good, missing = (ca.if_else(crossed, a, b) for a, b in zip(left, gone, strict=True))
     conditions = [
-        *now.conditions, (backwards, "TIME_BACKWARDS"), (ca.logic_not(good), "ESTIMATE_LOST"),
-        (missing, "MEASUREMENT_MISSING"),
+        *now.conditions, (backwards, "TIME_BACKWARDS"),
+        (ca.logic_or(lost, ca.logic_not(good)), "ESTIMATE_LOST"), (missing, "MEASUREMENT_MISSING"),
     ]  # fmt: skip
+    found = dict(zip(room.fields, fields, strict=True))
     given = found["control"]  # kept where the time is valid: the next step must not depend on one that is not
-    found["control"] = ca.if_else(valid, given, held)
-    outputs = [ca.if_else(valid, asked, last), after, *found.values(), given, status_of(conditions)]
-    return ca.Function("step", [y, last, held, measured, time], outputs)
+    for name in room.kept:
+        found[HELD[name]] = ca.if_else(valid, found[HELD[name]], symbols[name])
+    status = ca.if_else(more, CONTINUE, status_of(conditions))
+    outputs = [ca.if_else(valid, time, last), phase, *found.values(), given, status]
+    return ca.Function("step", list(symbols.values()), outputs)
 
 
 def _room(legs: tuple[Leg, ...]) -> _Room:
     """What is enough for all phases."""
     n, m, r = (max(leg.design.sizes[k] for leg in legs) for k in range(3))
-    return _Room(n=n, m=m, r=r, nx=max(leg.design.statement.nx for leg in legs))
+    nx, reads = max(leg.design.statement.nx for leg in legs), any(leg.design.reads for leg in legs)
+    return _Room(n=n, m=m, r=r, nx=nx, reads=reads)
 
 
 def _padded(value: Expr, rows: int, columns: int = 1) -> Any:
@@ -232,43 +270,67 @@ def _padded(value: Expr, rows: int, columns: int = 1) -> Any:
     return result
 
 
-def _given(leg: Leg, room: _Room) -> tuple[list[Any], tuple[Any, ...]]:
-    """Estimate, time of the last step in the phase, control held, measurement: with room, and what the phase takes."""
+def _given(leg: Leg, room: _Room) -> tuple[list[Any], Given]:
+    """What is kept, time of the last step in the phase, measurement: with room, and what the phase takes of it."""
     n, m, r = leg.design.sizes
-    sizes = (room.n, 1, room.m, room.r)
-    names = ("estimate", "last", "held", "measurement")
-    symbols = [ca.MX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
-    y, last, held, measured = symbols
-    return symbols, (y[:n], last, held[:m], measured[:r])
+    sizes = {**room.kept, "last": 1, "measurement": room.r}
+    symbols = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    own = {"estimate": n, "held": m, "spread": half_length(n), "measurement": r}
+    taken = {name: symbol[: own.get(name, 1)] for name, symbol in symbols.items()}
+    return list(symbols.values()), Given.of(taken)
+
+
+def _fields(leg: Leg, room: _Room, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a phase with room; nothing is overdue where nothing is read at instants."""
+    return {name: flat(_padded(found.get(name, ca.MX(0)), *room.shapes[name])) for name in room.fields}
 
 
 def _step(leg: Leg, room: _Room) -> ca.Function:
-    """(estimate, last, held, measurement, time, valid) -> fields with room, whether good, whether a row is missing."""
+    """(what is kept, last, measurement, time, valid) -> time in the phase, fields with room, whether the step goes on,
+    whether the estimate is good, whether a row is missing.
+    """
     symbols, given = _given(leg, room)
     time, valid = ca.MX.sym("time"), ca.MX.sym("valid")
     found = stepped(leg.design, leg.tables, given, time, valid)
-    fields = [flat(_padded(found.fields[name], *room.shapes[name])) for name in FIELDS]
-    return ca.Function(f"step_{leg.part}", [*symbols, time, valid], [*fields, found.good, found.missing])
+    values = [found.fields["time"], *_fields(leg, room, found.fields).values(), found.more, found.good, found.missing]
+    return ca.Function(f"step_{leg.part}", [*symbols, time, valid], [ca.densify(value) for value in values])
 
 
-def _crossing(leg: Leg, later: Leg, room: _Room) -> ca.Function:
-    """(estimate, last, held, measurement) -> estimate and control where the later phase begins, good, missing."""
-    symbols, given = _given(leg, room)
+def _crossing(legs: tuple[Leg, ...], begins: ca.Function, room: _Room, k: int) -> ca.Function:
+    """(what is kept, last, measurement, whether the step ends where the phases meet) -> time, phase, fields and so on.
+
+    Args:
+        legs: the phase that is left, and the later one.
+        begins: a step of the later phase.
+        room: sizes that are enough for every phase.
+        k: number of the phase that is left.
+    """
+    (leg, later), (symbols, given) = legs, _given(legs[0], room)
     assert leg.tangent is not None
+    meets = ca.MX.sym("meets")
+    given = given._replace(measured=ca.if_else(meets, given.measured, np.nan))
     found = stepped(leg.design, leg.tables, given, ca.MX(leg.tables.duration), ca.MX(1))
-    estimate = ca.DM(leg.tangent) @ found.fields["estimate"]
     control = ca.MX(ca.DM(later.begun))
     for row, own in leg.kept:
-        control[row] = symbols[2][own]
-    values = [_padded(estimate, room.n), _padded(control, room.m), found.good, found.missing]
-    return ca.Function(f"across_{leg.part}", symbols, [ca.densify(value) for value in values])
+        control[row] = given.held[own]
+    entered = {"estimate": ca.DM(leg.tangent) @ found.fields["estimate"], "control": control}
+    start = {name: _padded(entered.get(HELD[name], ca.MX(0)), size) for name, size in room.kept.items()}
+    ready = dict(zip(room.fields, begins(*start.values(), 0.0, np.nan, 0.0, 1.0)[1:-3], strict=True))
+    on = {**ready, **_fields(later, room, entered)}  # goes on from there
+    within, more = _fields(leg, room, found.fields), found.more
+    fields = [ca.if_else(more, within[f], ca.if_else(meets, ready[f], on[f])) for f in room.fields]
+    time = ca.if_else(more, leg.start + found.fields["time"], later.start)
+    goes_on = ca.logic_or(more, ca.logic_not(meets))
+    values = [time, k + ca.logic_not(more), *fields, goes_on, found.good, found.missing]
+    return ca.Function(f"over_{leg.part}", [*symbols, meets], [ca.densify(value) for value in values])
 
 
 def _staying(room: _Room) -> ca.Function:
-    """The same where a step does not reach the end of the phase."""
-    y, held = ca.MX.sym("estimate", room.n), ca.MX.sym("held", room.m)
-    last, measured = ca.MX.sym("last"), ca.MX.sym("measurement", room.r)
-    return ca.Function("stay", [y, last, held, measured], [y, held, ca.MX(1), ca.MX(0)])
+    """The same where a step does not reach the end of the phase: nothing that would count."""
+    sizes = {**room.kept, "last": 1, "measurement": room.r, "meets": 1}
+    symbols = [ca.MX.sym(name, size) for name, size in sizes.items()]
+    fields = [ca.MX.zeros(rows * columns) for rows, columns in (room.shapes[name] for name in room.fields)]
+    return ca.Function("stay", symbols, [ca.MX(0), ca.MX(0), *fields, ca.MX(0), ca.MX(1), ca.MX(0)])
 
 
 def _entries(names: list[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
@@ -292,6 +354,7 @@ def _inputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
         Port(name="held", rows=room.m),
         Port(name="measurement", rows=room.r, entries=measured),
         Port(name="time", unit="s", about="of the measurement, since the first phase began"),
+        *(Port(name=name, rows=size) for name, size in room.kept.items() if name in ABOUT_KEPT),
     )
 
 
@@ -316,11 +379,14 @@ def _outputs(legs: tuple[Leg, ...], room: _Room) -> tuple[Port, ...]:
         "nominal_control": ("the nominal at that time", controls),
         "feedback_gain": ("C", ()),
         "filter_gain": ("L of the last step; zero for rows that were left out", ()),
+        **{name: (words, ()) for name, words in ABOUT_KEPT.items()},
     }
-    fields = [
-        Port(name=name, rows=room.shapes[name][0], columns=room.shapes[name][1], about=words, entries=entries)
-        for name, (words, entries) in about.items()
-    ]
+    fields = []
+    for name, (rows, columns) in room.shapes.items():
+        (words, entries), unit = about[name], "s" if name == "elapsed" else ""
+        whole = name == "overdue"
+        port = Port(name=name, rows=rows, columns=columns, about=words, entries=entries, unit=unit, whole=whole)
+        fields.append(port)
     return (
         Port(name="time", unit="s", about="of the last step"),
         Port(name="phase", about=f"that this time is in: {listed}", whole=True),
@@ -356,16 +422,14 @@ def _first(leg: Leg, room: _Room) -> Array:
     n, m, r = leg.design.sizes
     own = {"estimate": (n, 1), "control": (m, 1), "nominal_state": (leg.design.statement.nx, 1)}
     own |= {"nominal_control": (m, 1), "feedback_gain": (m, n), "filter_gain": (n, r)}
-    shapes = {"time": ca.DM(0), **{name: ca.DM(*own[name]) for name in FIELDS}, "status": ca.DM(0)}
+    shapes = {"time": ca.DM(0), **{name: ca.DM(*size) for name, size in own.items()}}
     values = first_fields(leg.design, leg.tables, shapes, "time")
-    parts, offset = [np.zeros(2)], 1  # time and phase
-    for name in FIELDS:
-        rows, columns = own[name]
-        whole = np.zeros(room.shapes[name])
-        whole[:rows, :columns] = values[offset : offset + rows * columns].reshape(rows, columns)
+    found, offset = {name: np.zeros(shape) for name, shape in room.shapes.items()}, 1  # after the time
+    for name, (rows, columns) in own.items():
+        found[name][:rows, :columns] = values[offset : offset + rows * columns].reshape(rows, columns)
         offset += rows * columns
-        parts.append(whole.ravel())
-    return np.concatenate([*parts, parts[1 + FIELDS.index("control")], np.zeros(1)])
+    parts = [value.ravel() for value in found.values()]
+    return np.concatenate([np.zeros(2), *parts, found["control"].ravel(), np.zeros(1)])  # time and phase before
 
 
 def _points(legs: tuple[Leg, ...], room: _Room, duration: float, random: np.random.Generator, count: int) -> Array:
@@ -378,7 +442,9 @@ def _points(legs: tuple[Leg, ...], room: _Room, duration: float, random: np.rand
         own = points(leg.design, leg.tables, random, share if k + 1 < len(legs) else max(count - share * k, 1))
         rows = np.zeros((own.shape[0], sum(port.size for port in ports)))
         offset = 0
-        for name, size in (("estimate", n), ("last", 1), ("held", m), ("measurement", r), ("time", 1)):
+        sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1}
+        sizes |= {"spread": half_length(n)} | ({"overdue": 1} if leg.design.reads else {})
+        for name, size in sizes.items():
             place = span(ports, name).start
             rows[:, place : place + size] = own[:, offset : offset + size]
             offset += size

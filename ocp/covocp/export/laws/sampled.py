@@ -33,7 +33,6 @@ from covocp.base.short_repr import short_repr
 from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
     NO_STEP,
-    SCALAR_SIZE,
     STATUSES,
     about,
     field_ports,
@@ -41,19 +40,18 @@ from covocp.export.laws.controller import (
     first_fields,
     measurement_port,
     points,
-    solved,
 )
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
-from covocp.export.laws.law import LARGEST, Law, Port, flat, span, status_of
+from covocp.export.laws.law import LARGEST, Law, Port, flat, span, stacked_size, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.moves import WHOLE, Moves
+from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, solved
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
 # Share of a period by which an instant may miss a sample.
 SAME_INSTANT = 1e-6
-CONTINUE = -1.0
 HELD = {"estimate": "estimate", "last": "index", "held": "control"}
 ABOUT = (
     "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the "
@@ -64,6 +62,11 @@ ABOUT = (
     "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then "
     "P- M' (M P- M' + U/period)^-1 of the other rows, P- that of the filter with all of them. At time zero the control "
     "is that of the nominal.",
+)
+ABOUT_INSTANTS = (
+    "Rows of the measurement that are read at instants count with their variance at the sample of their instant "
+    "alone, and once. Between the instants they are left out, whatever they are, without a status; NaN is no missing "
+    "row then. A reading that comes later than its sample is lost.",
 )
 
 
@@ -148,7 +151,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     return Law(
         name="step",
         kind="controller",
-        about=(*about(design, ABOUT), spoken, limits_text(*limits)),
+        about=(*about(design, (*ABOUT, *(ABOUT_INSTANTS if design.reads else ()))), spoken, limits_text(*limits)),
         notes=limits_notes(*limits),
         constants={"PERIOD [s]": period} | limit_constants(*limits),
         core=core,
@@ -299,7 +302,7 @@ def _ports(design: Design) -> tuple[Port, ...]:
 
 def _points(design: Design, tables: History, samples: Samples, random: np.random.Generator, count: int) -> Array:
     """As for any time between two steps, the last step at a sample a few periods before."""
-    rows = points(design, tables, random, count)
+    rows = points(design, tables, random, count)[:, : stacked_size(_ports(design))]
     place = span(_ports(design), "last")
     before = random.choice([0, 1, 1, 1, 1, 2, 5, -1], count)
     time = np.nan_to_num(rows[:, -1], nan=0.0, posinf=tables.duration, neginf=0.0)

@@ -103,6 +103,11 @@ class _Task:
         return tuple(b.name for b in (*st.of_kind("parameter"), *st.of_kind("unknown")))
 
 
+# Options of the export of a problem: those of the mesh and of the plugin, all of them.
+OF_SOLVE = frozenset({entry.name for entry in fields(Options)} | {"plugin_options"})
+OPTIONS = tuple(sorted(OF_SOLVE | {"name", "overwrite", "tolerance", "method"}))
+
+
 def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tuple[Law, Linking | None]:
     """The solver of a problem, and what has to be linked with it.
 
@@ -123,11 +128,9 @@ def solver_law(problem: Problem, method: str, options: Mapping[str, Any]) -> tup
             received=f"method={method!r}",
             remedy="'sqpmethod' needs nothing else; the others are linked",
         )
-    known = {entry.name for entry in fields(Options)} | {"plugin_options"}
-    allowed = sorted(known | {"name", "overwrite", "tolerance", "method"})
     for name in options:
-        if name not in known:
-            raise no_export_option("a problem", name, options[name], allowed)
+        if name not in OF_SOLVE:
+            raise no_export_option("a problem", name, options[name], OPTIONS)
     made = replannable(problem)
     chosen = {name: value for name, value in options.items() if name != "plugin_options"}
     solution = Solver(made.fixed, **chosen).solve(progress=False)

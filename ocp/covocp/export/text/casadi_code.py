@@ -61,8 +61,12 @@ REMEDIES = {
     "Idas": "write the steps of the integration out, such as those of Runge-Kutta",
     "RungeKutta": "the option 'simplify': True of casadi.integrator writes the steps out",
     "Collocation": "write the steps of the integration out, such as those of Runge-Kutta",
-    "External": "export what is inside it, or link it yourself",
+    "External": "export the CasADi function that it was made of",
 }
+# Headers of the C standard library: code that includes another one calls something that has to be linked.
+STANDARD = frozenset({"float.h", "limits.h", "math.h", "stdarg.h", "stdint.h", "stdio.h", "stdlib.h", "string.h"})
+# Ends of the names of CasADi's classes: of functions that call a library, of functions that are one.
+LIBRARY, COMPILED = "Interface", "External"
 # Functions of CasADi that have no C code; of others it is seen in the code that it writes. CasADi prints a warning for
 # these, which nothing can silence but the loss of whatever else the process prints at that time.
 WITHOUT_CODE = ("CallbackInternal", "Newton", "KinsolInterface", "CvodesInterface", "IdasInterface")
@@ -98,13 +102,14 @@ def core_name(package: str, law: Law) -> str:
     return re.sub("_+", "_", f"{package}_{law.name}_core")
 
 
-def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
+def generate(package: str, laws: tuple[Law, ...], precision: str, linked: str = "") -> Generated:
     """The C code of the laws.
 
     Args:
         package: name of the package.
         laws: to be written.
         precision: "double" or "single".
+        linked: header of the library that the package says it is linked with; "": of none.
 
     Raises:
         ExportError: something in a law has no C code (says what, and where).
@@ -121,6 +126,7 @@ def generate(package: str, laws: tuple[Law, ...], precision: str) -> Generated:
         raise _refused(laws, str(error).strip().splitlines()[-1]) from error
     source = WHOLE.format(version=ca.CasadiMeta.version(), code=written)
     _check(source, laws)
+    _check_headers(source, laws, linked)
     source = reentrant(source)
     passages = [law.passages for law in laws if law.passages is not None]
     for own in passages:
@@ -165,6 +171,10 @@ def _check_functions(law: Law, laws: tuple[Law, ...]) -> None:
     for function in (law.written, *law.written.find_functions()):
         if function.class_name() in WITHOUT_CODE:
             raise _refused(laws, f"{function.class_name()}, which cannot be code generated", function.name())
+        if function.class_name().endswith(COMPILED):
+            raise _refused(
+                laws, f"{function.class_name()}, compiled code, which would have to be linked", function.name()
+            )
 
 
 def _check(source: str, laws: tuple[Law, ...]) -> None:
@@ -174,6 +184,23 @@ def _check(source: str, laws: tuple[Law, ...]) -> None:
         return
     functions: list[str] = re.findall(r"^/\* (\S+?):\(", source[: found.start()], re.MULTILINE)
     raise _refused(laws, found.group(1).strip(), functions[-1] if functions else "")
+
+
+def _check_headers(source: str, laws: tuple[Law, ...], linked: str) -> None:
+    """Complain about code that calls a library of which the package says nothing."""
+    headers: list[str] = re.findall(r"^\s*#include <(.*)>$", source, re.MULTILINE)
+    unknown = [header for header in headers if header not in STANDARD and header != linked]
+    if not unknown:
+        return
+    inside = [f for law in laws for f in law.written.find_functions() if f.class_name().endswith(LIBRARY)]
+    names = " and ".join(f"'{f.name()}' ({f.class_name().removesuffix(LIBRARY)})" for f in inside)
+    raise ExportError(
+        "This cannot be written as self-contained C code: " + ", ".join(f"'{law.name}'" for law in laws) + ".",
+        expected="CasADi functions whose C code calls no library",
+        received=f"code that includes {', '.join(f'<{header}>' for header in unknown)}"
+        + (f" for {names}" if names else ""),
+        remedy="take a solver that is written out: 'qrqp' of casadi.conic and as qpsol, 'sqpmethod' of casadi.nlpsol",
+    )
 
 
 def _refused(laws: tuple[Law, ...], words: str, where: str = "") -> ExportError:

@@ -10,6 +10,9 @@ from covocp.export.text.casadi_code import core_name
 from covocp.export.text.header import STRUCTS, struct_name
 from covocp.export.text.numbers import code, constant, size_names
 
+# CasADi calls the functions of its runtime, casadi_copy, casadi_sq, ..., by the name of the package and these.
+RUNTIME = "casadi_"
+
 
 def check_identifiers(package: str, laws: tuple[Law, ...]) -> None:
     """Complain about two things of one name: C has one space of names for macros, types and functions.
@@ -24,10 +27,22 @@ def check_identifiers(package: str, laws: tuple[Law, ...]) -> None:
             if name in known:
                 raise _twice(package, name, known[name], what)
             known[name] = what
+    for law in laws:
+        if law.name.startswith(RUNTIME):
+            raise _runtime(package, law.name)
     for law in laws:  # a parameter or a field hides what it is called like, a macro replaces it
         for port in (*law.inputs, *law.outputs):
             if port.name in known:
                 raise _twice(package, port.name, known[port.name], f"'{port.name}' of '{law.name}'")
+
+
+def _runtime(package: str, name: str) -> ExportError:
+    return ExportError(
+        f"'{name}' cannot be the name of a function: that of the package would be that of one of CasADi's runtime.",
+        expected=f"a name that does not begin with '{RUNTIME}'",
+        received=f"{package}_{name}",
+        remedy="rename the function",
+    )
 
 
 def _names(package: str, law: Law) -> Iterator[tuple[str, str]]:

@@ -133,10 +133,12 @@ def reference(law: Law, count: int, seed: int, precision: str) -> Reference:
         precision: inputs are rounded to it.
 
     Raises:
-        ExportError: a function that cannot be evaluated at most of its points.
+        ExportError: a function that cannot be evaluated at most of its points, or is finite at none.
     """
     rows, values = _evaluated(law, min(count, law.most), seed, precision)
     if law.kind == "function":
+        if not np.isfinite(values).all(axis=1).any():  # the last point becomes one at which something is compared
+            rows[-1], values[-1] = _finite_point(law, 2 * max(count, POINTS), seed, precision)
         broken = ~np.isfinite(values).all(axis=1)
         status = np.where(broken, CODES["RESULT_NOT_FINITE"], CODES["OK"])
     else:
@@ -166,6 +168,31 @@ def _evaluated(law: Law, count: int, seed: int, precision: str) -> tuple[Array, 
             remedy="give ranges= of its inputs within which it has values: no singular matrices",
         )
     return np.array([row for row, _ in known[:count]]), np.array([values for _, values in known[:count]])
+
+
+def _finite_point(law: Law, count: int, seed: int, precision: str) -> tuple[Array, Array]:
+    """A point at which all results of a function are finite, and what they are.
+
+    Raises:
+        ExportError: there is none among some.
+    """
+    rows, values = _evaluated(law, count, seed, precision)
+    finite = np.isfinite(values).all(axis=1)
+    if finite.any():
+        first = int(np.argmax(finite))
+        return rows[first], values[first]
+    sizes = np.cumsum([port.size for port in law.results])[:-1]
+    never = [
+        f"'{port.name}' is {'finite at none' if not finite.any() else 'not always finite'}"
+        for port, part in zip(law.results, np.split(values, sizes, axis=1), strict=True)
+        if not (finite := np.isfinite(part).all(axis=1)).all()
+    ]
+    raise ExportError(
+        f"The function '{law.name}' has finite results at no point at which C is to be compared with it.",
+        expected="points between the ranges, or of normal numbers, where all of its results are finite",
+        received=f"of {len(values)} points none: {', '.join(never)}"[:200],
+        remedy="give ranges= of its inputs within which it has values",
+    )
 
 
 def _points(law: Law, count: int, seed: int, precision: str) -> Array:
