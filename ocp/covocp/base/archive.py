@@ -15,7 +15,6 @@ begin with "$" are therefore written as "$map".
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import math
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from covocp.base.digests import sha256
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Given
 
@@ -198,7 +198,7 @@ def sealed_arrays(entries: Mapping[str, Any]) -> bytes:
     buffer = _zipped(written, zipfile.ZIP_DEFLATED)
     if sum(map(len, written.values())) > UNPACKED * len(buffer.getvalue()) + ALWAYS:  # it would not be read again
         buffer = _zipped(written, zipfile.ZIP_STORED)
-    content = hashlib.sha256()
+    content = sha256()
     for name, data in written.items():
         content.update(_heading(name, data))
         content.update(data)
@@ -209,7 +209,7 @@ def sealed_arrays(entries: Mapping[str, Any]) -> bytes:
 
 def _signed(body: bytes) -> bytes:
     """Bytes, and the checksum of them."""
-    return body + hashlib.sha256(body).hexdigest().encode()
+    return body + sha256(body).hexdigest().encode()
 
 
 def _heading(name: str, data: bytes) -> bytes:
@@ -262,7 +262,7 @@ class _Entries:
         self._archive, self._size = archive, size
         self._left = UNPACKED * size + ALWAYS
         self._read: set[str] = set()
-        self._content = hashlib.sha256()
+        self._content = sha256()
 
     def __getitem__(self, name: str) -> Any:
         info = self._archive.getinfo(name + NPY)

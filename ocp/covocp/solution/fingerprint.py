@@ -11,7 +11,6 @@ CasADi writes of them, where a difference alone is a warning.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from typing import Annotated
 import casadi as ca
 import numpy as np
 
+from covocp.base.digests import sha256
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.solution.meaning import ADDED, MAIN, Aspect, constants, declared
@@ -215,7 +215,7 @@ def _digest(function: ca.Function) -> str:
         text = function.serialize()
     except RuntimeError:  # a callback cannot be written
         text = function.class_name()
-    return hashlib.sha256(text.encode()).hexdigest()
+    return sha256(text.encode()).hexdigest()
 
 
 # --- comparison -------------------------------------------------------------------------------------------------------

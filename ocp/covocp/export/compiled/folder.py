@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
-import hashlib
 import json
 import os
 import shutil
@@ -21,6 +20,7 @@ import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from covocp.base.digests import sha256
 from covocp.base.errors import ExportError
 from covocp.base.files import abandoned, exchange, flush, held
 from covocp.export.compiled.building import FOLDER
@@ -263,7 +263,7 @@ def _recover(target: Path) -> None:
 
 def _hidden(target: Path, last: str = "") -> Path:
     """A name beside the target that nothing else has, and that tells whose it is."""
-    digest = hashlib.sha256(target.name.encode(errors="surrogateescape")).hexdigest()[:LETTERS]
+    digest = sha256(target.name.encode(errors="surrogateescape")).hexdigest()[:LETTERS]
     name = f".{target.name[:SHOWN]}.covocp-{digest}-{uuid.uuid4().hex}"
     return target.with_name(f"{name}.{last}" if last else name)
 
