@@ -25,6 +25,9 @@ RANK = 1e-4
 DISPLACEMENT = 1e-4
 # Powell's share of the curvature that is kept where a step shows less (Nocedal and Wright, 18.3).
 KEPT_SHARE = 0.1
+# Condition of the Hessian above which roundoff takes its definiteness: along concave directions each step would leave
+# a tenth of the curvature, until the inverse beside it is none.
+WORST_CONDITION = 1e12
 
 
 def first_curvature(
@@ -132,7 +135,9 @@ class Curvature(NamedTuple):
 
 
 def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature:
-    """The damped update of Broyden, Fletcher, Goldfarb and Shanno: B stays positive definite.
+    """The damped update of Broyden, Fletcher, Goldfarb and Shanno: B stays positive definite, in numbers too.
+
+    What would make it too ill-conditioned for that is not learnt.
 
     Args:
         curvature: B and its inverse.
@@ -151,4 +156,4 @@ def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature:
     scaled = change / sr
     B = B + np.outer(r, r / sr) - np.outer(Bs, Bs / sBs)
     H = H + np.outer((1.0 + float(r @ Hr) / sr) * scaled, change) - np.outer(Hr, scaled) - np.outer(scaled, Hr)
-    return Curvature(B, H)
+    return Curvature(B, H) if np.linalg.norm(B) * np.linalg.norm(H) < WORST_CONDITION else curvature
