@@ -6,7 +6,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
-from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error, unstable
+from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, node_error, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
@@ -67,7 +67,7 @@ def _flown_alone(solution: Solution) -> str:
         return ""
     left, cost = found
     differs = cost is not None and abs(cost - solution.cost) > COARSE_MESH * abs(solution.cost)
-    if left <= LONG_STEPS and not differs:
+    if left <= (OPTIMISED if differs else LONG_STEPS):  # a cost that differs at nodes that are right is one of the mesh
         return ""
     far = f"leaves the nodes by {left:.1e} of the range of a state" if np.isfinite(left) else "diverges"
     paid = f", and costs {cost:.6g} instead of {solution.cost:.6g}" if cost is not None else ""
