@@ -39,6 +39,8 @@ LOOKED_AGAIN = 3.0
 # Steps of an interval that what an unstable plant makes of them may ask for, and the share of what its segments are off
 # by halving the steps that is their own: more of it would be left by any steps.
 MOST_AGAINST_GROWTH, OWN_SHARE = 8, 0.3
+# A plant is called unstable from so many times what the segments by themselves are off, all together, on.
+UNSTABLE = 10.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
@@ -175,13 +177,16 @@ def unstable(extremal: Extremal) -> tuple[float, float | None] | None:
     """By how much a run along the controls leaves the nodes, of the range of a state, and what it costs.
 
     Returns:
-        None where the plant amplifies nothing, the cost None where it is not known.
+        None where the plant is not seen to be unstable, the cost None where it is not known.
     """
     moved, size = _by_segments(extremal, 0.0)
     left = _departure(extremal, moved, size)
     if left is None or left.cost is None:
         return None
     nx = left.states.size
+    suffered = (np.abs(_halved(extremal).jumps[:, :nx]) / size[:nx]).max(axis=1).sum()
+    if (left.states / size[:nx]).max() <= UNSTABLE * suffered:  # long steps of an oscillator add up as well
+        return None
     known = np.isfinite(left.cost) and not is_lost(extremal, left.states)
     return float((left.states / size[:nx]).max()), left.cost if known else None
 
