@@ -263,7 +263,7 @@ class Runs:
         """What the solver returns, and its counts; where it gives up by raising, the start."""
         try:
             return solver(**arguments), dict(solver.stats())
-        except RuntimeError as error:
+        except (RuntimeError, np.linalg.LinAlgError) as error:
             w0, rows = arguments["x0"], arguments["lbg"].size
             reason = str(error).strip().splitlines()[-1]
             result = {"x": w0, "lam_x": np.zeros(w0.size), "lam_g": np.zeros(rows)}

@@ -25,6 +25,10 @@ RANK = 1e-4
 DISPLACEMENT = 1e-4
 # Powell's share of the curvature that is kept where a step shows less (Nocedal and Wright, 18.3).
 KEPT_SHARE = 0.1
+# Condition of the Hessian (product of Frobenius norms) from which on it is lost: along concave directions a step leaves
+# a tenth of the curvature, until what lies across them, and the inverse, is roundoff. A run that begins to learn anew
+# earlier takes fewer steps (ten pendulums: 111 to 952 before, 94 to 888 so; with 1e12 one of them does not end).
+WORST_CONDITION = 1e9
 
 
 def first_curvature(
@@ -131,13 +135,16 @@ class Curvature(NamedTuple):
         return Curvature(matrix, np.asarray(np.linalg.inv(matrix), dtype=float))
 
 
-def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature:
+def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature | None:
     """The damped update of Broyden, Fletcher, Goldfarb and Shanno: B stays positive definite.
 
     Args:
         curvature: B and its inverse.
         change: s, of the variables.
         difference: y, of the slope of the Lagrangian.
+
+    Returns:
+        B and its inverse; None where it would be too ill-conditioned to stay definite in numbers.
     """
     B, H = curvature
     Bs = B @ change
@@ -151,4 +158,4 @@ def learnt(curvature: Curvature, change: Array, difference: Array) -> Curvature:
     scaled = change / sr
     B = B + np.outer(r, r / sr) - np.outer(Bs, Bs / sBs)
     H = H + np.outer((1.0 + float(r @ Hr) / sr) * scaled, change) - np.outer(Hr, scaled) - np.outer(scaled, Hr)
-    return Curvature(B, H)
+    return Curvature(B, H) if np.linalg.norm(B) * np.linalg.norm(H) < WORST_CONDITION else None

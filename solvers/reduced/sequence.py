@@ -169,8 +169,9 @@ class Sequence:
                     curvature, fresh = self._first(place), True
                     continue
                 return self._ended(place, rows, (lam_x, lam_g), Status.NO_PROGRESS, iterations, None)
-            curvature, fresh = self._learnt(curvature, place, following, rows, lam_g), False
+            more = self._learnt(curvature, place, following, rows, lam_g)
             place, iterations = following, iterations + 1
+            curvature, fresh = (self._first(place), True) if more is None else (more, False)
             rows = self._condensed(place)
 
     def _condensed(self, place: Place) -> Subproblem:
@@ -274,8 +275,10 @@ class Sequence:
 
     def _learnt(
         self, curvature: Curvature, place: Place, following: Place, rows: Subproblem, lam_g: Array
-    ) -> Curvature:
+    ) -> Curvature | None:
         """What a step tells of the Hessian: nothing where it closes gaps more than it moves what is chosen.
+
+        None where the Hessian is lost.
 
         The slope then changes by the gaps: a step of 1e-7 beside a start that moved by 1e-4 shows curvatures of 1e6.
         """

@@ -111,8 +111,8 @@ def _with_active(problem: Quadratic, active_rows: Array, active_bounds: Array) -
         found = _with_equations(B, problem.inverse, A, problem.slope, b)
     else:
         q = (problem.slope + B @ change)[free]
-        inner = B[np.ix_(free, free)]
-        found = _with_equations(inner, _inverse_of(problem.inverse, free), A[:, free], q, b)
+        inverse = _inverse_of(problem.inverse, free)
+        found = None if inverse is None else _with_equations(B[np.ix_(free, free)], inverse, A[:, free], q, b)
     if found is None:
         return None
     change[free], multipliers = found
@@ -128,11 +128,15 @@ def _with_active(problem: Quadratic, active_rows: Array, active_bounds: Array) -
     )
 
 
-def _inverse_of(inverse: Array, free: Array) -> Array:
-    """The inverse of the free part of B from that of the whole."""
+def _inverse_of(inverse: Array, free: Array) -> Array | None:
+    """The inverse of the free part of B from that of the whole; None where that has lost its rank to roundoff."""
     held = np.logical_not(free)
     across = inverse[np.ix_(free, held)]
-    return np.asarray(inverse[np.ix_(free, free)] - across @ np.linalg.solve(inverse[np.ix_(held, held)], across.T))
+    try:
+        inner = np.linalg.solve(inverse[np.ix_(held, held)], across.T)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(inverse[np.ix_(free, free)] - across @ inner)
 
 
 def _with_equations(B: Array, H: Array, A: Array, q: Array, b: Array) -> tuple[Array, Array] | None:

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from covocp.models import mass_chain, unknown_lag
 from covocp.passage import library
 from covocp.transcription import halved_steps
-from covocp.transcription.halved_steps import Refined, refined_end, refined_run
+from covocp.transcription.halved_steps import Refined, refined_run, refined_states
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import resolve_mesh
@@ -42,13 +42,13 @@ def test_runs_that_come_often_give_the_numbers_of_the_first(control: str, segmen
         first.append(
             (
                 flat(refined_run(statement, fresh, trajectory, statement.values)),
-                refined_end(statement, fresh, trajectory, statement.values),
+                refined_states(statement, fresh, trajectory, statement.values),
             )
         )
     for trajectory, (whole, end) in zip(moved, first, strict=True):
         again = flat(refined_run(statement, mesh, trajectory, statement.values))
         np.testing.assert_allclose(again, whole, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(refined_end(statement, mesh, trajectory, statement.values), end, rtol=1e-12)
+        np.testing.assert_allclose(refined_states(statement, mesh, trajectory, statement.values), end, rtol=1e-12)
     assert np.abs(first[0][0] - first[1][0]).max() > 1e-3  # the runs differ
 
 
@@ -63,12 +63,12 @@ def test_the_function_that_is_kept_takes_parameters_as_they_come() -> None:
 
 
 @pytest.mark.parametrize("times", [1, MANY])
-def test_the_state_at_the_end_is_that_of_scipy(times: int) -> None:
+def test_the_states_of_one_run_are_those_of_scipy(times: int) -> None:
     statement = mass_chain.problem(masses=2).statement()
     mesh = mesh_of(statement, substeps=8, segments=1)
     trajectory = own_start(statement, mesh, statement.values).trajectory
     for _ in range(times):
-        end = refined_end(statement, mesh, trajectory, statement.values)
+        found = refined_states(statement, mesh, trajectory, statement.values)
         jumps = refined_run(statement, mesh, trajectory, statement.values).jumps
     T, nodes = trajectory.duration, mesh.nodes
 
@@ -78,11 +78,11 @@ def test_the_state_at_the_end_is_that_of_scipy(times: int) -> None:
         f = mass_chain.STIFFNESS * D + mass_chain.CUBIC * D**3 + mass_chain.DAMPING * dD
         return np.array([x[2], x[3], u - f[0] + f[1], -f[1]])
 
-    x = trajectory.x[0]
+    states = [trajectory.x[0]]
     for begin, stop in zip(T * nodes[:-1], T * nodes[1:], strict=True):  # the control has corners at the nodes
-        x = solve_ivp(rate, (begin, stop), x, rtol=1e-10, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose(end, x, atol=2e-6)
-    np.testing.assert_allclose(trajectory.x[-1] + jumps[-1], x, atol=2e-6)
+        states.append(solve_ivp(rate, (begin, stop), states[-1], rtol=1e-10, atol=1e-12).y[:, -1])
+    np.testing.assert_allclose(found, states, atol=2e-6)
+    np.testing.assert_allclose(trajectory.x[-1] + jumps[-1], states[-1], atol=2e-6)
 
 
 def test_without_the_compiled_passage_the_runs_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

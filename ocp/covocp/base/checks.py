@@ -14,6 +14,9 @@ from covocp.base.errors import ProblemError, kind_and_name, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers
 
+# Share of its largest entry by which a matrix may differ from its transpose.
+SYMMETRIC = 1e-9
+
 
 def caller() -> str:
     """File and line of the user's code that called into covocp."""
@@ -176,14 +179,38 @@ def symmetric_data(name: str, what: str, value: Given, size: int, *, semidefinit
         matrix = matrix.reshape(1, 1) if matrix.size == 1 else matrix
         known = np.nan_to_num(matrix, nan=0.0, posinf=np.inf, neginf=-np.inf)
         if matrix.shape == (size, size):
-            if not np.isfinite(known).all() or not np.allclose(known, known.T):
-                check_density(name, what, known, definite=False)
             if semidefinite and not np.isnan(matrix).any():
                 check_density(name, what, known, definite=False)
+            else:
+                check_symmetric_numbers(name, what, known)
         matrix = ca.MX(ca.DM(matrix))
     if matrix.shape != (size, size):
         raise shape_error(name, what, f"a symmetric {size} x {size} matrix", f"shape {matrix.shape}")
     return pack_symbolic(matrix)
+
+
+def is_symmetric(numbers: Array) -> bool:
+    """Whether a square matrix is finite, and symmetric to roundoff of its own size."""
+    if not np.isfinite(numbers).all():
+        return False
+    return bool((np.abs(numbers - numbers.T) <= SYMMETRIC * np.abs(numbers).max(initial=0.0)).all())
+
+
+def check_symmetric_numbers(name: str, what: str, numbers: Array) -> None:
+    """A matrix of numbers must be finite, and symmetric to roundoff of its own size; it may be indefinite.
+
+    Raises:
+        ProblemError: it is not.
+    """
+    if is_symmetric(numbers):
+        return
+    finite = np.isfinite(numbers).all()
+    raise ProblemError(
+        f"The {what} of '{name}' is not symmetric." if finite else f"The {what} of '{name}' contains NaN or inf.",
+        expected="a number" if numbers.size == 1 else "a symmetric matrix",
+        received=np.array2string(numbers, max_line_width=100, threshold=25, prefix=" " * 12),
+        remedy=f"check the {what} given for '{name}'",
+    )
 
 
 def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
@@ -193,7 +220,7 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
     values = [generator.uniform(0.5, 1.5, symbol.shape) for symbol in symbols]
     numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
     difference = np.abs(numbers - numbers.T)
-    if np.isfinite(numbers).all() and (difference > 1e-9 * np.abs(numbers).max(initial=0.0)).any():
+    if np.isfinite(numbers).all() and (difference > SYMMETRIC * np.abs(numbers).max(initial=0.0)).any():
         i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
         raise ProblemError(
             f"The {what} of '{name}' is not symmetric.",

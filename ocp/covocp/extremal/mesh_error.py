@@ -12,8 +12,9 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
+from covocp.extremal.open_loop import Departure, departure, nominal_along
 from covocp.statement.statement import Statement
-from covocp.transcription.halved_steps import Refined, refined_end, refined_run
+from covocp.transcription.halved_steps import Refined, refined_run
 from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
 from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Multipliers, Trajectory
@@ -35,6 +36,11 @@ ALONG, OPTIMISED = 1e-4, 2e-3
 ORDER, MOST_TIMES, MOST_SUBSTEPS = 4, 8, 64
 # What steps that are far too long say is too much: before a run they are looked at again from so many times as many on.
 LOOKED_AGAIN = 3.0
+# Steps of an interval that what an unstable plant makes of them may ask for, and the share of what its segments are off
+# by halving the steps that is their own: more of it would be left by any steps.
+MOST_AGAINST_GROWTH, OWN_SHARE = 8, 0.3
+# A plant is called unstable from so many times what the segments by themselves are off, all together, on.
+UNSTABLE = 10.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
@@ -49,7 +55,8 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
 
     Each shooting segment is run again from its start. The jumps at the ends of the segments count with the multipliers
     of the continuity, which are the costates there: this is the change of the optimal cost. Along the controls
-    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more.
+    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more; where an
+    unstable plant amplifies the jumps, that of one run along the controls as well, unless roundoff would do as much.
 
     Args:
         extremal: trajectory and multipliers.
@@ -71,7 +78,8 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
         with np.errstate(over="ignore", invalid="ignore"):
             further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
-    error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
+    along = 0.0 if within is not None else _along_controls(extremal, cost)
+    error = max(abs(change), abs(change - missed), along) / max(abs(cost + change), NO_COST)
     return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
 
 
@@ -107,15 +115,29 @@ def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
 def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
     """Largest change of a state or of an entry of a matrix at a node by halving the steps, relative to its range.
 
-    What is a variable where a segment starts changes inside the segments and by the jumps at their ends, summed up.
+    The states are those of one run along the controls, in which an unstable plant amplifies what each segment is off.
+    Where a feedback holds them, and for matrices that are variables, the jumps at the ends of segments are summed up.
 
     Args:
         extremal: the trajectory.
-        gaps: at the ends of the segments with its own steps, (segments, variables there): those of a guess.
+        gaps: at the ends of the segments with its own steps, (segments, variables there): those of a guess, along which
+            nothing is amplified.
 
     Returns:
-        The largest of them; nan where the run is not finite.
+        The largest of them; inf where a run along the controls diverges, nan where the segments do.
     """
+    moved, size = _by_segments(extremal, gaps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        left = None if np.any(gaps) else _departure(extremal, moved, size)
+        if left is not None:
+            moved[: left.states.size] = left.states
+            if left.matrices is not None:
+                moved[left.states.size :] = np.maximum(moved[left.states.size :], left.matrices)
+        return float((moved / size).max(initial=0.0))
+
+
+def _by_segments(extremal: Extremal, gaps: Array | float) -> tuple[Array, Array]:
+    """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
     t, finer = extremal.trajectory, _halved(extremal)
     scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
@@ -125,7 +147,48 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
         moved, inside = np.cumsum(finer.jumps - gaps, axis=0), np.hstack([finer.states, finer.matrices]) - values
         total = np.abs(inside).max(axis=0)
         total[: moved.shape[1]] += np.abs(moved).max(axis=0)
-        return float((total / size).max(initial=0.0))
+    return total, size
+
+
+def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
+    nx = extremal.statement.nx
+    return departure(extremal, moved[:nx], size[:nx])
+
+
+def _along_controls(extremal: Extremal, cost: float) -> float:
+    """Change of the cost in one run along the controls; 0 where the plant amplifies nothing, or roundoff as much."""
+    moved, size = _by_segments(extremal, 0.0)
+    left = _departure(extremal, moved, size)
+    if left is None or left.cost is None or not np.isfinite(left.cost):
+        return 0.0
+    return 0.0 if is_lost(extremal, left.states) else abs(left.cost - cost)
+
+
+def is_lost(extremal: Extremal, left: Array) -> bool:
+    """Whether the plant is so unstable that roundoff alone would take the states about as far from the nodes, (nx,)."""
+    t, jumps = extremal.trajectory, _halved(extremal).jumps[:, : extremal.statement.nx]
+    scale = np.abs(t.x).max(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    suffered, amplified = float((np.abs(jumps) / scale).max()), float((left / scale).max())
+    return not np.isfinite(amplified) or amplified * STEP_ROUNDOFF > COARSE_MESH * suffered
+
+
+def unstable(extremal: Extremal) -> tuple[float, float | None] | None:
+    """By how much a run along the controls leaves the nodes, of the range of a state, and what it costs.
+
+    Returns:
+        None where the plant is not seen to be unstable, the cost None where it is not known.
+    """
+    moved, size = _by_segments(extremal, 0.0)
+    left = _departure(extremal, moved, size)
+    if left is None or left.cost is None:
+        return None
+    nx = left.states.size
+    suffered = (np.abs(_halved(extremal).jumps[:, :nx]) / size[:nx]).max(axis=1).sum()
+    if (left.states / size[:nx]).max() <= UNSTABLE * suffered:  # long steps of an oscillator add up as well
+        return None
+    known = np.isfinite(left.cost) and not is_lost(extremal, left.states)
+    return float((left.states / size[:nx]).max()), left.cost if known else None
 
 
 def finer_steps(
@@ -159,12 +222,15 @@ def _divided(
 ) -> Options | None:
     """`finer_steps`, of at most so many times as many, for so many times less change."""
     statement, mesh = extremal.statement, extremal.mesh
-    times = node_error(extremal, gaps) / allowed
+    order = 2 if mesh.step == "strang" else ORDER
+    moved, size = _by_segments(extremal, gaps)
+    times = (
+        max(float((moved / size).max(initial=0.0)), _against_growth(extremal, gaps, allowed, margin, order)) / allowed
+    )
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
     if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
         return None
-    order = 2 if mesh.step == "strang" else ORDER
     unit = step_unit(statement, mesh)
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
@@ -172,6 +238,22 @@ def _divided(
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
+
+
+def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:
+    """`node_error` where a few more steps suffice against what an unstable plant makes of them; else 0.
+
+    Over a long horizon no steps do, and roundoff and what the solver left of the gaps grow as they do.
+    """
+    mesh = extremal.mesh
+    if np.any(gaps) or len(mesh.segments) == 1:
+        return 0.0
+    error = node_error(extremal)
+    if not error > allowed or not mesh.substeps * (margin * error / allowed) ** (1 / order) <= MOST_AGAINST_GROWTH:
+        return 0.0
+    own = refined_run(extremal.statement, mesh, extremal.trajectory, extremal.parameters, parts=1).jumps
+    halved = _halved(extremal).jumps
+    return error if np.abs(own).max() <= OWN_SHARE * np.abs(halved).max() else 0.0
 
 
 def steps_along(
@@ -225,12 +307,8 @@ def _missed(extremal: Extremal, jumps: Array, parts: int) -> float:
         return 0.0
     if len(mesh.segments) == 1:
         return float(multipliers @ jumps[-1, : st.nx])
-    drift = refined_end(st, mesh, t, extremal.parameters, parts) - t.x[-1]
-    scale = np.abs(t.x).max(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    suffered = float((np.abs(jumps[:, : st.nx]) / scale).max())
-    amplified = float((np.abs(drift) / scale).max())
-    if not np.isfinite(drift).all() or amplified * STEP_ROUNDOFF > COARSE_MESH * suffered:
+    drift = nominal_along(extremal, parts)[-1] - t.x[-1]
+    if is_lost(extremal, np.abs(drift)):
         return 0.0
     return float(multipliers @ drift)
 

@@ -13,6 +13,7 @@ from covocp.base.arguments import check_argument, checked_class, truth
 from covocp.base.checks import check_positive, check_times, one_number
 from covocp.base.geometry import Chart
 from covocp.base.matrices import Array
+from covocp.base.pickling import not_pickled
 from covocp.base.short_repr import short_repr
 from covocp.problem.matrices import Matrix, Spread
 from covocp.statement.statement import ROLES, Role
@@ -324,6 +325,7 @@ class Expansion:
     __repr__ = short_repr
 
 
+@not_pickled
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Declarations:
     """All that is declared of a problem; another problem is made by replacing some of it.

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import as_number, check_density
+from covocp.base.checks import as_number, check_density, check_symmetric_numbers
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, pack
@@ -254,8 +254,10 @@ def _matrix_value(start: Start, value: Given) -> Array:
     if numbers.shape != (size, size):
         rows = ", ".join(start.of.labels)
         raise _wrong(name, f"a symmetric {size} x {size} matrix, rows {rows}", f"shape {numbers.shape}")
-    if start.of.covariance or not np.isfinite(numbers).all() or not np.allclose(numbers, numbers.T):
+    if start.of.covariance:
         check_density(name, "initial value", numbers, definite=False)
+    else:
+        check_symmetric_numbers(name, "initial value", numbers)
     return pack(0.5 * (numbers + numbers.T))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
-from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, node_error
+from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, node_error, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
@@ -34,6 +34,8 @@ def mention_doubts(solution: Solution) -> None:
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
+    elif alone := _flown_alone(solution):
+        warn_user(alone)
     elif not error <= COARSE_MESH:
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
@@ -56,6 +58,23 @@ def mention_doubts(solution: Solution) -> None:
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             "covariance_step='gauss' or more intervals."
         )
+
+
+def _flown_alone(solution: Solution) -> str:
+    """What an unstable plant makes of the errors of its steps along the controls alone, where that is much; else ""."""
+    found = unstable(solution.extremal) if solution.statement is not None else None
+    if found is None:
+        return ""
+    left, cost = found
+    differs = cost is not None and abs(cost - solution.cost) > COARSE_MESH * abs(solution.cost)
+    if left <= (OPTIMISED if differs else LONG_STEPS):  # a cost that differs at nodes that are right is one of the mesh
+        return ""
+    far = f"leaves the nodes by {left:.1e} of the range of a state" if np.isfinite(left) else "diverges"
+    paid = f", and costs {cost:.6g} instead of {solution.cost:.6g}" if cost is not None else ""
+    return (
+        f"The plant is unstable: a run along these controls alone {far}{paid}. Fly them with a feedback, or use more "
+        "intervals or substeps where these suffice."
+    )
 
 
 def _mention_slopes(solution: Solution, fine: bool) -> None:

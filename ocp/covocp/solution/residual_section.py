@@ -35,6 +35,8 @@ RESIDUALS = {
 
 # Of costates that nothing is compared with.
 UNCHECKED = "not checked: explicit steps back would be too many; costates near the end may be off"
+# Of nodes and costs that are no run along the controls.
+STEPS = "LARGE: the integration steps are too long, or an unstable plant amplifies them: more intervals or substeps"
 # Where to begin to worry about a residual, and what a large one means.
 WORRIES: dict[str, tuple[float, str]] = {
     "stationarity": (1e-3, "LARGE: not yet stationary; a smaller tolerance=, or start again from it"),
@@ -57,8 +59,8 @@ WORRIES: dict[str, tuple[float, str]] = {
         0.1,
         "large: the controls change within an interval; what that costs is the effect of their piecewise form below",
     ),
-    "mesh_error": (2e-4, "LARGE: the integration steps are too long: more intervals or substeps"),
-    "node_error": (1e-2, "LARGE: the integration steps are too long: more intervals or substeps"),
+    "mesh_error": (2e-4, STEPS),
+    "node_error": (1e-2, STEPS),
     "control_error": (1e-3, "large: the cost is off by about that: more intervals, refine=, or control='linear'"),
     "cost_identity": (1e-3, "LARGE: the expected cost is known to no more than this: more intervals"),
     "cross_covariance": (

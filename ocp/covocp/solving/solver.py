@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -110,7 +111,7 @@ class Solver:
         self.statement: Statement = problem.statement()
         check_magnitudes(self.statement, self.statement.values)
         check_between(self.statement, method)
-        self._problem = problem
+        self._problem = copy(problem)  # what is declared later belongs to later solvers
         self._elsewhere = Elsewhere(
             declarations=problem.declarations,
             statement=self.statement,

@@ -22,6 +22,7 @@ import numpy as np
 from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, half_indices, half_length
+from covocp.base.pickling import not_pickled
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
 from covocp.statement.chances import ChanceLimits
@@ -187,6 +188,7 @@ class Duration:
         return self.lower < self.upper
 
 
+@not_pickled
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statement:
     """A vector-matrix optimal control problem, ready for any method.

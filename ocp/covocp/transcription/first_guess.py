@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.buffered import swept
-from covocp.base.checks import as_number, check_density
+from covocp.base.checks import as_number, check_density, is_symmetric
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite, pack, unpack
@@ -171,7 +171,7 @@ def matrix_guess(block: Block, guess: Given) -> Array:
     if numbers.size == 1:
         numbers = np.diag(np.full(block.size, float(numbers.reshape(()))))
     wrong = numbers.shape != (block.size, block.size)
-    if wrong or not np.isfinite(numbers).all() or not np.allclose(numbers, numbers.T):
+    if wrong or not is_symmetric(numbers):
         raise ProblemError(
             f"The guess of '{block.name}' does not fit.",
             expected=f"a symmetric {block.size} x {block.size} matrix, or a number (times identity)",

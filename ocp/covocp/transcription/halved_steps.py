@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -80,10 +80,21 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
     )
 
 
-def refined_end(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2) -> Array:
-    """The state at the end, (nx,), of one run from the start along the same controls with shorter steps."""
+def refined_states(
+    statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, parts: int = 2
+) -> Array:
+    """The states at the nodes, (N + 1, nx), of one run from the start along the same controls with shorter steps.
+
+    NaN or inf where it diverges.
+    """
     runs, u = _runs(statement, mesh, parts), _divided(mesh, trajectory.u, parts)
-    return runs.end(trajectory.x[0], u, trajectory.duration, parameters)
+    return runs.states(trajectory.x[0], u, trajectory.duration, parameters)[::parts]
+
+
+@lru_cache(maxsize=MESHES)
+def in_one_segment(mesh: Mesh) -> Mesh:
+    """The mesh with one segment from the start to the end."""
+    return replace(mesh, segments=(mesh.intervals,))
 
 
 class _Runs:
@@ -117,19 +128,19 @@ class _Runs:
         self._asked[name] += 1
         return self._asked[name] > FEW
 
-    def end(self, x: Array, u: Array, duration: float, parameters: Array) -> Array:
-        """The state after all intervals, run from a state."""
+    def states(self, x: Array, u: Array, duration: float, parameters: Array) -> Array:
+        """The states at the ends of all intervals, run from a state, which is the first of them."""
         st, mesh, count = self._statement, self._mesh, self._mesh.intervals
-        if self._often("end"):
-            return np.asarray(nominal_states(st, mesh, x, u, duration, parameters)[-1])
+        if self._often("states"):
+            return nominal_states(st, mesh, x, u, duration, parameters)
         common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
         advance = nominal_interval(st, mesh.substeps, mesh.step)
-        value: Any = ca.DM(x)
+        values: list[Any] = [ca.DM(x)]
         lengths = [min(NUMERIC_RUN, count - first) for first in range(0, count, NUMERIC_RUN)]
         pieces = [ca.horzsplit(ca.DM(column), NUMERIC_RUN) for column in common]
         for length, *columns in zip(lengths, *pieces, strict=True):
-            value = sequence_of(advance, length)(value, *columns)[0][:, -1]
-        return np.asarray(ca.DM(value).full()).ravel()
+            values.append(sequence_of(advance, length)(values[-1][:, -1], *columns)[0])
+        return np.asarray(ca.DM(ca.horzcat(*values)).full()).T
 
 
 @lru_cache(maxsize=MESHES)

@@ -21,6 +21,10 @@ STRETCH = 10.0
 # Least magnitude of a state that starts at (or keeps near) nothing, as a share of the range of its bounds or of 1, the
 # lesser one: at a start, which may not have moved it yet, and at a point that was reached, where less is roundoff.
 AT_START, REACHED = 1e-3, 1e-9
+# A standard deviation counts up to so many times the values at the ends (1 where they tell none), at a start and at a
+# point that was reached: a large prior says that little is known, not that the nominal goes there. In far too large
+# units of state and control a cost has the size of what they change of it, and any point looks converged.
+PRIOR_AT_START, PRIOR_REACHED = 1e3, 10.0
 # Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
 GIVEN_SHARE = 1e-6
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
@@ -52,16 +56,11 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array, *, re
     """
     x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
-    candidates = [np.abs(guess.x).max(axis=0, initial=0.0), np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf))]
-    for block in statement.matrices:
-        if block.estimation:
-            diagonal = np.diagonal(unpack(np.nan_to_num(e0[block.span]), block.size))
-            known = min(statement.nx, block.size)  # constants to be chosen are states that nothing estimates
-            deviations = np.zeros(statement.nx)
-            deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
-            candidates.append(deviations)
+    ends = np.maximum(np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf)))
+    most = (PRIOR_REACHED if reached else PRIOR_AT_START) * np.where(ends > 0, ends, 1.0)
+    deviations = np.minimum(_deviations(statement, e0), most)
+    found = np.max([np.abs(guess.x).max(axis=0, initial=0.0), ends, deviations], axis=0)
     span = np.where(upper > lower, upper - lower, np.inf)
-    found = np.max(candidates, axis=0)
     limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
     alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
     alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
@@ -75,6 +74,17 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array, *, re
         size = np.minimum(np.where(own > 0, own, 1.0), _half_range(statement, block))
         u[block.span] = _as_given(statement, block, size, own > 0, reached)
     return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+
+
+def _deviations(statement: Statement, e: Array) -> Array:
+    """Standard deviations of the states by some half-vectors (ne,), shape (nx,); 0 of those that nothing estimates."""
+    deviations = np.zeros(statement.nx)
+    for block in statement.matrices:
+        if block.estimation:
+            diagonal = np.diagonal(unpack(np.nan_to_num(e[block.span]), block.size))
+            known = min(statement.nx, block.size)  # constants to be chosen are states that nothing estimates
+            deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
+    return deviations
 
 
 def choose_scales(
