@@ -35,8 +35,6 @@ TRIALS = 15
 # Changes of the cost below this share of it are lost in the integration errors: there the merit is not asked.
 COST_ACCURACY = 1e-7
 SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-4, 1e8
-# Share of the largest cost below which one has vanished: its slopes and their own terms then fall together.
-VANISHED = 1e-20
 # Past steps whose change of slope the metric remembers.
 PAIRS = 20
 # The multiplier's weight in the merit.
@@ -77,7 +75,7 @@ class Settings:
 
 @dataclass(kw_only=True)
 class _Control:
-    """What the step control remembers: w, its increase, d, past steps, merit weights, costs and misses, the largest."""
+    """What the step control remembers: w, its increase, d, past steps, merit weights, past costs and misses."""
 
     weight: float
     fraction: float
@@ -86,7 +84,6 @@ class _Control:
     pairs: list[Pair] = field(default_factory=list)
     past: list[tuple[float, Array]] = field(default_factory=list)
     iterations: int = 0
-    largest: float = 0.0
     nearest: tuple[float, int] = (np.inf, 0)
     history: list[dict[str, float]] = field(default_factory=list)
 
@@ -192,12 +189,9 @@ class Search:
     def _arrived(self, current: Iterate, linear: Linear, measures: Measures, tolerance: float) -> bool:
         """The stop test of a pass: in the scales of the start, and in those of the point that was reached.
 
-        What inequalities still leave is for the passes. Where the cost has vanished the second one decides.
+        What inequalities still leave is for the passes.
         """
-        size = self.space.cost_size(current)
-        self.control.largest = max(self.control.largest, size)
-        steep = measures.slope > tolerance and size > VANISHED * self.control.largest
-        if steep or measures.miss > TERMINAL_SHARE * self.settings.violation_tolerance:
+        if measures.slope > tolerance or measures.miss > TERMINAL_SHARE * self.settings.violation_tolerance:
             return False
         self.reached = self.space.reached(current, linear, measures)
         left = replace(self.reached, complementarity=0.0, infeasibility=0.0) if self.space.groups else self.reached

@@ -375,3 +375,17 @@ def test_a_plant_that_runs_away_ends_as_an_error_without_numpy_telling_of_overfl
     ocp.minimize(running=u**2 + x**2)
     with pytest.raises(co.SolveError):
         co.solve(ocp, "gradient", max_iterations=10, progress=False)
+
+
+@pytest.mark.parametrize("final", [None, 0.0])
+@pytest.mark.parametrize("variant", ["gradient", "chord"])
+def test_where_nothing_is_to_be_done_the_controls_are_zero(final, variant):
+    """All terms of H_u fall with the controls, none is small beside the others: runs went on to a cost of 1e-267."""
+    ocp = co.Problem(10.0)
+    x, u = ocp.state("x", initial=0.0, final=final), ocp.control("u", guess=1.0)
+    ocp.dynamics(x, -x + u)
+    ocp.minimize(running=0.5 * u**2)
+    solution = co.solve(ocp, "gradient", variant=variant, progress=False)
+    assert solution.cost == 0.0
+    assert not solution.controls.any()
+    assert solution.stats["iterations"] <= 3

@@ -243,13 +243,16 @@ def _divided(
 def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:
     """`node_error` where a few more steps suffice against what an unstable plant makes of them; else 0.
 
-    Over a long horizon no steps do, and roundoff and what the solver left of the gaps grow as they do.
+    Over a long horizon no steps do, and roundoff and what the solver left of the gaps grow as they do. What an
+    oscillator adds up is told as it is: against it the segments by themselves are looked at.
     """
     mesh = extremal.mesh
     if np.any(gaps) or len(mesh.segments) == 1:
         return 0.0
     error = node_error(extremal)
     if not error > allowed or not mesh.substeps * (margin * error / allowed) ** (1 / order) <= MOST_AGAINST_GROWTH:
+        return 0.0
+    if unstable(extremal) is None:
         return 0.0
     own = refined_run(extremal.statement, mesh, extremal.trajectory, extremal.parameters, parts=1).jumps
     halved = _halved(extremal).jumps

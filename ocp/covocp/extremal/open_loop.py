@@ -21,7 +21,7 @@ from covocp.transcription.trajectory import Trajectory
 
 # A plant amplifies where the nodes are left by so many times what all segments by themselves are off, and by no less
 # than a share of the range of an entry: what it amplifies then changes the cost by the square as well.
-AMPLIFIES, SEEN = 2.0, 1e-4
+AMPLIFIES, SEEN = 4.0, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
