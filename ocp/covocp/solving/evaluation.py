@@ -19,6 +19,7 @@ from covocp.base.later import later
 from covocp.base.matrices import Array, distinct, stacked, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import close_loop, densities, start_covariance, variances
+from covocp.extremal.densities import check_noise
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.joint import Statistics
@@ -90,7 +91,8 @@ def evaluate(
         filter of the design computes, the actual one is `loop.E`. Multipliers and costates are the design's.
 
     Raises:
-        ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
+        ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols, noise along
+            the nominal is none (negative, or of a measurement zero).
         SolveError: a phase, or what it gives to the next one, becomes NaN or inf along the nominal.
     """
     if isinstance(problem, (Solution, PhasesSolution)):
@@ -143,6 +145,7 @@ def _along(
         if not shorter.converged:
             break
         outcome, given = shorter, finer
+    check_noise(outcome.extremal)
     if outcome.converged:
         check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
     with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
