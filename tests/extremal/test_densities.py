@@ -22,9 +22,9 @@ def moving(measurement, process=lambda ocp: 0.1, **at):
 @pytest.mark.parametrize(
     ("measurement", "process", "words"),
     [
-        (lambda ocp: 1 - 0.41 * ocp.time, lambda ocp: 0.1, ("measurement noise of m", "t = 2.44 s")),
-        (lambda ocp: (ocp.time - 2) ** 2, lambda ocp: 0.1, ("measurement noise of m", "t = 2 s")),
-        (lambda ocp: 1.0, lambda ocp: 0.3 - 0.12 * ocp.time, ("process noise of x is negative", "t = 2.52 s")),
+        (lambda ocp: 1 - 0.41 * ocp.time, lambda ocp: 0.1, ("measurement noise density of m", "t = 2.44 s")),
+        (lambda ocp: (ocp.time - 2) ** 2, lambda ocp: 0.1, ("measurement noise density of m", "t = 2 s")),
+        (lambda ocp: 1.0, lambda ocp: 0.3 - 0.12 * ocp.time, ("process noise density of x is negative", "t = 2.52 s")),
     ],
 )
 def test_density_that_no_noise_has_is_no_solution(measurement, process, words):
@@ -36,14 +36,14 @@ def test_density_that_no_noise_has_is_no_solution(measurement, process, words):
 
 
 FALLING = [
-    ({"measurement": lambda ocp: 1 - 0.41 * ocp.time}, "measurement noise of m is not positive at t = 2.44 s"),
+    ({"measurement": lambda ocp: 1 - 0.41 * ocp.time}, "measurement noise density of m is not positive at t = 2.44 s"),
     (
         {"measurement": lambda ocp: 1.0, "process": lambda ocp: 0.3 - 0.12 * ocp.time},
-        "noise of x is negative at t = 2.52",
+        "process noise density of x is negative at t = 2.52",
     ),
     (
         {"measurement": lambda ocp: 1 - 0.41 * ocp.time, "at": [0.0, 1.0, 3.0, 4.0]},
-        "variance of the measurement noise of m is not positive at t = 3 s",
+        "measurement noise variance of m is not positive at t = 3 s",
     ),
 ]
 
@@ -61,7 +61,7 @@ def test_variance_of_a_reading_counts_where_it_is_read(options):
     own = {"intervals": 20, "progress": False, **options}
     costs = [co.solve(moving(noise, at=[0.5, 3.5]), **own).cost for noise in (falling, plain)]
     assert costs[0] == pytest.approx(costs[1], rel=1e-6)
-    with pytest.raises(co.SolveError, match="measurement noise of m is not positive at t = 2 s"):
+    with pytest.raises(co.SolveError, match="measurement noise variance of m is not positive at t = 2 s"):
         co.solve(moving(falling, at=[0.5, 2.0]), **own)
 
 
@@ -92,7 +92,7 @@ def test_noise_is_judged_in_units_of_its_own():
     ocp.dynamics(angle, u, noise=1e-9 * (1.5 - ocp.time))
     E = ocp.estimation_covariance()
     ocp.minimize(running=u**2, terminal=1e8 * E[angle, angle])
-    with pytest.raises(co.ProblemError, match=r"process noise of angle is negative at t = 1\.52 s"):
+    with pytest.raises(co.ProblemError, match=r"process noise density of angle is negative at t = 1\.52 s"):
         co.evaluate(ocp, nominal={"u": 1.0})
 
 
@@ -117,7 +117,7 @@ def jumping(noise, end):
 
 def test_noise_of_a_jump_that_none_can_be():
     """E is 0.25 before the jump, x is 1: noise of -0.01 leaves a covariance, but is none."""
-    noise = "noise of the jump from 'A' to 'B' of x is negative at t = 1 s"
+    noise = "noise variance of the jump from 'A' to 'B' of x is negative at t = 1 s"
     phases = jumping(lambda x: 0.19 - 0.2 * x, 1.0)
     with pytest.raises(co.SolveError, match=noise) as caught:
         co.solve(phases, intervals=10, progress=False)
@@ -135,7 +135,7 @@ def test_noise_of_a_phase_that_none_can_be():
     second = phases.problems[1]
     y = second.states[0].symbol
     second.measurement("late", y, noise=1.5 - y, at=[0.25, 0.75])
-    where = "measurement noise of late is not positive at t = 0.25 s"
+    where = "measurement noise variance of late is not positive at t = 0.25 s"
     with pytest.raises(co.ProblemError, match=f"phase 'B': .*{where}"):
         co.evaluate(phases, nominal=[{"u": 1.0}, {"w": 3.0}], intervals=10)
     second.subject_to(y, lower=4.0, upper=4.0, at="final")

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from covocp.base.checks import check_density
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array, stacked, unpack
 from covocp.base.short_repr import short_repr
@@ -53,6 +54,18 @@ class Noise:
     remedy: str = NOT_NEGATIVE
 
     __repr__ = short_repr
+
+
+class Truth(NamedTuple):
+    """A system that flies along the trajectory of another one, whose states are the first ones, with its parameters."""
+
+    statement: Statement
+    parameters: Array
+
+    def columns(self, extremal: Extremal, nodes: Any) -> tuple[Array, ...]:
+        """Arguments (state, control, time, duration, parameters) of its functions at some nodes, a column each."""
+        x, u, _, *rest, _ = (np.asarray(column)[:, nodes] for column in extremal.columns())
+        return x[: self.statement.nx], u[: self.statement.nu], *rest, np.tile(self.parameters[:, None], (1, nodes.size))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +141,7 @@ def impossible_jump(link: Link, before: Statement, after: Statement, ends: JumpE
         return None
     added, passed = link.variances(after, *ends)
     noise = Noise(
-        what=f"variance of the noise of the jump from '{before.name}' to '{after.name}' of",
+        what=f"noise variance of the jump from '{before.name}' to '{after.name}' of",
         matrices=added[None],
         time=np.array([ends[2]]),
         rows=after.augmented,
@@ -149,64 +162,76 @@ def impossible_in_phases(extremals: Sequence[Extremal], links: Sequence[Link]) -
     return ""
 
 
-def noises_along(extremal: Extremal) -> Iterator[Noise]:
-    """All noises of the statement of a trajectory, where the nominal has values; constant ones once."""
-    st, mesh = extremal.statement, extremal.mesh
+def noises_along(extremal: Extremal, truth: Truth | None = None) -> Iterator[Noise]:
+    """All noises along a trajectory, where the nominal has values; constant ones once.
+
+    Args:
+        extremal: the trajectory.
+        truth: the system whose noises they are, which may be none; None: that of the trajectory.
+    """
+    own, mesh = truth or Truth(extremal.statement, extremal.parameters), extremal.mesh
+    st, definite = own.statement, truth is None
     known = np.flatnonzero(np.isfinite(extremal.trajectory.x).all(axis=1))
     nodes = known if st.noise_varies else known[:1]
     if not nodes.size:
         return
-    x, u, _, *rest = (np.asarray(column)[:, nodes] for column in extremal.columns())
-    count, time = nodes.size, extremal.time[nodes]
+    at, count, time = own.columns(extremal, nodes), nodes.size, extremal.time[nodes]
     for block, form in zip(st.matrices, st.riccati, strict=True):
         if block.estimation and form is not None:
-            noise = stacked(form.map(count)(x, u, *rest)[1], count)
-            variances = np.diagonal(unpack(extremal.trajectory.e[known][:, block.span], block.size), axis1=1, axis2=2)
-            grown = np.nan_to_num(variances, nan=0.0).min(axis=0).clip(0.0) / extremal.trajectory.duration
-            what = "density of the process noise of"
-            yield Noise(what=what, matrices=noise, time=time, rows=st.augmented, beside=grown)
+            noise = stacked(form.map(count)(*at)[1], count)
+            yield Noise(
+                what="process noise density of",
+                matrices=noise,
+                time=time,
+                rows=st.augmented,
+                beside=_grown(extremal, known),
+            )
     if st.information is not None:
-        stated = stacked(st.information.map(count)(x, u, *rest), count)
-        largest = np.abs(np.nan_to_num(stated, posinf=0.0)).max(initial=0.0)
-        yield Noise(
-            what="information of a measurement",
-            matrices=stated * np.eye(stated.shape[1]),
-            time=time,
-            beside=np.full(stated.shape[1], largest),
-        )
+        stated = stacked(st.information.map(count)(*at), count)
+        size, largest = stated.shape[1], np.abs(np.nan_to_num(stated, posinf=0.0)).max(initial=0.0)
+        what, beside = "information of a measurement", np.full(size, largest)
+        yield Noise(what=what, matrices=stated * np.eye(size), time=time, beside=beside)
     if st.measurement is not None:
-        _, slopes, density = (stacked(v, count) for v in st.measurement.map(count)(x, u, *rest))
+        _, slopes, density = (stacked(v, count) for v in st.measurement.map(count)(*at))
         seen = _largest(extremal, slopes, nodes) * extremal.trajectory.duration
         for block in st.measurements:
             yield Noise(
-                what=f"density of the measurement noise of {block.name}",
+                what=f"measurement noise density of {block.name}",
                 matrices=density[:, block.span, block.span],
                 time=time,
-                definite=True,
-                beside=seen[block.span],
-                remedy=SWITCHED,
+                definite=definite,
+                beside=seen[block.span] if definite else None,
+                remedy=SWITCHED if definite else NOT_NEGATIVE,
             )
     taken = [k for k in mesh.instants if mesh.readings[:, k].any() and k in set(known.tolist())]
     if st.samples is not None and taken:
-        yield from _read(extremal, np.array(taken))
+        yield from _read(extremal, own, np.array(taken), definite)
 
 
-def _read(extremal: Extremal, nodes: Any) -> Iterator[Noise]:
+def _read(extremal: Extremal, own: Truth, nodes: Any, definite: bool) -> Iterator[Noise]:
     """The noise of each measurement at instants, where it is read."""
-    st, count = extremal.statement, nodes.size
-    assert st.samples is not None
-    x, u, _, *rest = (np.asarray(column)[:, nodes] for column in extremal.columns())
-    _, slopes, variance = (stacked(v, count) for v in st.samples.measurement.map(count)(x, u, *rest))
+    samples, count = own.statement.samples, nodes.size
+    assert samples is not None
+    _, slopes, variance = (stacked(v, count) for v in samples.measurement.map(count)(*own.columns(extremal, nodes)))
     seen = _largest(extremal, slopes, nodes)
-    for block, own in zip(st.samples.blocks, extremal.mesh.readings[:, nodes] > 0, strict=True):
+    for block, taken in zip(samples.blocks, extremal.mesh.readings[:, nodes] > 0, strict=True):
         yield Noise(
-            what=f"variance of the measurement noise of {block.name}",
-            matrices=variance[own][:, block.span, block.span],
-            time=extremal.time[nodes][own],
-            definite=True,
-            beside=seen[block.span],
-            remedy=ABOVE_ZERO,
+            what=f"measurement noise variance of {block.name}",
+            matrices=variance[taken][:, block.span, block.span],
+            time=extremal.time[nodes][taken],
+            definite=definite,
+            beside=seen[block.span] if definite else None,
+            remedy=ABOVE_ZERO if definite else NOT_NEGATIVE,
         )
+
+
+def _grown(extremal: Extremal, nodes: Any) -> Array | None:
+    """The least variance of each row of the augmented state along the way, over the duration; None without E."""
+    if not extremal.statement.estimated:
+        return None
+    block = extremal.statement.estimation
+    variances = np.diagonal(unpack(extremal.trajectory.e[nodes][:, block.span], block.size), axis1=1, axis2=2)
+    return np.asarray(np.nan_to_num(variances).min(axis=0).clip(0.0) / extremal.trajectory.duration)
 
 
 def _largest(extremal: Extremal, slopes: Array, nodes: Any) -> Array:
@@ -289,6 +314,43 @@ def check_noise(extremal: Extremal) -> None:
     found = impossible_noise(extremal)
     if found is not None:
         raise found.error("along this nominal")
+
+
+def check_truth(extremal: Extremal, truth: Statement, parameters: Array, initial: Array) -> None:
+    """What is truly uncertain along a trajectory must be a covariance, a density or a variance; none at all is one too.
+
+    Args:
+        extremal: the trajectory.
+        truth: the true system.
+        parameters: its own.
+        initial: covariance of its deviation at the start, (n, n).
+
+    Raises:
+        ProblemError: names it, and the time.
+    """
+    check_density("truth", "initial covariance", initial, definite=False)
+    found = first_impossible(noises_along(extremal, Truth(truth, parameters)))
+    if found is not None:
+        raise found.error("along the nominal, in the truth")
+
+
+def check_true_jump(link: Link, before: Extremal, truths: tuple[Truth, Truth]) -> None:
+    """The noise of a true jump at the end of a trajectory must be one.
+
+    Args:
+        link: of the truth.
+        before: the trajectory.
+        truths: what ends there, and what begins.
+
+    Raises:
+        ProblemError: names what jumps.
+    """
+    one, two = truths
+    t, none = before.trajectory, np.zeros(one.statement.ne)
+    ends = (t.x[-1, : one.statement.nx], none, t.duration, one.parameters, two.parameters)
+    found = impossible_jump(link, one.statement, two.statement, ends)
+    if found is not None:
+        raise found.error("in the truth")
 
 
 def check_jump_noise(link: Link, before: Extremal, after: Statement, parameters: Array) -> None:

@@ -17,7 +17,7 @@ from covocp.base.errors import OutsideDomainError, ProblemError, SolveError, eva
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.densities import check_jump_noise, check_noise
+from covocp.extremal.densities import Truth, check_jump_noise, check_noise, check_true_jump
 from covocp.extremal.extremal import Outcome
 from covocp.extremal.joint import Statistics
 from covocp.extremal.links import ChainOutcome
@@ -303,6 +303,9 @@ def _true_chain(solution: PhasesSolution, truth: Given) -> ChainStatistics:
     truly = ChainStatistics(phases=tuple(found), links=chain.links)
     for k in range(len(chain.links)):
         _check_jump(solution, truly, k)
+        pair = zip(chain.statements[k : k + 2], values[k : k + 2], strict=True)
+        one, two = (Truth(*entry) for entry in pair)
+        check_true_jump(chain.links[k], solution[k].extremal, (one, two))
     return truly
 
 
