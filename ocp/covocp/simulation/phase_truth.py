@@ -18,7 +18,7 @@ from covocp.problem.phase_chain import chain_of
 from covocp.problem.phase_feedback import in_phase
 from covocp.problem.phases import Phases
 from covocp.simulation.actual import System, actual_system, plain_truth, stated_system
-from covocp.simulation.stretch import in_words
+from covocp.simulation.stretch import cost_of_runs, in_words
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
@@ -58,7 +58,7 @@ def actual_phases(solution: PhasesSolution, designs: tuple[System, ...], truth: 
     Raises:
         ProblemError: it is none of these, or names or sizes differ.
     """
-    costs = np.array([phase.cost for phase in solution])
+    costs = np.array([cost_of_runs(phase) for phase in solution])
     if truth is None:
         return ActualPhases(systems=designs, links=solution.links, fixed=frozenset(), words="", costs=costs)
     fixed: set[str] = set()
@@ -107,6 +107,6 @@ def in_its_phase(phase: Solution, make: Callable[..., Made], *arguments: Any) ->
 def _true_costs(solution: PhasesSolution, truth: Given) -> Array:
     """Expected costs by linear theory; NaN where that knows other statistics only."""
     try:
-        return np.array([phase.cost for phase in evaluate(solution, truth=truth)])
+        return np.array([cost_of_runs(phase) for phase in evaluate(solution, truth=truth)])
     except (ProblemError, RuntimeError):
         return np.full(len(solution), np.nan)

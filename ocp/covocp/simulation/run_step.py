@@ -180,7 +180,12 @@ def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
         parts += [gathered[k] for k in run.sums]
     if design.statement.loop is not None:
         cost = design.statement.loop.running(state, u, c["t"], setting.solution.duration, p)
-        parts.append(cost + ca.dot(moved, c["extra"] @ moved) / 2)
+        cost += ca.dot(moved, c["extra"] @ moved) / 2
+        if design.statement.loop.weighed is not None:  # a run has no covariance X, but the deviations of which it is
+            d = part(deviations(run, z, c), 0, design.size)
+            of_state, crossed = ca.horzsplit(c["weighed"], [0, design.size, design.size + design.fed_back])
+            cost += ca.dot(d, of_state @ d) / 2 + ca.dot(d, crossed @ moved)
+        parts.append(cost)
     return ca.vertcat(*parts), u
 
 
