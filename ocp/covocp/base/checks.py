@@ -14,6 +14,9 @@ from covocp.base.errors import ProblemError, kind_and_name, shown
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers
 
+# Difference of two entries of a matrix, relative to its largest one, above which it is not symmetric.
+ASYMMETRY = 1e-9
+
 
 def caller() -> str:
     """File and line of the user's code that called into covocp."""
@@ -193,7 +196,8 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
     values = [generator.uniform(0.5, 1.5, symbol.shape) for symbol in symbols]
     numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
     difference = np.abs(numbers - numbers.T)
-    if np.isfinite(numbers).all() and (difference > 1e-9 * np.abs(numbers).max(initial=0.0)).any():
+    if np.isfinite(numbers).all() and (difference > ASYMMETRY * np.abs(numbers).max(initial=0.0)).any():
+        _check_parameters(name, what, expression, values)
         i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
         raise ProblemError(
             f"The {what} of '{name}' is not symmetric.",
@@ -201,6 +205,31 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
             received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
             remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
         )
+
+
+def _check_parameters(name: str, what: str, expression: ca.MX, values: list[Array]) -> None:
+    """A matrix that is symmetric where square parameters in it are does not say that they are.
+
+    Raises:
+        ProblemError: names the first of them.
+    """
+    symbols, even, square = ca.symvar(expression), [], []
+    for symbol, value in zip(symbols, values, strict=True):
+        size = math.isqrt(value.size)
+        if size > 1 and size**2 == value.size:
+            square.append(f"{symbol.name()} ({size} x {size})")
+            value = (value.reshape(size, size) + value.reshape(size, size).T).reshape(value.shape)
+        even.append(value)
+    numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(even)[0].full())
+    if not square or (np.abs(numbers - numbers.T) > ASYMMETRY * np.abs(numbers).max(initial=0.0)).any():
+        return
+    first = square[0].split(" ")[0]
+    raise ProblemError(
+        f"The {what} of '{name}' is symmetric only where '{first}' is, and nothing says that it is.",
+        expected="an expression that is symmetric for all values of what is in it",
+        received=f"{', '.join(square)}, all of whose entries are free",
+        remedy=f"write ({first} + {first}.T) / 2 for {first}",
+    )
 
 
 def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:
