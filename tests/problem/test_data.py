@@ -136,7 +136,7 @@ def test_a_free_duration_is_covered_up_to_its_bound():
         ([0.0, 5.0], [1.0, 2.0], "linear", ["do not cover", "0 to 10 s", "0 to 5 s"]),
         ([0.1, 10.0], [1.0, 2.0], "linear", ["do not cover", "0.1 to 10 s"]),
         ([0.0, 6.0, 6.0, 10.0], [1.0, 2.0, 3.0, 4.0], "linear", ["do not rise", "6, then 6"]),
-        ([0.0, np.nan, 10.0], [1.0, 2.0, 3.0], "linear", ["no numbers"]),
+        ([0.0, np.nan, 10.0], [1.0, 2.0, 3.0], "linear", ["not finite"]),
         ([0.0, 10.0], [1.0, np.nan], "linear", ["not finite"]),
         ([0.0, 10.0], [1.0, 2.0, 3.0], "linear", ["(2,)", "(3,)"]),
         ([0.0, 10.0], [[1.0, 2.0]], "linear", ["(1, 2)"]),

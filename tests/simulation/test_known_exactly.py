@@ -35,3 +35,37 @@ def test_more_than_the_error_of_steps_is_compared(predicted, sample, inside):
         name="x", predicted=predicted, sample=sample, low=0.9 * sample, high=1.1 * sample, bias=0, robust=0, exact=1e-7
     )
     assert component.inside == inside
+
+
+@pytest.mark.parametrize("start", [2.0, 2e7])
+def test_a_state_that_nothing_makes_uncertain_is_the_same_in_all_runs(start):
+    """Mass that the control burns: runs differ from the nominal by the steps of both, 3e-6 of it on a coarse mesh."""
+    ocp = co.Problem(4.0, name="ascent")
+    x, m = ocp.state("x", initial=0.0, final=2.0, variance=0.05), ocp.state("m", initial=start)
+    u = ocp.control("u", lower=0, upper=3)
+    ocp.dynamics(x, u, noise=0.01)
+    ocp.dynamics(m, -0.3 * u * m)
+    ocp.measurement("position", x, noise=0.02)
+    ocp.estimation_covariance()
+    ocp.minimize(running=u**2 * (1 + ocp.time))
+    runs = co.simulate(co.solve(ocp, intervals=8, progress=False), runs=300, seed=1, progress=False)
+    known = runs.verdict.deviations[1]
+    assert known.name == "m"
+    assert known.predicted == 0.0
+    assert 1e-8 * start < known.sample < 1e-5 * start
+    assert runs.verdict.holds, runs.verdict
+    assert "OUTSIDE" not in str(runs)
+
+
+def test_what_varies_by_second_order_alone_is_no_rounding():
+    """The integral of 1e-7 x^2 is 0 in the nominal; linear theory predicts no spread, runs have one."""
+    ocp = co.Problem(4.0, name="quadratic")
+    x, m = ocp.state("x", initial=0.0, final=0.0, variance=0.05), ocp.state("m", initial=1.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, u, noise=0.01)
+    ocp.dynamics(m, -1e-7 * x**2)
+    ocp.measurement("position", x, noise=0.02)
+    ocp.estimation_covariance()
+    ocp.minimize(running=u**2)
+    runs = co.simulate(co.solve(ocp, intervals=8, progress=False), runs=300, seed=1, progress=False)
+    assert runs.verdict.outside[-1] == "m"

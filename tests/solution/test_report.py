@@ -263,3 +263,30 @@ def test_what_path_constraints_do_between_the_nodes():
         solution = co.solve(ocp, intervals=5, progress=False)
     assert "between them that of 'obstacle' is passed by up to 0.01" in " ".join(str(solution).split())
     assert "between them" not in str(co.solve(unknown_lag.problem(), intervals=50, progress=False))
+
+
+def gyroscope(**prescribed):
+    """An attitude and a bias that are known to micro-radians: multipliers of the positive bounds of their variances."""
+    ocp = co.Problem(10.0, name="gyroscope")
+    angle, bias = (ocp.state(name, initial=0.0, variance=1e-8) for name in ("angle", "bias"))
+    u = ocp.control("u")
+    ocp.dynamics(angle, u + bias, noise=1e-12)
+    ocp.dynamics(bias, -bias / 100, noise=1e-14)
+    ocp.measurement("star", angle, noise=1e-10 * (1 + 1e3 * u**2), every=1.0)
+    E = ocp.estimation_covariance()
+    P, w = ocp.symmetric("P", 1, initial=1.0, **prescribed), ocp.control("w")
+    ocp.dynamics(P, w)
+    ocp.subject_to(E[angle, angle] / 1e-8, upper=2.0, name="limit")
+    ocp.subject_to(angle, lower=0.1, upper=0.1, at="final")
+    ocp.minimize(running=u**2 + w**2 + 1e6 * E[angle, angle])
+    return co.solve(ocp, intervals=10, covariances="states", progress=False)
+
+
+@pytest.mark.filterwarnings("ignore::covocp.CovocpWarning")
+def test_only_what_was_fixed_is_called_fixed():
+    """Of the integral of w^2 over 10 s from 1 to 2 the multiplier is -0.2."""
+    free = gyroscope()
+    assert np.abs(free.multiplier("E")).max() > 1e-6 * free.cost
+    assert "fixed at T" not in str(free)
+    fixed = str(gyroscope(final=2.0)).split("fixed at T")[1].split("necessary")[0]
+    assert fixed.split() == ["multiplier", "P[0,", "0]", "-0.2"]

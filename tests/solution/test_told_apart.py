@@ -407,6 +407,7 @@ COMPARED: dict[type, dict[str, str]] = {
         "running": "values",
         "terminal": "values",
         "extra_control": "- weights less running cost",
+        "weighed": "- part of the weights",
         "by_parts": "- rates and costs",
         "spread": "- in the expected running cost",
         "spread_end": "- in the expected terminal cost",

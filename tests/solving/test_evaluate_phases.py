@@ -215,7 +215,7 @@ def test_a_truth_by_a_parameter_counts_in_all_phases() -> None:
         (co.Phases([integrator(n, first=n == "a") for n in "abc"]), "3 phases"),
         (3, "unknown kind"),
         ({"z": 1.0}, "There is no parameter 'z'"),
-        (kicked(noise=-1.0), "In the phase 'one'.*truth.*density"),
+        (kicked(noise=-1.0), "In the phase 'one'.*density.*truth"),
         (phased_loops.bounce(), "In the phase 'fall'.*another system"),
     ],
 )

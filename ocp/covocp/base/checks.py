@@ -221,6 +221,7 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
     numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
     difference = np.abs(numbers - numbers.T)
     if np.isfinite(numbers).all() and (difference > SYMMETRIC * np.abs(numbers).max(initial=0.0)).any():
+        _check_parameters(name, what, expression, values)
         i, j = (int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
         raise ProblemError(
             f"The {what} of '{name}' is not symmetric.",
@@ -228,6 +229,31 @@ def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
             received=f"entries [{i}, {j}] and [{j}, {i}] that differ: {str(expression)[:120]}",
             remedy="write A @ P + P @ A.T, not 2 * A @ P; give both off-diagonal entries of a density",
         )
+
+
+def _check_parameters(name: str, what: str, expression: ca.MX, values: list[Array]) -> None:
+    """A matrix that is symmetric where square parameters in it are does not say that they are.
+
+    Raises:
+        ProblemError: names the first of them.
+    """
+    symbols, even, square = ca.symvar(expression), [], []
+    for symbol, value in zip(symbols, values, strict=True):
+        size = math.isqrt(value.size)
+        if size > 1 and size**2 == value.size:
+            square.append(f"{symbol.name()} ({size} x {size})")
+            value = (value.reshape(size, size) + value.reshape(size, size).T).reshape(value.shape)
+        even.append(value)
+    numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(even)[0].full())
+    if not square or (np.abs(numbers - numbers.T) > SYMMETRIC * np.abs(numbers).max(initial=0.0)).any():
+        return
+    first = square[0].split(" ")[0]
+    raise ProblemError(
+        f"The {what} of '{name}' is symmetric only where '{first}' is, and nothing says that it is.",
+        expected="an expression that is symmetric for all values of what is in it",
+        received=f"{', '.join(square)}, all of whose entries are free",
+        remedy=f"write ({first} + {first}.T) / 2 for {first}",
+    )
 
 
 def check_density(name: str, what: str, numbers: Array, *, definite: bool) -> None:

@@ -42,7 +42,7 @@ def quantile(probability: float) -> float:
     return -NORMAL.inv_cdf(1.0 - probability) if probability > 0.5 else NORMAL.inv_cdf(probability)
 
 
-def inside(y: Array, s: Array, lower: float, upper: float) -> Array:
+def inside(y: Array, s: Array, lower: Array | float, upper: Array | float) -> Array:
     """Probability that y + s z is between two limits, which may be infinite; where s is zero: whether y is."""
     y, s = (np.asarray(v, dtype=float) for v in np.broadcast_arrays(y, s))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

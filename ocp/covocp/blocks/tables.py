@@ -153,8 +153,11 @@ def table(name: str, grid: Given, values: Given, *, kind: Literal["linear", "cub
 def _knots(name: str, given: Given, kind: str) -> Array:
     """Knots of one variable, checked."""
     knots = np.array(as_number(name, "knots", given), dtype=float)
-    if knots.ndim != 1 or not np.isfinite(knots).all():
-        raise _wrong(name, "has knots that are no numbers", "finite numbers, shape (K,)", f"shape {knots.shape}")
+    if knots.ndim != 1:
+        expected = "shape (K,); of several variables a tuple of such, not a list or an array"
+        raise _wrong(name, "has knots of another shape", expected, f"shape {knots.shape}")
+    if not np.isfinite(knots).all():
+        raise _wrong(name, "has knots that are not finite", "finite numbers", "NaN or inf")
     if knots.size < FEWEST[kind]:
         raise _wrong(name, "has too few knots", f"at least {FEWEST[kind]} for kind='{kind}'", str(knots.size))
     if not (np.diff(knots) > 0).all():

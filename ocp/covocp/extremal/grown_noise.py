@@ -9,8 +9,8 @@ covariance of (d, y), the deviation and its estimate, adds to Z again:
 
     D' = A D + D A' + diag(tr(Q_zz (Z + dZ)), K tr(U_zz (Z + dZ)) K')/2,    left out: int tr(W D)/2 dt + tr(S D)/2.
 
-For a linear system whose densities are quadratic this is exact. It is integrated along the nodes by the trapezoidal
-rule; that D is in its own rate is met by repeating this.
+For a linear system whose densities are quadratic this is exact, but for its integration along the nodes by the
+trapezoidal rule, whose error falls with the square of their number; that D is in its own rate is met by repeating this.
 """
 
 from __future__ import annotations

@@ -266,6 +266,7 @@ def with_weights(problem: Declarations, expansion: Expansion, running: CostParts
             A=_folded(expansion.A + W[:n, :n]),
             B=_folded(expansion.B + W[n:, n:]),
             N=_folded(expansion.N + W[:n, n:]),
+            weighed=(W[:n, :n], W[:n, n:]),
         )
     if terminal.weights is not None:
         expansion = replace(expansion, end=_folded(expansion.end + terminal.weights[:n, :n]))

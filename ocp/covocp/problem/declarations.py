@@ -304,6 +304,7 @@ class Expansion:
     F, G: slopes of the rates by the augmented state and by the control; A, B, N: second derivatives of the running
     cost with the weights; Q: process noise; end: S(T); running, terminal: L and k; gain: the feedback gain C.
     spread: what nonlinear terms of the covariance X of the closed loop add to the running and to the terminal cost.
+    weighed: what the linear ones of the running cost add to A and N; None without them.
     shared: whether the gain is optimised because of what some phase of several asks for.
     """
 
@@ -320,6 +321,7 @@ class Expansion:
     alternative: ca.MX | None = None
     product: ca.MX | None = None
     spread: tuple[ca.MX, ca.MX] | None = None
+    weighed: tuple[ca.MX, ca.MX] | None = None
     shared: bool = False
 
     __repr__ = short_repr

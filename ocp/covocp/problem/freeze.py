@@ -388,6 +388,9 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
         extra_control=stacked.function(
             "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
         ),
+        weighed=None
+        if v.weighed is None
+        else stacked.function("weighed", list(map(ca.densify, stacked.substitute(*v.weighed))), without=("matrices",)),
         by_parts=by_parts,
         spread=spread,
         spread_end=spread_end,

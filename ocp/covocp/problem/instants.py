@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from covocp.base.checks import as_number, is_scalar
+from covocp.base.checks import as_number, is_scalar, is_symbolic
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
@@ -78,6 +78,13 @@ def _periodic(name: str, every: Given, duration: float) -> tuple[float, ...]:
 
 def _checked(name: str, at: Given, duration: float) -> Array:
     """Instants that were given, divided by the duration."""
+    if any(is_symbolic(entry) for entry in (at if isinstance(at, (list, tuple)) else [at])):
+        raise ProblemError(
+            f"The instants at= of the measurement '{name}' contain an expression.",
+            expected="numbers: instants are nodes of every mesh, and are not chosen",
+            received=f"at={at}"[:200],
+            remedy="give numbers; to choose an instant end a phase of Free duration there, and measure at its end",
+        )
     times = as_number(name, "instants at=", at).ravel()
     _check_count(name, times.size)
     shares = times / duration

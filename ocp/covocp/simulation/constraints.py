@@ -19,7 +19,7 @@ import numpy as np
 from scipy import special
 
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.prediction import Prediction
@@ -28,10 +28,16 @@ from covocp.simulation.schedule import Nominal
 from covocp.solution.solution import Solution
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Conditions, Statement, entry_names
+from covocp.transcription.scales import limit_units, magnitudes
 
 Place = Literal["path", "initial", "final", "inside"]
 # Limits count as kept within this share of their size.
 MARGIN = 1e-9
+# Share of its unit by which a nominal may pass a limit and have met it: solvers do so by some 1e-8.
+SOLVED = 1e-7
+# The same of what is known exactly, by which runs may do so besides: they take other steps than the nominal. It is
+# known exactly where its spread is less than the second share.
+STEPPED, ROUNDED = 1e-6, 1e-12
 # Share of the duration by which a time may miss an instant and be it.
 SAME = 1e-9
 
@@ -138,17 +144,16 @@ def _counted(st: Statement, states: int, fed_back: int) -> Rows:
 
 def _add_chance(limits: ChanceLimits, column: Any, rows: list[Row], values: list[Any]) -> None:
     """Rows of a condition on a probability: the expression itself, and whether all of them hold together."""
-    first, rooms = len(rows), []
+    first = len(rows)
     for i, name in enumerate(limits.names):
         low, high = float(limits.lower[i]), float(limits.upper[i])
         rows.append(Row(name=name, place=limits.place, lower=low, upper=high, bound=False, chance=True))
         values.append(column[i])
-        rooms.append(1 - beyond(column[i], low, high))
     if limits.joint:
         parts = tuple(range(first, len(rows)))
-        one = Row(name=limits.name, place=limits.place, lower=0.5, upper=np.inf, bound=False, chance=True, parts=parts)
-        rows.append(one)
-        values.append(ca.mmin(ca.vertcat(*rooms)))
+        name, place = limits.name, limits.place  # it is kept where its parts are, and has no limits of its own
+        rows.append(Row(name=name, place=place, lower=-np.inf, upper=np.inf, bound=False, chance=True, parts=parts))
+        values.append(0)
 
 
 class _Bound(NamedTuple):
@@ -193,17 +198,84 @@ def violations(run: Run, z: Given, fed: Given, c: dict[str, Any]) -> Any:
     known = ca.DM(solution.parameters[: solution.parameters.size - design.unknowns])
     matrices = c["e"] if c["e"].shape[0] else run.symbolic.zeros(design.statement.ne)  # no constraint uses them
     values = chosen.function(state, u, matrices, c["t"], solution.duration, ca.vertcat(known, run.own))
-    return ca.vertcat(*(beyond(values[i], row.lower, row.upper) for i, row in enumerate(chosen.rows)))
+    allowed = margins(solution, design).tolist()
+    flags: list[Any] = []
+    for i, row in enumerate(chosen.rows):
+        own = beyond(values[i], row.lower, row.upper, allowed[i])
+        flags.append(ca.mmax(ca.vertcat(*(flags[k] for k in row.parts))) if row.parts else own)
+    return ca.vertcat(*flags)
 
 
-def beyond(value: Given, low: float, high: float) -> Any:
-    """One unless a value is inside its limits, but for rounding."""
+def beyond(value: Given, low: float, high: float, allowed: float = 0.0) -> Any:
+    """One unless a value is inside its limits, but for rounding and for what is allowed besides."""
     inside: Any = 1.0
     if np.isfinite(low):
-        inside = value >= low - MARGIN * max(1.0, abs(low))
+        inside = value >= low - MARGIN * max(1.0, abs(low)) - allowed
     if np.isfinite(high):
-        inside = ca.logic_and(inside, value <= high + MARGIN * max(1.0, abs(high)))
+        inside = ca.logic_and(inside, value <= high + MARGIN * max(1.0, abs(high)) + allowed)
     return ca.logic_not(inside)
+
+
+@lru_cache(maxsize=2)
+def margins(solution: Solution, design: System) -> Array:
+    """By how much a run may pass each limit and have kept it, (rows,): no more than its nominal was allowed to.
+
+    What is active is met by a solver to its accuracy only; all runs of what is known exactly would violate it then, and
+    half of those of the rest by as little. Of what is known exactly runs may differ from that by their steps.
+    """
+    chosen, st = counted_rows(design), design.statement
+    if not chosen.rows:
+        return np.zeros(0)
+    columns, count = solution.extremal.columns(), solution.t.size
+    values, slopes = (np.asarray(v.full()) for v in _linearised(st, design).map(count)(*columns))
+    spread = _largest_spread(solution, design, slopes.reshape(len(chosen.rows), count, -1))
+    units, result = _units(chosen, solution, values), np.zeros(len(chosen.rows))
+    for i, row in enumerate(chosen.rows):
+        once = row.among(solution.t)
+        own = values[i] if once is None else values[i, once : once + 1]
+        excess = float(np.max(np.maximum(row.lower - own, own - row.upper)))
+        if 0.0 < excess <= SOLVED * units[i]:
+            result[i] = excess
+        if spread[i] <= ROUNDED * units[i]:
+            result[i] = max(result[i], STEPPED * units[i])
+    return result
+
+
+def asked_margins(solution: Solution, least: Array, most: Array) -> Array:
+    """The same of the fed-back controls that a run asks for, between what counts as all that there is, (m,)."""
+    u = solution.trajectory.u[:, : least.size]
+    excess = np.maximum(least - u, u - most).max(axis=0, initial=0.0)
+    limits = np.abs(np.where(np.isfinite([least, most]), [least, most], 0.0)).max(axis=0, initial=0.0)
+    allowed = SOLVED * np.maximum(_scales(solution)[1][: least.size], limits)
+    return np.asarray(np.where(excess <= allowed, excess, 0.0))
+
+
+def _scales(solution: Solution) -> tuple[Array, Array]:
+    """Units in which solvers meet the bounds of states and controls."""
+    found = magnitudes(solution.extremal.statement, solution.trajectory, solution.parameters, reached=True)
+    return found.x, found.u
+
+
+def _units(chosen: Rows, solution: Solution, values: Array) -> Array:
+    """Units in which a solver meets each limit: that of the state or control, of a condition that of its limits."""
+    st = solution.extremal.statement
+    lower, upper = (np.array([getattr(row, side) for row in chosen.rows]) for side in ("lower", "upper"))
+    limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
+    units = limit_units(lower, upper)
+    for names, scales in zip((st.state_names, st.control_names), _scales(solution), strict=True):
+        for i, row in enumerate(chosen.rows):
+            if row.bound and row.name in names:
+                units[i] = scales[names.index(row.name)]
+    return np.asarray(np.maximum(units, limits))
+
+
+def _largest_spread(solution: Solution, design: System, slopes: Array) -> Array:
+    """An upper bound of the standard deviation of each inequality at any node, by the design, (rows,)."""
+    n, loop = design.size, solution.loop
+    E = unpack(solution.trajectory.e[:, design.covariance], n)
+    actual, estimate = (E, np.zeros_like(E)) if loop is None else (loop.X, loop.Xhat)
+    scatter = np.hstack([np.sqrt(np.diagonal(v, axis1=1, axis2=2).clip(0.0)) for v in (actual, estimate)])
+    return np.asarray(np.einsum("rkj,kj->rk", np.abs(slopes), scatter).max(axis=1, initial=0.0))
 
 
 def promised(solution: Solution, design: System, nominal: Nominal, prediction: Prediction) -> Array:
@@ -224,11 +296,11 @@ def promised(solution: Solution, design: System, nominal: Nominal, prediction: P
     slopes = slopes.reshape(rows, count, 2 * design.size).transpose(1, 0, 2)
     centre = values.T + np.einsum("kri,ki->kr", slopes, prediction.mean)
     spread = np.sqrt(np.einsum("kri,kij,krj->kr", slopes, prediction.covariance, slopes).clip(0.0))
-    result = np.zeros((count, rows))
+    result, allowed = np.zeros((count, rows)), margins(solution, design)
     for i, row in enumerate(chosen.rows):
         for limit, sign in ((row.lower, -1.0), (row.upper, 1.0)):
             if np.isfinite(limit):
-                over = sign * (centre[:, i] - limit)
+                over = sign * (centre[:, i] - limit) - allowed[i]
                 with np.errstate(divide="ignore", invalid="ignore"):
                     share = special.ndtr(over / spread[:, i])
                 known = spread[:, i] == 0.0

@@ -69,6 +69,8 @@ class MonteCarlo:
         estimates: the filter's estimates of them, (R, n); those of a law at its last step, NaN where it has none.
         costs: of each run, (R,); NaN where it left the domain, or without an expected cost.
         predicted_cost: linear prediction for what was simulated, NaN where there is none; design_cost: of the design.
+        spread_cost: what of the cost of the design is not linear in the covariance X of the closed loop: no run has it,
+            and it is in none of the others.
         left: time at which a run left the domain [s], inf where it did not, (R,).
         domain: deviations at which it is left, (n,).
         unanswered: time at which the law of a run first gave no finite control [s], inf where it always did, (R,).
@@ -116,6 +118,7 @@ class MonteCarlo:
     costs: Array
     predicted_cost: float
     design_cost: float
+    spread_cost: float
     left: Array
     domain: Array
     unanswered: Array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,11 +13,12 @@ from covocp.base.errors import ProblemError, kind_and_name
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.extremal.densities import Truth, check_true_jump, check_truth
 from covocp.problem.phase_chain import chain_of
 from covocp.problem.phase_feedback import in_phase
 from covocp.problem.phases import Phases
 from covocp.simulation.actual import System, actual_system, plain_truth, stated_system
-from covocp.simulation.stretch import in_words
+from covocp.simulation.stretch import cost_of_runs, in_words
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution
 from covocp.solving.evaluation import evaluate
@@ -56,7 +58,7 @@ def actual_phases(solution: PhasesSolution, designs: tuple[System, ...], truth: 
     Raises:
         ProblemError: it is none of these, or names or sizes differ.
     """
-    costs = np.array([phase.cost for phase in solution])
+    costs = np.array([cost_of_runs(phase) for phase in solution])
     if truth is None:
         return ActualPhases(systems=designs, links=solution.links, fixed=frozenset(), words="", costs=costs)
     fixed: set[str] = set()
@@ -80,6 +82,12 @@ def actual_phases(solution: PhasesSolution, designs: tuple[System, ...], truth: 
             received=f"{len(truth.problems)} phases" if isinstance(truth, Phases) else kind_and_name(truth),
             remedy="correct truth=",
         )
+    for phase, system in zip(solution, systems, strict=True):
+        checked = (phase.extremal, system.statement, system.parameters, system.variance)
+        in_its_phase(phase, check_truth, *checked)
+    truths = [Truth(system.statement, system.parameters) for system in systems]
+    for link, phase, both in zip(links, solution, pairwise(truths), strict=False):
+        check_true_jump(link, phase.extremal, both)
     known = np.full(len(solution), np.nan) if fixed else _true_costs(solution, truth)
     return ActualPhases(systems=tuple(systems), links=links, fixed=frozenset(fixed), words=in_words(truth), costs=known)
 
@@ -99,6 +107,6 @@ def in_its_phase(phase: Solution, make: Callable[..., Made], *arguments: Any) ->
 def _true_costs(solution: PhasesSolution, truth: Given) -> Array:
     """Expected costs by linear theory; NaN where that knows other statistics only."""
     try:
-        return np.array([phase.cost for phase in evaluate(solution, truth=truth)])
+        return np.array([cost_of_runs(phase) for phase in evaluate(solution, truth=truth)])
     except (ProblemError, RuntimeError):
         return np.full(len(solution), np.nan)

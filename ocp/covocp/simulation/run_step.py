@@ -29,7 +29,7 @@ import numpy as np
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_length
-from covocp.simulation.constraints import Place, beyond, counted_rows, violations
+from covocp.simulation.constraints import Place, asked_margins, beyond, counted_rows, violations
 from covocp.simulation.filtering import corrected, moved_covariance, read_now
 from covocp.simulation.run_parts import (
     UNREAD,
@@ -180,7 +180,12 @@ def _drift(run: Run, z: Given, c: dict[str, Any]) -> tuple[Any, Any]:
         parts += [gathered[k] for k in run.sums]
     if design.statement.loop is not None:
         cost = design.statement.loop.running(state, u, c["t"], setting.solution.duration, p)
-        parts.append(cost + ca.dot(moved, c["extra"] @ moved) / 2)
+        cost += ca.dot(moved, c["extra"] @ moved) / 2
+        if design.statement.loop.weighed is not None:  # a run has no covariance X, but the deviations of which it is
+            d = part(deviations(run, z, c), 0, design.size)
+            of_state, crossed = ca.horzsplit(c["weighed"], [0, design.size, design.size + design.fed_back])
+            cost += ca.dot(d, of_state @ d) / 2 + ca.dot(d, crossed @ moved)
+        parts.append(cost)
     return ca.vertcat(*parts), u
 
 
@@ -201,7 +206,8 @@ def _flags(run: Run, c: dict[str, Any], places: tuple[Place, ...]) -> Any:
     """One where more control is asked for than there is, one for each inequality of some places that is violated."""
     limits = run.setting.limits
     asked, fed = control_of(run, run.z, c)
-    flags = [beyond(asked[i], limits.least[i], limits.most[i]) for i in range(limits.least.size)]
+    allowed = asked_margins(run.setting.solution, limits.least, limits.most)
+    flags = [beyond(asked[i], *ends) for i, ends in enumerate(zip(limits.least, limits.most, allowed, strict=True))]
     violated = violations(run, run.z, fed, c)
     flags += [violated[i] for i in counted_rows(run.setting.design).at(*places)]
     return ca.vertcat(run.symbolic(0, 1), *flags)

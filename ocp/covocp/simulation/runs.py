@@ -8,6 +8,7 @@ from covocp.base.arguments import checked, truth
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
 from covocp.base.threads import one_at_a_time
+from covocp.extremal.densities import check_truth
 from covocp.simulation.actual import actual_system
 from covocp.simulation.flown import flown_law, sample_indices
 from covocp.simulation.monte_carlo import MonteCarlo
@@ -128,6 +129,8 @@ def simulate(
     if flown is not None and filter != "perturbation":
         raise wrong_argument("filter", "no filter= beside law=: the law has its own", filter)
     actual = actual_system(design, truth)
+    if truth is not None:
+        check_truth(solution.extremal, actual.statement, actual.parameters, actual.variance)
     base = base_grid(solution, store, step, None if flown is None else flown.times)
     expected = predict(solution, design, design, base)
     true = expected if truth is None else predict(solution, design, actual, base)

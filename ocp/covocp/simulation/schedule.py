@@ -184,8 +184,9 @@ class Coefficients:
 
     function: (state, control, matrices, time, duration, parameters, length h of the step, readings) -> the column.
     shapes: of the parts by name, in their order: "t", the nominal "x", "u" and, where a constraint uses them, the
-        matrices "e", the gain "C", "extra", the weights B - L_uu of the feedback; for the perturbation filter its gain
-        "K", its model "F", "G", "M", "Hu", "h", the measurement that is expected along the nominal, and "early",
+        matrices "e", the gain "C", "extra", the weights B - L_uu of the feedback, and "weighed", those
+        of deviations in A and N that are not in L; for the perturbation filter its gain "K", its model "F", "G", "M",
+        "Hu", "h", the measurement that is expected along the nominal, and "early",
         E M'(M E M' + 2 U/h)^-1, its gain for what is measured during the first half of a step; of what is read at an
         instant its gain "Kr", its model "Hr", "Hru" and the reading "hr" that is expected.
     """
@@ -223,6 +224,9 @@ def coefficients(design: System, kind: Estimator) -> Coefficients:
         "e": e if any(c.uses_matrices for c in st.conditions) else symbolic.zeros(0, 1),
         "C": symbolic.zeros(m, n) if loop is None or kind == "law" else loop.gain(*a),
         "extra": symbolic.zeros(0, 0) if loop is None else loop.extra_control(x, u, t, T, p),
+        "weighed": symbolic.zeros(0, 0)
+        if loop is None or loop.weighed is None
+        else ca.horzcat(*loop.weighed(x, u, t, T, p)),
     }
     step, reading = symbolic.sym("step"), symbolic.sym("reading", st.readings)
     if kind == "perturbation":

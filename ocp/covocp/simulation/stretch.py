@@ -13,6 +13,7 @@ from covocp.base.expressions import Given
 from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, read_only
 from covocp.base.progress import Progress
+from covocp.extremal.closed_loop import COVARIANCES
 from covocp.simulation.actual import System, design_system
 from covocp.simulation.batches import Batch, Cloud, StoppedError
 from covocp.simulation.constraints import counted_rows, promised
@@ -185,7 +186,7 @@ def sample_of(
     unknowns = np.tile(design.start[design.entries :], (nominal.t.size, 1))
     states = _values(design.motion, nominal.x)
     limits, m = setting.limits, design.fed_back
-    costs = (solution.cost, truth[1]) if setting.costs else (np.nan, np.nan)
+    costs = (cost_of_runs(solution), truth[1]) if setting.costs else (np.nan, np.nan)
     sample = MonteCarlo(
         **_of_runs(harvest.batches),
         name=solution.name,
@@ -211,6 +212,7 @@ def sample_of(
         design_error=expected.error,
         design_cost=costs[0],
         predicted_cost=costs[1],
+        spread_cost=cost_of_spread(solution) if setting.costs else 0.0,
         domain=setting.domain,
         limits=(limits.least, limits.most),
         limited=bool(np.isfinite(limits.lower).any() or np.isfinite(limits.upper).any()),
@@ -243,15 +245,25 @@ def _of_runs(batches: Sequence[Batch]) -> dict[str, Any]:
     return {**read_only(values), "moments": moments_of(batches)}
 
 
+def cost_of_runs(solution: Solution) -> float:
+    """The expected cost of runs: without what is not linear in the covariance of the closed loop, which no run has."""
+    return solution.cost - cost_of_spread(solution)
+
+
+def cost_of_spread(solution: Solution) -> float:
+    """What of the expected cost is not linear in the covariance of the closed loop."""
+    return 0.0 if solution.loop is None else float(solution.loop.cost.get(COVARIANCES, 0.0))
+
+
 def true_cost(solution: Solution, truth: Given) -> float:
-    """Expected cost by linear theory for the truth; NaN where that knows other dynamics or constants."""
+    """Expected cost of runs by linear theory for the truth; NaN where that knows other dynamics or constants."""
     if truth is None:
-        return solution.cost
+        return cost_of_runs(solution)
     unknowns = tuple(block.name for block in solution.blocks if block.kind == "unknown")
     if isinstance(truth, Mapping) and any(name_of(k, solution.symbols, unknowns, missing_ok=True) for k in truth):
         return np.nan  # what has one value in every run is not uncertain any more
     try:
-        return evaluate(solution, truth=truth).cost
+        return cost_of_runs(evaluate(solution, truth=truth))
     except (ProblemError, RuntimeError):  # `evaluate` takes other statistics only, of what has second derivatives
         return np.nan
 

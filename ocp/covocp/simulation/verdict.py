@@ -25,6 +25,10 @@ AS_PROMISED = 0.1
 # Share of the largest predicted deviation of a component on the way below which it is known exactly at the end: what is
 # left is of the steps of nominal and runs.
 EXACT = 1e-6
+# Shares of the nominal's magnitude: below the first, what varies between runs is rounding. Where no more is predicted
+# all the way, and no more varies, all runs do the same: they differ from the nominal by the steps of both alone, which
+# may be up to the second; longer ones are told where the nominal is.
+ROUNDED, STEPS = 1e-12, 1e-4
 # Share of what the sample has in excess of the prediction from which on something explains part of it.
 PART = 0.5
 
@@ -225,10 +229,12 @@ def judge(sample: MonteCarlo) -> Verdict:
     numbers = predicted if sample.fed_back else errors
     largest = np.nan_to_num(standard_deviations(sample.predicted), nan=0.0, posinf=0.0).max(axis=0)
     exact = EXACT * largest
+    magnitude = np.abs(sample.nominal).max(axis=0, initial=0.0)
+    same = np.where(largest <= ROUNDED * magnitude, magnitude, 0.0)
     to_error = np.hstack([-np.eye(n), np.eye(n)])
     more = (np.diagonal(v) for v in (sample.grown[:n, :n], to_error @ sample.grown @ to_error.T))
     grown, grown_errors = (np.sqrt((v**2 + w).clip(0.0)) for v, w in zip((predicted, errors), more, strict=True))
-    level = (stayed, sample.level, exact)
+    level = (stayed, sample.level, exact, same)
     return Verdict(
         deviations=_entries(names[:states], predicted, grown, sample.deviations, *level),
         errors=_entries(names, errors, grown_errors, sample.estimates - sample.deviations, *level)
@@ -257,14 +263,16 @@ def _entries(
     stayed: Array,
     level: float,
     exact: Array,
+    same: Array,
 ) -> tuple[Component, ...]:
-    """The components of some terminal values, (R, rows)."""
+    """The components of some terminal values, (R, rows); `same`: magnitude of what all runs should do, else 0."""
     inside = values[stayed]
     result = []
     for i, name in enumerate(names):
         column = inside[:, i]
         square = float(np.mean(column**2)) if column.size else np.nan
         fourth = float(np.mean(column**4)) if column.size else np.nan
+        alike = column.size and float(column.std()) <= ROUNDED * same[i]
         low, high = mean_square_band(square, degrees_of_freedom(column.size, square, fourth), level)
         result.append(
             Component(
@@ -275,7 +283,7 @@ def _entries(
                 high=float(np.sqrt(high)),
                 bias=float(column.mean()) if column.size else np.nan,
                 robust=float(robust_deviation(values[:, i : i + 1])[0]),
-                exact=float(exact[i]),
+                exact=max(float(exact[i]), STEPS * float(same[i]) if alike else 0.0),
                 grown=float(grown[i]),
             )
         )

@@ -11,12 +11,16 @@ from covocp.base.matrices import Array
 from covocp.base.normal import inside, margin, shown_probability
 from covocp.base.pages import Section, Sentence, Table, number
 from covocp.statement.chances import ChanceLimits
+from covocp.transcription.scales import limit_units
 
 if TYPE_CHECKING:
     from covocp.solution.solution import Solution
 
 # Share of the risk by which a probability may be missed before it is called so: the tolerance of the solver.
 ROUNDED = 1e-3
+# Share of the unit of a limit by which a solver may pass it, and of the deviation that it may be without changing a
+# probability. Where the deviation is less, the limit counts from where the solver left it.
+SOLVED, SMALL = 1e-7, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +60,10 @@ def reached(solution: Solution) -> tuple[Reached, ...]:
         for i, name in enumerate(limits.names):
             y, s = values[:, i], deviations[:, i]
             pair = float(limits.lower[i]), float(limits.upper[i])
-            shares.append(inside(y, s, *pair))
             rooms = margin(y, s, *pair, limits.each)
+            allowed = _allowed(*pair)
+            missed = np.where((rooms >= -allowed) & (SMALL * s <= allowed), np.maximum(-rooms, 0.0), 0.0)
+            shares.append(inside(y, s, pair[0] - missed, pair[1] + missed))
             k = int(np.argmin(np.where(np.isfinite(rooms), rooms, -np.inf)))
             own = {"place": limits.place, "asked": limits.each, "reached": float(shares[-1].min())}
             result.append(
@@ -78,6 +84,12 @@ def reached(solution: Solution) -> tuple[Reached, ...]:
                 )
             )
     return tuple(result)
+
+
+def _allowed(lower: float, upper: float) -> float:
+    """By how much a limit may be passed and be met, in the unit of the expression: solvers do so by some 1e-8."""
+    ends = np.array([lower]), np.array([upper])
+    return SOLVED * max(float(limit_units(*ends)[0]), *(abs(v) for v in (lower, upper) if np.isfinite(v)))
 
 
 def widths(solution: Solution, limits: ChanceLimits) -> tuple[Array, Array]:

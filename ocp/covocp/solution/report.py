@@ -323,13 +323,17 @@ def _matrix(solution: Solution, block: Block) -> Section:
         rows = [row + [""] * (block.size + 1 - len(row)) for row in rows]
         columns = [f"{kind} {block.name} at T", *labels]
     multipliers = solution.final_multipliers[1][block.span]
-    pairs = zip(*half_indices(block.size), multipliers, strict=True)
+    given = np.ones(multipliers.size, dtype=bool)  # a file without its problem does not tell which entries are fixed
+    if solution.statement is not None:
+        given = ~np.isnan(solution.statement.boundary_values(solution.parameters).final_matrices[block.span])
+    pairs = zip(*half_indices(block.size), multipliers, given, strict=True)
     fixed = [
         [f"{block.name}[{labels[min(i, j)]}, {labels[max(i, j)]}]", number(value)]
-        for i, j, value in pairs
-        if abs(value) > NEGLIGIBLE * abs(solution.cost) and not block.backward  # bounds at the end leave tiny ones
+        for i, j, value, known in pairs
+        if known and not block.backward and abs(value) > NEGLIGIBLE * abs(solution.cost)
     ]
-    return [Table(columns=columns, rows=rows), *_table(["fixed at T", "multiplier"], fixed)]
+    heading = "at T" if solution.statement is None else "fixed at T"
+    return [Table(columns=columns, rows=rows), *_table([heading, "multiplier"], fixed)]
 
 
 def _between_nodes(solution: Solution) -> Section:

@@ -12,13 +12,14 @@ from typing import Any, cast, overload
 
 import numpy as np
 
-from covocp.base.checks import as_number, check_density, check_kind, column
+from covocp.base.checks import as_number, check_kind, column
 from covocp.base.errors import ProblemError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import Array, distinct, stacked, unpack
+from covocp.base.matrices import Array, distinct, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import close_loop, densities, start_covariance, variances
+from covocp.extremal.densities import check_noise, check_truth
 from covocp.extremal.extremal import Extremal, Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.extremal.joint import Statistics
@@ -90,7 +91,8 @@ def evaluate(
         filter of the design computes, the actual one is `loop.E`. Multipliers and costates are the design's.
 
     Raises:
-        ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols.
+        ProblemError: a control or a decision is not given, a name is unknown, `truth` has other symbols, noise along
+            the nominal is none (negative, or of a measurement zero).
         SolveError: a phase, or what it gives to the next one, becomes NaN or inf along the nominal.
     """
     if isinstance(problem, (Solution, PhasesSolution)):
@@ -143,6 +145,7 @@ def _along(
         if not shorter.converged:
             break
         outcome, given = shorter, finer
+    check_noise(outcome.extremal)
     if outcome.converged:
         check_costs(outcome.extremal.trajectory, outcome.cost_terms["running"], outcome.cost_terms["terminal"])
     with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
@@ -389,26 +392,8 @@ def statistics_along(extremal: Extremal, other: Statement, values: Array) -> Sta
         parameters=values,
         variance=variances(other),
     )
-    _check_densities(extremal, statistics)
+    check_truth(extremal, other, values, statistics.initial)
     return statistics
-
-
-def _check_densities(extremal: Extremal, truth: Statistics) -> None:
-    """What is truly uncertain must be a covariance or a density, at every node; no noise at all is one too."""
-    x, u, _, t, duration, _ = extremal.columns()
-    count = extremal.mesh.intervals + 1
-    values = truth.density.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
-    check_density("truth", "initial covariance", truth.initial, definite=False)
-    named = list(zip(("process noise density", "measurement noise density"), values, strict=True))
-    if truth.variance is not None:
-        own = truth.variance.map(count)(x, u, t, duration, np.tile(truth.parameters[:, None], (1, count)))
-        named.append(("noise variance of what is read at instants", own))
-    for what, value in named:
-        matrices = stacked(value, count)
-        if matrices.size:
-            smallest = np.linalg.eigvalsh(np.nan_to_num(matrices))[:, 0]
-            worst = int(np.argmin(np.where(np.isfinite(matrices).all(axis=(1, 2)), smallest, -np.inf)))
-            check_density("truth", what, matrices[worst], definite=False)
 
 
 def check_same(design: Statement, truth: Statement) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
 from covocp.base.errors import ProblemError, SolveError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
+from covocp.extremal.densities import impossible_in_phases
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
@@ -94,6 +95,9 @@ def solve_phases(
         starts = [list(near), list(best)] if near is not best else [list(best)]
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         outcome = ChainRuns(chain, method, prepare, own, reporter, values, starts).solve(asked, random)
+        if outcome.converged and (impossible := impossible_in_phases(outcome.extremals, chain.links)):
+            message = f"the solution found means nothing: {impossible}"
+            outcome = replace(outcome, converged=False, message=message)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
             raise interrupted(solution)

@@ -17,6 +17,7 @@ from covocp.base.errors import OutsideDomainError, ProblemError, SolveError, eva
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
+from covocp.extremal.densities import Truth, check_jump_noise, check_noise, check_true_jump
 from covocp.extremal.extremal import Outcome
 from covocp.extremal.joint import Statistics
 from covocp.extremal.links import ChainOutcome
@@ -131,6 +132,7 @@ def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], val
         try:
             fine.append(graded(st, own, value))
             outcomes.append(run_along(st, nominal, fine[-1], value, linked))
+            check_noise(outcomes[-1].extremal)
         except ProblemError as error:
             raise in_phase(st, error) from error
         filled.append(value)
@@ -150,10 +152,11 @@ def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], val
 
 
 def _check_passes(chain: Chain, i: int, outcome: Outcome, parameters: Array, later: Array) -> None:
-    """What a phase gives to the next one has a value.
+    """What a phase gives to the next one has a value, and the noise of the jump is one.
 
     Raises:
         SolveError: it has none, though the phase ends with numbers.
+        ProblemError: noise of the jump is negative.
     """
     link, t = chain.links[i], outcome.extremal.trajectory
     given = link.values(t.x[-1], t.e[-1], t.duration, parameters, later)
@@ -163,6 +166,7 @@ def _check_passes(chain: Chain, i: int, outcome: Outcome, parameters: Array, lat
         raise SolveError(
             error.problem, expected=error.expected, received=error.received, remedy=error.remedy
         ) from error
+    check_jump_noise(link, outcome.extremal, chain.statements[i + 1], later)
 
 
 def _check_finite(name: str, outcome: Outcome) -> None:
@@ -299,6 +303,9 @@ def _true_chain(solution: PhasesSolution, truth: Given) -> ChainStatistics:
     truly = ChainStatistics(phases=tuple(found), links=chain.links)
     for k in range(len(chain.links)):
         _check_jump(solution, truly, k)
+        pair = zip(chain.statements[k : k + 2], values[k : k + 2], strict=True)
+        one, two = (Truth(*entry) for entry in pair)
+        check_true_jump(chain.links[k], solution[k].extremal, (one, two))
     return truly
 
 

@@ -13,6 +13,7 @@ from covocp.base.errors import CovocpError, OutsideDomainError
 from covocp.base.matrices import Array, is_semidefinite, pack, semidefinite_part, unpack
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
+from covocp.extremal.densities import JumpEnds, impossible_jump
 from covocp.extremal.extremal import Guess
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
@@ -23,7 +24,7 @@ from covocp.solving.refined_meshes import Measured, remade
 from covocp.solving.refining import first_guesses, unseen, with_layers
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
-from covocp.statement.chain import Chain, started_at
+from covocp.statement.chain import Chain, Link, started_at
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.grading import graded
@@ -260,7 +261,7 @@ class ChainRuns:
             None where some phase has no guess.
 
         Raises:
-            OutsideDomainError: what passes from a phase to the next is NaN or inf along a guess.
+            OutsideDomainError: what passes from a phase to the next is NaN or inf along a guess, or no covariance.
         """
         found: list[Guess] = []
         filled: list[Array] = []
@@ -274,6 +275,7 @@ class ChainRuns:
                 covariances = covariances and sound
                 states, matrices = link.values(t.x[-1], ends, t.duration, filled[-1], value)
                 link.check_finite(before, (t.x[-1], ends, t.duration), (states, matrices))
+                _check_variances(link, before, st, (t.x[-1], ends, t.duration, filled[-1], value))
                 value, st = link.filled(value, matrices), started_at(st, link, states)
             own = graded(st, own, value)
             fine.append(own if own.refine is None else with_layers(st, own, value))
@@ -290,6 +292,17 @@ class ChainRuns:
             options=tuple(fine),
             covariances=covariances,
         )
+
+
+def _check_variances(link: Link, before: Statement, after: Statement, ends: JumpEnds) -> None:
+    """No phase can start with a covariance that the noise of a jump makes negative; a method may leave a lesser one.
+
+    Raises:
+        OutsideDomainError: names what jumps.
+    """
+    wrong = impossible_jump(link, before, after, ends)
+    if wrong is not None and not is_semidefinite(link.variances(after, *ends)[1][None]):
+        raise wrong.error("at the guess", OutsideDomainError)
 
 
 def nearest_covariances(statement: Statement, halves: Array) -> tuple[Array, bool]:

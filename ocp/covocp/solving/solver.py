@@ -467,7 +467,7 @@ class Solver:
         if not outcome.converged:
             if allow_failure:
                 return solution
-            raise failure(self.statement.name, self.method, outcome, solution, self._other_way())
+            raise failure(self.statement.name, self.method, outcome, solution, "" if impossible else self._other_way())
         if assess:
             mention_doubts(solution)
             mention_limits(solution)

@@ -19,7 +19,7 @@ from covocp.solution.solution import Solution
 from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.statement.names import name_of
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.first_guess import simulate_matrices, starts
+from covocp.transcription.first_guess import check_measured, simulate_matrices, starts
 from covocp.transcription.mesh import Mesh, control_places
 from covocp.transcription.starts import own_start, ranked
 from covocp.transcription.steering import quadrature_weights, resampled
@@ -117,6 +117,8 @@ def _from_solution(
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
         trajectory = _resampled(statement, mesh, parameters, solution, matched, elapsed)
+    if not statement.noise_varies:  # what parameters say has no better place to go on to
+        check_measured(statement, trajectory.x[0], trajectory.u[0], duration, parameters)
     st = statement
     constraints = (st.path.size, st.start.size, st.end.size, st.inside.size)
     own_constraints = (m.path.shape[1], m.start.size, m.end.size, m.instants.size)

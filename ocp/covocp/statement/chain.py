@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.errors import OutsideDomainError
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.statement.statement import Statement
 
@@ -48,6 +48,20 @@ class Link:
         """The states and the half-vectors that are given, as numbers."""
         states, matrices = self.function(x, e, duration, parameters, later)
         return np.asarray(states.full()).ravel(), np.asarray(matrices.full()).ravel()
+
+    def variances(
+        self, later: Statement, x: Array, e: Array, duration: float, parameters: Array, of_later: Array
+    ) -> tuple[Array, Array]:
+        """What is added to the covariance of the error, N of J E J' + N, and that covariance as the later one has it.
+
+        Args:
+            later: a statement with such a covariance, which goes on.
+            x, e, duration, parameters, of_later: as of `values`.
+        """
+        block = later.estimation
+        rows = [k for k, entry in enumerate(self.matrices) if block.span.start <= entry < block.span.stop]
+        added, passed = (self.values(x, own, duration, parameters, of_later)[1][rows] for own in (np.zeros_like(e), e))
+        return unpack(added, block.size), unpack(passed, block.size)
 
     def check_finite(self, before: Statement, ends: tuple[Array, Array, float], given: tuple[Array, Array]) -> None:
         """What is given must be numbers, where the statement before ends with numbers: else it is not the link's fault.

@@ -119,6 +119,7 @@ class Loop:
     running: (state, control, time, duration, parameters) -> L of the actual system.
     terminal: (state, duration, parameters) -> k of the actual system, S(T) (n, n).
     extra_control: (state, control, time, duration, parameters) -> B - L_uu (m, m): what the weights add to L.
+    weighed: the same -> what terms of the loop's covariance add to A (n, n) and N (n, m); None without them.
     by_parts: (all six) -> L + tr(S Q + C'B C E)/2, tr(S E)/2: over any time the running cost is the integral of the
         first less the growth of the second [Schmidt E-20]; None where the gain is not the best one.
     spread: (state, control, time, duration, parameters, half-vector of the covariance of augmented state and controls)
@@ -133,6 +134,7 @@ class Loop:
     terminal: ca.Function
     extra_control: ca.Function
     by_parts: ca.Function | None
+    weighed: ca.Function | None = None
     spread: ca.Function | None = None
     spread_end: ca.Function | None = None
     shared: bool = False

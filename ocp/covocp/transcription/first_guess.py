@@ -226,14 +226,7 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
         ProblemError: names the rate, the cost, the constraint or the measurement.
     """
     arguments = (x, u, e, 0.0, duration, parameters)
-    if statement.information is not None:
-        stated = np.asarray(statement.information(x, u, 0.0, duration, parameters).full())
-        check_density(", ".join(statement.measurement_names), "information", np.diagflat(stated), definite=False)
-    if statement.measurement is not None:
-        density = np.asarray(statement.measurement(x, u, 0.0, duration, parameters)[2].full())
-        for block in statement.measurements:
-            own = density[block.span, block.span]
-            check_density(block.name, "measurement noise density", own, definite=True)
+    check_measured(statement, x, u, duration, parameters)
     if statement.loop is not None:
         weights = np.asarray(statement.loop.expansion(x, u, 0.0, duration, parameters)[3].full())
         fed = statement.control_names[: weights.shape[0]]
@@ -259,6 +252,28 @@ def check_model(statement: Statement, x: Array, u: Array, e: Array, duration: fl
         if form is not None and block.estimation:
             noise = np.asarray(form(x, u, 0.0, duration, parameters)[1].full())
             check_density(", ".join(statement.augmented), "process noise density", noise, definite=False)
+
+
+def check_measured(statement: Statement, x: Array, u: Array, duration: float, parameters: Array) -> None:
+    """The noise of what is measured, at the start; at instants where it has one value that parameters say.
+
+    Raises:
+        ProblemError: names the measurement.
+    """
+    at = (x, u, 0.0, duration, parameters)
+    if statement.information is not None:
+        stated = np.asarray(statement.information(*at).full())
+        check_density(", ".join(statement.measurement_names), "information", np.diagflat(stated), definite=False)
+    if statement.measurement is not None:
+        density = np.asarray(statement.measurement(*at)[2].full())
+        for block in statement.measurements:
+            own = density[block.span, block.span]
+            check_density(block.name, "measurement noise density", own, definite=True)
+    samples = statement.samples
+    if samples is not None and not any(samples.measurement.jac_sparsity(2, k).nnz() for k in range(len(at) - 1)):
+        variance = np.asarray(samples.measurement(*at)[2].full())
+        for block in samples.blocks:
+            check_density(block.name, "measurement noise variance", variance[block.span, block.span], definite=True)
 
 
 def _short(values: Array) -> str:
