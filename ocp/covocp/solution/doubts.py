@@ -71,10 +71,8 @@ def _flown_alone(solution: Solution) -> str:
         return ""
     far = f"leaves the nodes by {left:.1e} of the range of a state" if np.isfinite(left) else "diverges"
     paid = f", and costs {cost:.6g} instead of {solution.cost:.6g}" if cost is not None else ""
-    return (
-        f"The plant is unstable: a run along these controls alone {far}{paid}. Fly them with a feedback, or use more "
-        "intervals or substeps where these suffice."
-    )
+    or_else = "" if cost is None else ", or use more intervals or substeps where these suffice"  # roundoff does as much
+    return f"The plant is unstable: a run along these controls alone {far}{paid}. Fly them with a feedback{or_else}."
 
 
 def _mention_slopes(solution: Solution, fine: bool) -> None:
