@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
-from exports import FOLDER, STRICT
+from exports import FOLDER, QUICK, STRICT
 from scipy.integrate import solve_ivp
 
 import covocp as co
@@ -135,3 +137,33 @@ def test_an_estimate_that_is_lost_on_the_way_leaves_the_nominal_control_of_the_e
         assert step.status == "ESTIMATE_LOST"
         assert float(control[0]) == pytest.approx(float(solution.at(3.05)["u"]), abs=1e-14)
         assert step.state["time"] == 3.05
+
+
+@pytest.mark.parametrize(("first", "last", "precision"), [(10.0, 0.3, "single"), (1e5, 1e-3, "double")])
+def test_a_short_phase_after_a_long_one_comes_to_its_end(
+    first: float, last: float, precision: Literal["single", "double"], tmp_path: Path
+) -> None:
+    """By the clock of the whole flight a node of the short one is rounded: it came again, and the step never ended."""
+
+    def phase(duration: float, name: str) -> co.Problem:
+        ocp = co.Problem(duration, name=name)
+        begins = (None, None) if name == "two" else (1.0, 0.1)
+        x, u = ocp.state("x", initial=begins[0], variance=begins[1]), ocp.control("u")
+        ocp.dynamics(x, (u - x) / first, noise=1e-3 / first)
+        ocp.measurement("m", x, noise=0.05 * first)
+        ocp.minimize_expected(running=u**2 / first, terminal_weight={x: 1.0} if name == "two" else None)
+        return ocp
+
+    solution = co.solve(co.Phases([phase(first, "one"), phase(last, "two")]), intervals=[20, 20], progress=False)
+    made = export_c(solution, tmp_path / "pair", precision=precision)
+    made.build(flags=QUICK)
+    (tmp_path / "fly.c").write_text(
+        '#include <math.h>\n#include "pair.h"\nint main(void)\n{\n    pair_controller c;\n    pair_real u;\n'
+        f"    int bad = 0;\n    pair_init(&c);\n    for (int k = 0; k <= 41; ++k) {{\n"
+        f"        pair_step(&c, (pair_real)NAN, (pair_real)({first} + {last} * k / 41.0), &u);\n"
+        "        bad += !isfinite(u);\n    }\n    return bad;\n}\n"
+    )
+    sources = [str(path) for path in made.directory.glob("*.c") if path.name != "main.c"]
+    command = ["cc", "-O0", f"-I{made.directory}", str(tmp_path / "fly.c"), *sources, "-lm", "-o", str(tmp_path / "fly")]
+    subprocess.run(command, check=True)
+    assert subprocess.run([tmp_path / "fly"], timeout=20).returncode == 0

@@ -30,7 +30,8 @@ STATUSES = {
     "without feedback: the caller must stop",
     "TIME_BACKWARDS": "the time is before that of the last step: nominal control, the estimate stays",
     "TIME_NOT_FINITE": "the time is NaN, infinite or beyond 1e30: values of the last valid time",
-    "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the old estimate stays",
+    "ESTIMATE_LOST": "the new estimate or its control was not finite: nominal control, the estimate stays as before, "
+    "or as at the last node that was reached",
     "ARGUMENT_NOT_FINITE": "an argument is NaN or infinite: the plan made at the export is returned",
     "NOT_CONVERGED": "the iterations ended before the first-order conditions of a minimum held: the last iterate is "
     "returned",

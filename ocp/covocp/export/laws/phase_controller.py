@@ -17,7 +17,7 @@ reading is ignored.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -185,7 +185,7 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         margin: share of it within which a time is that where two phases meet.
         tolerance: largest relative deviation.
     """
-    room = _room(legs)
+    legs, room = tuple(_by_the_clock_of_all(leg, duration, margin) for leg in legs), _room(legs)
     return Law(
         name="step",
         kind="controller",
@@ -206,6 +206,14 @@ def phases_controller(legs: tuple[Leg, ...], duration: float, margin: float, tol
         points=lambda random, count: _points(legs, room, duration, random, count),
         tolerance=tolerance,
     )
+
+
+def _by_the_clock_of_all(leg: Leg, duration: float, margin: float) -> Leg:
+    """A phase whose times are as uncertain as those of the flight, by which its nodes are kept between two calls.
+
+    By its own, shorter, clock a node rounded to that of the flight would come again, and again.
+    """
+    return replace(leg, tables=replace(leg.tables, margin=margin * duration / leg.tables.duration))
 
 
 def _core(legs: tuple[Leg, ...], room: _Room, duration: float, margin: float) -> ca.Function:
@@ -241,6 +249,7 @@ def _core(legs: tuple[Leg, ...], room: _Room, duration: float, margin: float) ->
     gone = [ca.if_else(ca.logic_and(gone[-3], flies), starts[after] + gone[0], asked), after, *gone[1:]]
     crossed = ca.logic_and(crosses, ca.logic_not(lost))
     time, phase, *fields, more, good, missing = (ca.if_else(crossed, a, b) for a, b in zip(left, gone, strict=True))
+    more = ca.logic_and(more, ca.logic_or(time > last, phase > before))  # whatever is rounded, a step ends
     conditions = [
         *now.conditions, (backwards, "TIME_BACKWARDS"),
         (ca.logic_or(lost, ca.logic_not(good)), "ESTIMATE_LOST"), (missing, "MEASUREMENT_MISSING"),
