@@ -164,6 +164,15 @@ def test_a_short_phase_after_a_long_one_comes_to_its_end(
         "        bad += !isfinite(u);\n    }\n    return bad;\n}\n"
     )
     sources = [str(path) for path in made.directory.glob("*.c") if path.name != "main.c"]
-    command = ["cc", "-O0", f"-I{made.directory}", str(tmp_path / "fly.c"), *sources, "-lm", "-o", str(tmp_path / "fly")]
+    command = [
+        "cc",
+        "-O0",
+        f"-I{made.directory}",
+        str(tmp_path / "fly.c"),
+        *sources,
+        "-lm",
+        "-o",
+        str(tmp_path / "fly"),
+    ]
     subprocess.run(command, check=True)
     assert subprocess.run([tmp_path / "fly"], timeout=20).returncode == 0

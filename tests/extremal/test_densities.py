@@ -211,3 +211,19 @@ def test_comparison_at_other_parameters():
     ocp.minimize(running=weight * u**2)
     rows = co.compare(ocp, intervals=20, parameters={"weight": 3.0}, progress=False).solutions
     assert [solution.cost for solution in rows.values()] == pytest.approx([3.0, 3.0], rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.9])
+def test_correlated_noise_of_a_sensor_that_fades_is_a_noise(factor):
+    """[[a e^(8t), c], [c, a]], |c| < a: definite at all times, and singular at the first ones beside the last ones."""
+    ocp = co.Problem(5.0)
+    x, u = ocp.state("x", 2, initial=0.0, variance=1.0), ocp.control("u")
+    ocp.dynamics(x, -x + u, noise=0.1)
+    beside = 0.1 * factor
+    noise = ca.vertcat(ca.horzcat(0.1 * ca.exp(8.0 * ocp.time), beside), ca.horzcat(beside, 0.1))
+    ocp.measurement("m", x, noise=noise)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2, terminal=E[x[0], x[0]])
+    solution = co.solve(ocp, intervals=40, progress=False)
+    assert solution.converged
+    assert abs(solution.controls).max() < 1e-6

@@ -17,7 +17,7 @@ X, U, T = ca.SX.sym("x", 5), ca.SX.sym("u"), ca.SX.sym("t")
 PATH = [0.0, 0.0, 0.0, 1.0, 0.0]
 PAPER = {"k": agile_aircraft.FACTOR, "l": agile_aircraft.DECAY}
 # The optimal controls are compared with laws, and not flown alone.
-pytestmark = pytest.mark.filterwarnings("ignore:The plant is unstable")
+pytestmark = pytest.mark.filterwarnings("ignore:.*along these controls alone")
 UNITS = ("rad", "deg")
 # Section 6: angle of attack [deg], rates of speed, angle of attack, pitch rate, slopes of the last two in the canard.
 FITTED = np.array(

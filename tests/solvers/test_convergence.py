@@ -31,7 +31,7 @@ def lag(**options: object) -> co.Solution:
     return co.solve(unknown_lag.problem(final=1.0, weight=10.0), intervals=50, progress=False, **options)  # type: ignore[arg-type]
 
 
-@pytest.mark.filterwarnings("ignore:The plant is unstable")  # flown open loop these controls miss the end
+@pytest.mark.filterwarnings("ignore:.*along these controls alone")  # flown open loop these controls miss the end
 @pytest.mark.parametrize(("a", "duration"), [(1.0, 16.0), (2.0, 12.0), (3.0, 8.0), (3.0, 9.0)])
 def test_unstable_plants_have_the_cost_of_the_closed_form(a: float, duration: float) -> None:
     # the simulated start reaches e^(a T); the tolerance is that of the mesh, (a h)^4

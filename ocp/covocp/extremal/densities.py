@@ -277,8 +277,8 @@ def _first_wrong(matrices: Array, noise: Noise, rows: list[int]) -> tuple[int, f
 
     In units in which the largest variance of each row is 1. The smallest eigenvalue that is allowed is relative to the
     largest of any point, or of what it is judged by besides: what is lost in rounding of that is not negative. Of what
-    must be positive definite it is so to the lesser of both: a sensor that is nearly switched off at some points is
-    noisy there, not singular elsewhere.
+    must be positive definite each variance is so to the lesser of both, and correlations are judged point by point: a
+    sensor that is nearly switched off at some points is noisy there, not singular elsewhere.
     """
     if not len(matrices):
         return None
@@ -286,23 +286,27 @@ def _first_wrong(matrices: Array, noise: Noise, rows: list[int]) -> tuple[int, f
     numbers = np.where(np.isfinite(matrices), matrices, 0.0)
     variances = np.abs(np.diagonal(numbers, axis1=1, axis2=2)).max(axis=0)
     variances = np.where(variances > 0, variances, np.abs(numbers).max(initial=0.0) or 1.0)
-    units = np.sqrt(variances)
-    eigenvalues = np.linalg.eigvalsh(numbers / units[:, None] / units)
+    beside = np.full(len(rows), np.inf) if noise.beside is None else noise.beside[rows]
+    own = np.diagonal(numbers, axis1=1, axis2=2)
+    units = np.sqrt(np.where(own != 0, np.abs(own), variances) if noise.definite else np.tile(variances, (len(own), 1)))
+    scaled = numbers / units[:, :, None] / units[:, None, :]
+    eigenvalues = np.linalg.eigvalsh(scaled)
     smallest, sizes = eigenvalues[:, 0], np.abs(eigenvalues).max(axis=1)
-    beside = np.inf if noise.beside is None else float((noise.beside[rows] / variances).max())
     if noise.definite:
-        least = SINGULAR * np.maximum(sizes, min(float(sizes.max()), beside))
+        small = (own < SINGULAR * np.minimum(variances, beside)).any(axis=1)
+        wrong = np.flatnonzero((smallest < SINGULAR * sizes) | small | ~finite)
     else:
-        lost = ROUNDING * beside if np.isfinite(beside) else 0.0
-        least = np.full(sizes.shape, -max(ROUNDOFF * float(sizes.max()), lost))
-    wrong = np.flatnonzero((smallest < least) | ~finite)
+        share = float((beside / variances).max())
+        lost = ROUNDING * share if np.isfinite(share) else 0.0
+        wrong = np.flatnonzero((smallest < -max(ROUNDOFF * float(sizes.max()), lost)) | ~finite)
     if not wrong.size:
         return None
     k = int(wrong[0])
     if not finite[k]:
         return k, float(np.nan), int(np.argmin(np.isfinite(matrices[k]).all(axis=1)))
-    vector = np.linalg.eigh(numbers[k] / units[:, None] / units)[1][:, 0]
-    return k, float(np.linalg.eigvalsh(numbers[k])[0]), int(np.argmax(np.abs(vector)))
+    told = float(np.linalg.eigvalsh(numbers[k])[0])
+    vector = np.linalg.eigh(scaled[k])[1][:, 0]
+    return k, told if len(rows) == 1 or told <= 0 else float(smallest[k]), int(np.argmax(np.abs(vector)))
 
 
 def check_noise(extremal: Extremal) -> None:

@@ -55,8 +55,8 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
 
     Each shooting segment is run again from its start. The jumps at the ends of the segments count with the multipliers
     of the continuity, which are the costates there: this is the change of the optimal cost. Along the controls
-    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more; where an
-    unstable plant amplifies the jumps, that of one run along the controls as well, unless roundoff would do as much.
+    themselves the terminal conditions are missed too; what this changes of the cost counts where it is more. What an
+    unstable plant makes of the jumps along the controls alone is told by `unstable` and `node_error`.
 
     Args:
         extremal: trajectory and multipliers.
@@ -78,8 +78,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
         with np.errstate(over="ignore", invalid="ignore"):
             further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
-    along = 0.0 if within is not None else _along_controls(extremal, cost)
-    error = max(abs(change), abs(change - missed), along) / max(abs(cost + change), NO_COST)
+    error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
     return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
 
 
@@ -153,15 +152,6 @@ def _by_segments(extremal: Extremal, gaps: Array | float) -> tuple[Array, Array]
 def _departure(extremal: Extremal, moved: Array, size: Array) -> Departure | None:
     nx = extremal.statement.nx
     return departure(extremal, moved[:nx], size[:nx])
-
-
-def _along_controls(extremal: Extremal, cost: float) -> float:
-    """Change of the cost in one run along the controls; 0 where the plant amplifies nothing, or roundoff as much."""
-    moved, size = _by_segments(extremal, 0.0)
-    left = _departure(extremal, moved, size)
-    if left is None or left.cost is None or not np.isfinite(left.cost):
-        return 0.0
-    return 0.0 if is_lost(extremal, left.states) else abs(left.cost - cost)
 
 
 def is_lost(extremal: Extremal, left: Array) -> bool:

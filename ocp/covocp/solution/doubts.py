@@ -32,16 +32,19 @@ def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
     error, fine = solution.mesh_error, False
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
+    alone, by_steps = _flown_alone(solution) if np.isfinite(error) else ("", False)
+    if alone:
+        warn_user(alone)
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
-    elif alone := _flown_alone(solution):
-        warn_user(alone)
-    elif not error <= COARSE_MESH:
+    elif not (error <= COARSE_MESH or by_steps):
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
             + (", or the states. Put a node where a rate jumps (grid=). " if depends_on_time else ". ")
             + "Use more intervals or substeps."
         )
+    elif alone:
+        pass
     elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
         warn_user(
             f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
@@ -60,19 +63,23 @@ def mention_doubts(solution: Solution) -> None:
         )
 
 
-def _flown_alone(solution: Solution) -> str:
-    """What an unstable plant makes of the errors of its steps along the controls alone, where that is much; else ""."""
+def _flown_alone(solution: Solution) -> tuple[str, bool]:
+    """What becomes of errors of the steps along the controls alone, where that is much; whether shorter ones help."""
     found = unstable(solution.extremal) if solution.statement is not None else None
     if found is None:
-        return ""
+        return "", False
     left, cost = found
     differs = cost is not None and abs(cost - solution.cost) > COARSE_MESH * abs(solution.cost)
     if left <= (OPTIMISED if differs else LONG_STEPS):  # a cost that differs at nodes that are right is one of the mesh
-        return ""
+        return "", False
     far = f"leaves the nodes by {left:.1e} of the range of a state" if np.isfinite(left) else "diverges"
-    paid = f", and costs {cost:.6g} instead of {solution.cost:.6g}" if cost is not None else ""
-    or_else = "" if cost is None else ", or use more intervals or substeps where these suffice"  # roundoff does as much
-    return f"The plant is unstable: a run along these controls alone {far}{paid}. Fly them with a feedback{or_else}."
+    if cost is None:  # roundoff does as much: no steps are short enough
+        return f"The plant is unstable: a run along these controls alone {far}. Fly them with a feedback.", False
+    paid = f" and costs {cost:.6g} instead of {solution.cost:.6g}" if differs else ""
+    return (
+        f"What the steps are off grows: a run along these controls alone {far}{paid}. Use more intervals or substeps, "
+        "or, where the plant is unstable, fly them with a feedback."
+    ), True
 
 
 def _mention_slopes(solution: Solution, fine: bool) -> None:
