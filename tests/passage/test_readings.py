@@ -7,6 +7,7 @@ from fractions import Fraction
 import casadi as ca
 import numpy as np
 import pytest
+from derivatives import tangents_of
 from sampled import random_system
 
 import covocp as co
@@ -102,11 +103,8 @@ def test_tangents_of_values_and_slopes_are_those_of_plain_updates(n, rows):
     found = []
     for result in (passed, by_casadi(n, rows, arguments)):
         value = ca.dot(weights, result) + ca.sumsqr(result) / 2
-        slopes = ca.Function("slopes", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
-        t = ca.MX.sym("t")
-        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
-        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
-        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+        values = [value, *(ca.gradient(value, v) for v in arguments)]
+        found.append(tangents_of(values, arguments, directions, given))
     for own, other in zip(*found, strict=True):
         assert np.abs(own - other).max() <= 1e-10 * np.abs(other).max()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from derivatives import tangents_of
 from longer import in_long_double
 from scipy.integrate import solve_ivp
 from side_by_side import in_threads
@@ -167,11 +168,8 @@ def test_tangents_of_values_and_slopes_are_those_of_casadi(n, kicked, every):
     found = []
     for result in (passed, by_casadi(n, arguments, every)):
         value = ca.dot(weights, result) + ca.sumsqr(result) / 2
-        slopes = ca.Function("slopes", arguments, [value, *(ca.gradient(value, v) for v in arguments)])
-        t = ca.MX.sym("t")
-        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
-        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
-        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+        values = [value, *(ca.gradient(value, v) for v in arguments)]
+        found.append(tangents_of(values, arguments, directions, given))
     for own, other in zip(*found, strict=True):
         assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
 
@@ -212,11 +210,8 @@ def test_tangents_of_slopes_by_few_entries_are_those_of_casadi(n, kicked, cost):
     found = []
     for result in (passed, by_casadi(n, arguments)):
         value = cost(result)
-        slopes = ca.Function("slopes", arguments, [ca.gradient(value, v) for v in arguments])
-        t = ca.MX.sym("t")
-        along = slopes(*(v + t * ca.DM(d) for v, d in zip(arguments, directions, strict=True)))
-        tangent = ca.Function("tangent", [t, *arguments], [ca.jtimes(v, t, 1) for v in along])
-        found.append([np.asarray(v.full()) for v in tangent(0, *given)])
+        values = [ca.gradient(value, v) for v in arguments]
+        found.append(tangents_of(values, arguments, directions, given))
     for own, other in zip(*found, strict=True):
         assert np.abs(own - other).max() <= 1e-11 * np.abs(other).max()
 

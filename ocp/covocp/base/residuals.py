@@ -24,6 +24,8 @@ from covocp.base.matrices import Array
 LIMIT = 1e-5
 # Largest violation of a converged point, in magnitudes of what is constrained.
 VIOLATION = 1e-6
+# Share of its unit by which a point may pass a limit and have met it: solvers do so by some 1e-8.
+PASSED = 1e-7
 # A cost below this share of what the controls change of it (a tracking cost that vanishes) has no size of its own.
 VANISHING = 0.1
 

@@ -20,6 +20,7 @@ from scipy import special
 
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, unpack
+from covocp.base.residuals import PASSED
 from covocp.base.short_repr import short_repr
 from covocp.simulation.actual import System
 from covocp.simulation.prediction import Prediction
@@ -33,10 +34,8 @@ from covocp.transcription.scales import limit_units, magnitudes
 Place = Literal["path", "initial", "final", "inside"]
 # Limits count as kept within this share of their size.
 MARGIN = 1e-9
-# Share of its unit by which a nominal may pass a limit and have met it: solvers do so by some 1e-8.
-SOLVED = 1e-7
-# The same of what is known exactly, by which runs may do so besides: they take other steps than the nominal. It is
-# known exactly where its spread is less than the second share.
+# Share of its unit by which runs may pass a limit of what is known exactly, besides what the nominal may (`PASSED`):
+# they take other steps. It is known exactly where its spread is less than the second share.
 STEPPED, ROUNDED = 1e-6, 1e-12
 # Share of the duration by which a time may miss an instant and be it.
 SAME = 1e-9
@@ -234,7 +233,7 @@ def margins(solution: Solution, design: System) -> Array:
         once = row.among(solution.t)
         own = values[i] if once is None else values[i, once : once + 1]
         excess = float(np.max(np.maximum(row.lower - own, own - row.upper)))
-        if 0.0 < excess <= SOLVED * units[i]:
+        if 0.0 < excess <= PASSED * units[i]:
             result[i] = excess
         if spread[i] <= ROUNDED * units[i]:
             result[i] = max(result[i], STEPPED * units[i])
@@ -246,7 +245,7 @@ def asked_margins(solution: Solution, least: Array, most: Array) -> Array:
     u = solution.trajectory.u[:, : least.size]
     excess = np.maximum(least - u, u - most).max(axis=0, initial=0.0)
     limits = np.abs(np.where(np.isfinite([least, most]), [least, most], 0.0)).max(axis=0, initial=0.0)
-    allowed = SOLVED * np.maximum(_scales(solution)[1][: least.size], limits)
+    allowed = PASSED * np.maximum(_scales(solution)[1][: least.size], limits)
     return np.asarray(np.where(excess <= allowed, excess, 0.0))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.normal import inside, margin, shown_probability
 from covocp.base.pages import Section, Sentence, Table, number
+from covocp.base.residuals import PASSED
 from covocp.statement.chances import ChanceLimits
 from covocp.transcription.scales import limit_units
 
@@ -18,9 +19,9 @@ if TYPE_CHECKING:
 
 # Share of the risk by which a probability may be missed before it is called so: the tolerance of the solver.
 ROUNDED = 1e-3
-# Share of the unit of a limit by which a solver may pass it, and of the deviation that it may be without changing a
-# probability. Where the deviation is less, the limit counts from where the solver left it.
-SOLVED, SMALL = 1e-7, 1e-3
+# Share of the deviation that a limit may be passed by (`PASSED`) without changing a probability. Where the deviation is
+# less, the limit counts from where the solver left it.
+SMALL = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,7 @@ def reached(solution: Solution) -> tuple[Reached, ...]:
 def _allowed(lower: float, upper: float) -> float:
     """By how much a limit may be passed and be met, in the unit of the expression: solvers do so by some 1e-8."""
     ends = np.array([lower]), np.array([upper])
-    return SOLVED * max(float(limit_units(*ends)[0]), *(abs(v) for v in (lower, upper) if np.isfinite(v)))
+    return PASSED * max(float(limit_units(*ends)[0]), *(abs(v) for v in (lower, upper) if np.isfinite(v)))
 
 
 def widths(solution: Solution, limits: ChanceLimits) -> tuple[Array, Array]:

@@ -44,7 +44,7 @@ def mention_doubts(solution: Solution) -> None:
             + "Use more intervals or substeps."
         )
     elif alone:
-        pass
+        pass  # said already, with what the steps are off at the nodes
     elif solution.statement is not None and (moved := node_error(solution.extremal)) > LONG_STEPS:
         warn_user(
             f"The integration steps are long: halving them moves a state or a covariance at a node by {moved:.1e} of "
