@@ -9,7 +9,7 @@ from longer import in_long_double
 from scipy.integrate import solve_ivp
 
 from covocp.base.matrices import half_length, pack, unpack
-from covocp.passage import library, ordering
+from covocp.passage import library, ordering, sweep
 from covocp.passage.sweep import _Sweep, passed_by
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -139,6 +139,83 @@ def test_a_pivot_that_vanishes_is_exchanged(monkeypatch, share):
     for k in range(STEPS):
         exact = D @ exact @ D.T
         assert np.allclose(unpack(found[:, k], n), exact, rtol=1e-12, atol=1e-12)
+
+
+def oscillators(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """h H at both points of oscillators of which one is measured; each third step has pivots that nearly vanish."""
+    n, m = 10, 5
+    F = np.block([[np.zeros((m, m)), np.eye(m)], [-np.eye(m), np.zeros((m, m))]])
+    Q, W = np.zeros((n, n)), np.zeros((n, n))
+    Q[m:, m:], W[0, 0] = 0.01 * np.eye(m), 0.1
+    H = np.block([[-F.T, W], [Q, F]])
+    lengths = [0.9999 * np.sqrt(12.0) if k % 3 == 1 else 0.2 + 0.01 * k for k in range(count)]
+    return np.hstack([h * H for h in lengths]), np.hstack([1.01 * h * H for h in lengths])
+
+
+def by_stages(
+    first: np.ndarray, points: tuple[np.ndarray, np.ndarray], seeds: np.ndarray, ends: int
+) -> list[np.ndarray]:
+    """Slopes by both points along a direction of the form of H, and it: differences of steps in longer arithmetic."""
+    n, slopes = len(first), []
+    every = points[0].shape[1] // (2 * n * ends)
+
+    def value(given: list[np.ndarray]) -> np.longdouble:
+        total, E = np.longdouble(0.0), first
+        for e in range(ends):
+            span = slice(2 * n * every * e, 2 * n * every * (e + 1))
+            E = in_long_double(E, given[0][:, span], given[1][:, span], steps=every)
+            lower = np.concatenate([E[j:, j] for j in range(n)])
+            total += (seeds[:, e] * lower).sum()
+        return total
+
+    for k in range(2):
+        rng, moves = np.random.default_rng(k), points[k].shape[1] // (2 * n)
+        F, Q, W = (rng.normal(size=(moves, n, n)) for _ in range(3))
+        Q, W = Q + Q.transpose(0, 2, 1), W + W.transpose(0, 2, 1)
+        direction = np.hstack(np.block([[-F.transpose(0, 2, 1), W], [Q, F]])) * (points[k] != 0)
+        step, moved = np.longdouble(1e-8), []
+        for sign in (1, -1):
+            given = [p.astype(np.longdouble) for p in points]
+            given[k] = given[k] + sign * step * direction
+            moved.append(value(given))
+        slopes.append(np.array([float((moved[0] - moved[1]) / (2 * step)), *direction.ravel()]))
+    return slopes
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no longer numbers than double here")
+@pytest.mark.parametrize("kind", ["chain", "poor pivots", "much measured"])
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_slopes_of_few_entries_without_stages(monkeypatch, kind, rows):
+    """Of factors alone; then all stages are asked for, and are there from then on."""
+    monkeypatch.setattr(ordering, "LARGEST_SHARE", 1e9)
+    n, count, every = 10, 20, 2
+    if kind == "poor pivots":
+        both = oscillators(count)
+    else:
+        F, Q, W = chain(n)
+        H = 0.2 * np.block([[-F.T, W * (1e5 if kind == "much measured" else 1.0)], [Q, F]])
+        both = np.tile(H, count), np.tile(1.01 * H, count)
+    pattern = ca.sparsify(ca.DM(np.abs(both[0][:, : 2 * n]))).sparsity()
+    wide = ca.repmat(pattern, 1, count)
+    a = [ca.MX.sym("e", half_length(n)), ca.MX.sym("h1", wide), ca.MX.sym("h2", wide)]
+    own = ca.MX.sym("s", half_length(n), count // every)
+    made = kept(n, tuple(map(tuple, pattern.get_triplet())), count, False, (), 0, False, every)
+    monkeypatch.setattr(sweep, "_sweep", lambda *given: made)
+    after = passed_by(a[0], a[1:], n, every=every)
+    function = ca.Function("f", [*a, own], [after, *(ca.jtimes(after, x, own, True) for x in a)])
+    E = prior(n)
+    given = [pack(E), *(ca.project(ca.DM(k), wide) for k in both)]
+    C = np.zeros((n, n))
+    C[-rows:, -rows:] = np.arange(1.0, rows * rows + 1).reshape(rows, rows)
+    C = C + C.T
+    few, all_ = np.zeros((half_length(n), count // every)), np.random.default_rng(3).normal(size=(55, count // every))
+    few[:, -3] = pack(C)  # what comes after has no slopes
+    for seeds in (few, all_, few):
+        _, _, *slopes = function(*given, seeds)
+        for own_slope, known, moves in zip(slopes, by_stages(E, both, seeds, count // every), both, strict=True):
+            found = float(np.sum(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape)))
+            size = float(np.sum(np.abs(np.asarray(own_slope.full()) * known[1:].reshape(moves.shape))))
+            assert abs(found - known[0]) <= 1e-8 * size
 
 
 def test_a_large_chain_is_the_differential_equation():

@@ -65,7 +65,9 @@ static void tangent_step(
     add_sparse(p, n, 1.0, d1, Y1, inner);
     add_sparse(p, n, -1.0 / 12.0, h2, inner, right);
     memcpy(dY1, right, sizeof(double) * m * n);
-    if (!p->order || !solve_sparse(p, n, k, n, dY1)) {
+    if (is_steady(p, k))
+        solve_sparse(p, n, k, n, dY1);
+    else {
         solve_full(p, n, k, E, w, right, a);
         for (int i = 0; i < m; ++i) memcpy(dY1 + i * n, a + i * w + m, sizeof(double) * n);
     }
@@ -226,12 +228,6 @@ static void write_out_tangent(const Moved *v, int n, double *RESTRICT dP) {
         }
 }
 
-static int asked(const double *seed, size_t half) {
-    for (size_t t = 0; seed && t < half; ++t)
-        if (seed[t] != 0.0) return 1;
-    return 0;
-}
-
 /* All of P and dP from here on. */
 static void write_both(Moved *v, int n) {
     if (!v->s.few) return;
@@ -242,9 +238,10 @@ static void write_both(Moved *v, int n) {
 
 /* `join` with tangents of the seeds. */
 static void join_tangents(Moved *v, int n, int *rows, const double *seed, const double *d_seed) {
-    const size_t half = (size_t)n * (n + 1) / 2, square = sizeof(double) * n * n;
-    const int moved = asked(d_seed, half);
-    if (!moved && !asked(seed, half)) return;
+    const int half = n * (n + 1) / 2;
+    const size_t square = sizeof(double) * n * n;
+    const int moved = is_asked(d_seed, half);
+    if (!moved && !is_asked(seed, half)) return;
     if (!v->s.any) {
         memset(v->dP, 0, square), memset(v->dM, 0, square), memset(v->s.P, 0, square);
         if (!moved) {

@@ -90,12 +90,18 @@ static void write_out(Slopes *s, int n, double *RESTRICT P) {
         }
 }
 
+/* Whether some number is not zero; none where there are none. */
+static int is_asked(const double *seed, int half) {
+    int any = 0;
+    for (int t = 0; seed && t < half && !any; t += 64)
+        for (int i = t; i < half && i < t + 64; ++i) any |= seed[i] != 0.0;
+    return any;
+}
+
 /* The slopes of one step's result join those of what comes after; `rows`: n to work in. */
 static void join(Slopes *s, int n, int *RESTRICT rows, const double *RESTRICT seed) {
     const int half = n * (n + 1) / 2;
-    int asked = 0;
-    for (int t = 0; t < half && !asked; ++t) asked = seed[t] != 0.0;
-    if (!asked) return;
+    if (!is_asked(seed, half)) return;
     if (!s->any) {
         int r = 0;
         memset(s->P, 0, sizeof(double) * n * n);
@@ -130,14 +136,25 @@ static void pack_slopes(Slopes *s, int n, double *RESTRICT spare, double *RESTRI
         for (int i = j; i < n; ++i, ++t) half[t] = i == j ? P[i * n + j] : P[i * n + j] + P[j * n + i];
 }
 
-/* Slopes before a step and by its H: few columns. */
-INLINE void back_few(const Passage *p, int n, int r, int k, Slopes *s, double *RESTRICT spare, double *s1, double *s2) {
-    double *RESTRICT y = spare, *RESTRICT weighted = spare + 2 * n * r;
-    divide_few(p->factor + (size_t)k * n * n, p->swaps + (size_t)k * n, n, r, s->M);
-    for (int stage = 0; stage < 2; ++stage) {
+/* Slopes before step k and by its H: few columns; `before`: half-vector there. */
+INLINE void back_few(
+    const Passage *p, int n, const int r, int k, Slopes *s, const double *before, double *spare, double *s1, double *s2
+) {
+    const size_t square = (size_t)n * n, tall = (size_t)2 * n * r;
+    double *y = spare, *weighted = y + 2 * tall, *E = p->work + 16 * square;
+    divide_few(p->factor + k * square, p->swaps + (size_t)k * n, n, r, s->M);
+    const int steady = !p->full && is_steady(p, k);
+    if (steady)
+        few_stages(p, n, r, k, before, s->M, y, y + tall, weighted);
+    else if (!p->full) { /* all stages once more */
+        spread(before, n, E);
+        step(p, n, k, E);
+    }
+    const size_t place = p->full ? (size_t)k : 0;
+    for (int stage = 0; stage < 2; ++stage, y += tall) {
         double *out = stage ? s2 : s1;
         if (!out) continue;
-        product_turned((stage ? p->stage2 : p->stage1) + (size_t)k * 2 * n * n, s->M, 2 * n, n, r, y);
+        if (!steady) product_turned((stage ? p->stage2 : p->stage1) + place * 2 * square, s->M, 2 * n, n, r, y);
         for (int i = 0; i < 2 * n; ++i)
             for (int c = 0; c < r; ++c) {
                 double sum = 0.0;
@@ -189,13 +206,14 @@ static void back_reading(const Passage *p, int n, int j, Slopes *s, double *REST
     product(spare, A, n, n, n, s->P);
 }
 
+/* Slopes at the steps of a passage from its `first` half-vector on. */
 static void back(
-    const Passage *p, int n, const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told,
-    double *by_kicks
+    const Passage *p, int n, const double *first, const double *seed, double *by_first, double *by_h1, double *by_h2,
+    double *by_told, double *by_kicks
 ) {
-    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p);
-    double *spare = p->work + 5 * n * n;
-    Slopes s = {0, 0, p->work, p->work + n * n, p->work + 2 * n * n};
+    const size_t half = (size_t)n * (n + 1) / 2, nnz = p->nnz, tells = telling(p), square = (size_t)n * n;
+    double *spare = p->work, *P = spare + 14 * square, *M = P + square, *C = M + square / 2;
+    Slopes s = {0, 0, P, M, C};
     for (int at = p->count - 1; at >= 0; --at) {
         const int k = p->place[at];
         if (at_end(p, at)) {
@@ -214,14 +232,19 @@ static void back(
         if (!s.any) {
             if (s1) memset(s1, 0, sizeof(double) * nnz);
             if (s2) memset(s2, 0, sizeof(double) * nnz);
-        } else if (!s.few)
+            continue;
+        }
+        if (!s.few) {
             back_all(p, n, k, &s, spare, s1, s2);
-        else if (s.few == 1)
-            back_few(p, n, 1, k, &s, spare, s1, s2);
+            continue;
+        }
+        const double *before = at ? p->after + (at - 1) * half : first;
+        if (s.few == 1)
+            back_few(p, n, 1, k, &s, before, spare, s1, s2);
         else if (s.few == 2)
-            back_few(p, n, 2, k, &s, spare, s1, s2);
+            back_few(p, n, 2, k, &s, before, spare, s1, s2);
         else
-            back_few(p, n, s.few, k, &s, spare, s1, s2);
+            back_few(p, n, s.few, k, &s, before, spare, s1, s2);
     }
     if (by_first) pack_slopes(&s, n, spare, by_first);
 }

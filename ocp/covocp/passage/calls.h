@@ -3,6 +3,7 @@
 #include "rows.h"
 #include "sparse.h"
 #include "forward.h"
+#include "few.h"
 #include "back.h"
 #include "kept.h"
 #include "along.h"
@@ -21,13 +22,15 @@ EXPORT void NAME(passage_forward)(
         memcpy(after + k * half, p->after + ((k + 1) * apart - 1) * half, sizeof(double) * half);
 }
 
-/* Slopes of seed . after by the arguments; those that are NULL are left out. */
-EXPORT void NAME(passage_reverse)(
+/* Slopes of seed . after by the arguments; those that are NULL are left out. Nonzero without memory. */
+EXPORT int NAME(passage_reverse)(
     Kept *k, const double *first, const double *h1, const double *h2, const double *told, const double *kicks,
     const double *seed, double *by_first, double *by_h1, double *by_h2, double *by_told, double *by_kicks
 ) {
+    if (!is_few(&k->p, k->p.n, seed) && keep_stages(k)) return 1;
     run(k, k->p.n, first, h1, h2, told, kicks);
-    back(&k->p, k->p.n, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+    back(&k->p, k->p.n, k->first, seed, by_first, by_h1, by_h2, by_told, by_kicks);
+    return 0;
 }
 
 /* Tangents of `after`, and of the slopes that `passage_reverse` gives, along a direction; nonzero without memory.
@@ -44,11 +47,11 @@ EXPORT int NAME(passage_tangent)(
     const Passage *p = &k->p;
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
     const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->ends, d = sizeof(double);
-    if (!k->moved) k->moved = room((size_t)p->moves * 5 * square, d);
-    if (!k->turned) k->turned = room((size_t)p->reads * turned, d);
-    if (!k->direction) k->direction = calloc(numbers(p), d); /* compared before it is first written */
-    if (!k->shifted) k->shifted = room(all, d);
-    if (!k->moved || !k->turned || !k->direction || !k->shifted) return 1;
+    const int first_time = !k->direction;
+    if (made(k, &k->moved, (size_t)p->moves * 5 * square) || made(k, &k->turned, (size_t)p->reads * turned) ||
+        made(k, &k->direction, numbers(p)) || made(k, &k->shifted, all) || keep_stages(k))
+        return 1;
+    if (first_time) memset(k->direction, 0, d * numbers(p)); /* compared before it is first written */
     run(k, p->n, first, h1, h2, told, kicks);
     tangents(k, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
     if (d_after) memcpy(d_after, k->shifted, d * all);

@@ -90,15 +90,17 @@ static int measures_much(const Passage *p, int k, const double *E) {
  * [I; E] goes through the step as it is. Where much is measured the transition D itself is made, from which E's rounding
  * is apart: the errors of D [I; E] stay in proportion to what they come from.
  */
-static void step(Passage *p, int n, int k, double *RESTRICT E) {
+static void step(const Passage *p, int n, int k, double *RESTRICT E) {
     const int m = 2 * n, transition = measures_much(p, k, E), columns = transition ? m : n, w = m + columns;
     double *RESTRICT a = p->work, *RESTRICT b = p->work + 8 * n * n, *RESTRICT D = p->work + 10 * n * n;
-    const size_t place = p->lean ? 0 : (size_t)k;
+    const size_t place = p->full ? (size_t)k : 0, own = p->lean ? 0 : (size_t)k;
     double *RESTRICT Y1 = p->stage1 + place * m * n, *RESTRICT Y2 = p->stage2 + place * m * n;
-    double *RESTRICT factor = p->factor + place * n * n;
-    double *swaps = p->swaps + place * n;
+    double *RESTRICT factor = p->factor + own * n * n;
+    double *swaps = p->swaps + own * n;
     double *RESTRICT stage = transition ? D : Y1;
-    if (!p->order || !sparse_stage(p, n, k, E, columns, stage)) {
+    if (is_steady(p, k))
+        sparse_stage(p, n, k, E, columns, stage);
+    else {
         solve_full(p, n, k, E, w, NULL, a);
         for (int i = 0; i < m; ++i) memcpy(stage + i * columns, a + i * w + m, sizeof(double) * columns);
     }
@@ -167,8 +169,10 @@ static void passes(Passage *p, int n, const double *first, const double *kicks) 
         const int place = p->place[k];
         if (place < 0)
             reading(p, n, -1 - place, E);
-        else
+        else {
+            factorize(p, place);
             step(p, n, place, E);
+        }
         const int wanted = at_end(p, k);
         if (p->lean && !wanted) continue;
         double *after = p->after + (p->lean ? k / p->every : k) * half;

@@ -4,14 +4,24 @@ typedef struct {
     int known;     /* whether there is a last point: 1, or 2 with kicks */
     int along;     /* whether the tangents are along the last direction: 1, or 2 with tangents of kicks */
     int *whole;    /* its shape, and to work in */
-    double *reals; /* all of `p` */
+    double *reals; /* all of `p` but what is in `whole` and in `stages` */
+    double *stages; /* of all steps; NULL until they are asked for */
     double *first, *h1, *h2, *told, *kicks; /* the last point */
     double *moved;  /* tangents of the stages and of X, of every step; NULL until they are asked for */
     double *turned; /* tangents of K, A, E+, of every reading, as `moved` */
     double *direction, *shifted; /* the last direction; the tangents of the half-vectors along it; as `moved` */
+    size_t held; /* bytes of all of these */
 } Kept;
 
 static void *room(size_t count, size_t size) { return count > SIZE_MAX / size ? NULL : malloc(count ? count * size : 1); }
+
+/* Room for reals of `k` at a place where there is none yet; nonzero without memory. */
+static int made(Kept *k, double **place, size_t count) {
+    if (*place) return 0;
+    *place = room(count, sizeof(double));
+    if (*place) k->held += count * sizeof(double);
+    return !*place;
+}
 
 /* Numbers of a point, with kicks. */
 static size_t numbers(const Passage *p) {
@@ -31,6 +41,17 @@ static int here(
     return kicks ? !memcmp(k->kicks, kicks, half * p->ends) : k->known == 1;
 }
 
+/* Keep the stages of all steps from now on; nonzero without memory. */
+static int keep_stages(Kept *k) {
+    Passage *p = &k->p;
+    if (p->full) return 0;
+    p->full = 1;
+    if (made(k, &k->stages, stages(p, NULL))) p->full = 0;
+    stages(p, p->full ? k->stages : k->reals);
+    k->known = k->along = 0;
+    return !p->full;
+}
+
 static void run(
     Kept *k, int n, const double *first, const double *h1, const double *h2, const double *told, const double *kicks
 ) {
@@ -44,4 +65,24 @@ static void run(
     if (kicks) memcpy(k->kicks, kicks, sizeof(double) * half * p->ends);
     passes(p, n, first, kicks);
     k->known = kicks ? 2 : 1;
+}
+
+/* Whether seeds leave slopes of few columns, at whatever step: those of one half-vector, of few entries. */
+static int is_few(const Passage *p, int n, const double *seed) {
+    const int half = n * (n + 1) / 2;
+    int found = 0;
+    for (int e = 0; e < p->ends; ++e, seed += half) {
+        if (!is_asked(seed, half)) continue;
+        int rows = 0;
+        for (int i = 0; i < n; ++i) {
+            int any = 0;
+            for (int j = 0; j < n && !any; ++j) {
+                const int low = i > j ? i : j, high = i > j ? j : i;
+                any = seed[high * (2 * n - high + 1) / 2 + low - high] != 0.0;
+            }
+            rows += any;
+        }
+        if (found++ || 3 * rows > n) return 0;
+    }
+    return 1;
 }

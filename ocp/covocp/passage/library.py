@@ -13,15 +13,16 @@ from typing import Any
 MODULE = "covocp.passage._passage"
 
 # Of the arguments of the functions and of what they mean; a library of an earlier one would give wrong numbers.
-VERSION = 10
+VERSION = 11
 
 _WHOLE, _ADDRESS = ctypes.c_int, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "passage_new": (_ADDRESS, (_ADDRESS, _WHOLE, _WHOLE)),
     "passage_bytes": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
+    "passage_held": (ctypes.c_size_t, (_ADDRESS,)),
     "passage_free": (None, (_ADDRESS,)),
     "passage_forward": (None, (_ADDRESS,) * 7),
-    "passage_reverse": (None, (_ADDRESS,) * 12),
+    "passage_reverse": (_WHOLE, (_ADDRESS,) * 12),
     "passage_tangent": (_WHOLE, (_ADDRESS,) * 19),
     "exported_length": (ctypes.c_size_t, (_ADDRESS, _WHOLE)),
     "exported_forward": (None, (_ADDRESS,) * 6),

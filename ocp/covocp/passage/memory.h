@@ -49,6 +49,8 @@ static const double GAP = 0.28867513459481287;
 static const double SHARE = 0.5 - 2.0 * 0.28867513459481287;
 /* Of information times variance in a step, above which the transition is made. */
 static const double MUCH = 100.0;
+/* Steps whose systems are made triangular side by side. */
+enum { MOST_LANES = 8 };
 
 /* Steps of a covariance and where their numbers lie.
  *
@@ -59,21 +61,41 @@ typedef struct {
     int n, nnz, count, r, moves, reads;
     int every, ends;  /* half-vectors are wanted, kicks and seeds given, after every so many steps: `ends` columns */
     int lean;         /* nothing is kept of the steps: no slopes */
+    int lanes;        /* steps made triangular side by side: 1 or MOST_LANES */
+    int full, brief;  /* the stages of all steps are kept; the factors of their systems, which for slopes of few entries
+                       * suffice (few.h) */
     const int *place; /* of each step among those that move, or -1 - that among those that read; of shape */
     const int *row, *col; /* nonzeros of H, column by column; of shape */
     const int *begin, *across, *which; /* the same row by row: places, columns, positions among them; of shape */
-    /* An order of elimination and the pattern it leads to, see `solve_sparse`, of shape; NULL: rows are exchanged. Row i of
-     * the factors has columns `before` it and `behind` it, from `left[i]` and `right[i]` on; `facing`: of each of the
-     * former, the place of i behind it. */
+    /* An order of elimination and the pattern it leads to, see `solve_sparse`, of shape; NULL: rows are exchanged. Row
+     * order[i] of the factors has columns `before` it and `behind` it, from `left[i]` and `right[i]` on; `facing`: of each
+     * of the former, its place behind that column. */
     const int *order, *rank, *left, *right, *before, *facing, *behind;
     int *chosen;                  /* 2n to work in */
+    int *good;                    /* whether factors are, of as many steps as there are in `factors` */
     const double *h1, *h2, *told; /* the point */
     double *after;                /* half-vectors there, after all steps; where it is lean only those that are wanted */
-    double *stage1, *stage2;      /* of every step, 2n x n, row by row */
-    double *factor, *swaps;       /* of every X', n x n, and the rows that were exchanged for each */
+    double *factors;              /* of the systems of all steps, or of those side by side */
+    double *factor, *swaps;       /* of every X', n x n, and the rows that were exchanged for each; of one where it is lean */
+    double *stage1, *stage2;      /* of every step, 2n x n, row by row; of one unless all are kept */
     double *gain, *keep, *inverse, *reached; /* of every reading: K, A, (M E M' + R)^-1, E+ */
     double *work, *sizes, *values; /* to work in; `sizes`: of the diagonal of a full system */
 } Passage;
 
 /* Numbers that tell of one reading. */
 static size_t telling(const Passage *p) { return (size_t)p->r * p->n + (size_t)p->r * (p->r + 1) / 2; }
+
+/* Gives a place to one array; `memory` NULL: counts only. */
+static double *placed(double *memory, size_t *used, size_t count) {
+    double *place = memory ? memory + *used : NULL;
+    *used += count;
+    return place;
+}
+
+/* Places for the stages of all steps, or of one, from `memory` on; their number. */
+static size_t stages(Passage *p, double *memory) {
+    const size_t n = p->n, square = n * n, steps = p->full || !p->moves ? (size_t)p->moves : 1;
+    size_t used = 0;
+    p->stage1 = placed(memory, &used, steps * 2 * square), p->stage2 = placed(memory, &used, steps * 2 * square);
+    return used;
+}

@@ -14,7 +14,7 @@
 #include "written.h"
 
 /* Of this source: VERSION in library.py, one more with every change of arguments or of their meaning. */
-EXPORT int passage_version(void) { return 10; }
+EXPORT int passage_version(void) { return 11; }
 
 /* Whether this processor can take the functions whose names end in _newer. */
 EXPORT int passage_newer(void) {
@@ -28,46 +28,55 @@ EXPORT int passage_newer(void) {
 
 EXPORT void passage_free(Kept *k) {
     if (!k) return;
-    void *owned[] = {k->whole, k->reals, k->moved, k->turned, k->direction, k->shifted};
+    void *owned[] = {k->whole, k->reals, k->stages, k->moved, k->turned, k->direction, k->shifted};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; ++i) free(owned[i]);
     free(k);
+}
+
+/* Tells a passage its shape, and what is kept of its steps. */
+static void told_apart(Passage *p, const int *shape, int lean) {
+    described(p, shape);
+    p->lean = lean, p->lanes = MOST_LANES, p->brief = !lean && p->order;
 }
 
 /* A passage of a shape of `length` numbers; NULL where there is no memory. `lean`: for values alone. */
 EXPORT Kept *passage_new(const int *shape, int length, int lean) {
     Kept *k = calloc(1, sizeof *k);
     if (!k) return NULL;
-    k->whole = room((size_t)length + 2 * shape[0], sizeof(int));
-    if (k->whole) {
-        memcpy(k->whole, shape, sizeof(int) * length);
-        described(&k->p, k->whole);
-        k->p.chosen = k->whole + length;
-        k->p.lean = lean;
-        k->reals = room(keeps(&k->p, NULL) + works(&k->p, NULL) + numbers(&k->p), sizeof(double));
-    }
-    if (!k->reals) {
+    Passage *p = &k->p;
+    told_apart(p, shape, lean);
+    k->whole = room((size_t)length + counts(p, NULL), sizeof(int));
+    if (!k->whole || made(k, &k->reals, stages(p, NULL) + keeps(p, NULL) + works(p, NULL) + numbers(p))) {
         passage_free(k);
         return NULL;
     }
-    Passage *p = &k->p;
+    memcpy(k->whole, shape, sizeof(int) * length);
+    told_apart(p, k->whole, lean);
+    counts(p, k->whole + length);
     const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = (size_t)p->nnz * p->moves;
-    double *at = k->reals + keeps(p, k->reals);
+    double *at = k->reals + stages(p, k->reals); /* where `keep_stages` finds them */
+    at += keeps(p, at);
     at += works(p, at);
     k->first = at, k->h1 = k->first + half, k->h2 = k->h1 + entries;
     k->told = k->h2 + entries, k->kicks = k->told + telling(p) * p->reads;
     p->h1 = k->h1, p->h2 = k->h2, p->told = k->told;
+    if (!lean && !p->brief && keep_stages(k)) {
+        passage_free(k);
+        return NULL;
+    }
     return k;
 }
 
-/* Bytes of such a passage, with its tangents unless it is for values alone. */
+/* Bytes of such a passage before slopes or tangents ask for more. */
 EXPORT size_t passage_bytes(const int *shape, int lean) {
     Passage p;
-    described(&p, shape);
-    p.lean = lean;
-    const size_t n = p.n, square = n * n, own = keeps(&p, NULL) + works(&p, NULL) + numbers(&p);
-    const size_t moved = 5 * square * p.moves + (p.r * n + 2 * square) * p.reads;
-    return sizeof(double) * (own + (lean ? 0 : moved + numbers(&p) + n * (n + 1) / 2 * p.ends));
+    told_apart(&p, shape, lean);
+    p.full = !lean && !p.brief;
+    return sizeof(double) * (stages(&p, NULL) + keeps(&p, NULL) + works(&p, NULL) + numbers(&p));
 }
+
+/* Bytes that it has now. */
+EXPORT size_t passage_held(const Kept *k) { return k->held; }
 
 /* What exported code computes, by the same operations: not those for newer processors. */
 EXPORT size_t exported_length(const int *shape, int of) { return written_length(shape, of); }

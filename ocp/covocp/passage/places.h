@@ -5,6 +5,7 @@ static void described(Passage *p, const int *shape) {
     memset(p, 0, sizeof *p);
     p->n = shape[0], p->nnz = shape[1], p->count = shape[2], p->r = shape[3];
     p->every = shape[5], p->ends = p->count / p->every;
+    p->lanes = 1;
     p->place = shape + 6;
     for (int k = 0; k < p->count; ++k) p->place[k] < 0 ? ++p->reads : ++p->moves;
     p->row = p->place + p->count, p->col = p->row + p->nnz;
@@ -15,20 +16,21 @@ static void described(Passage *p, const int *shape) {
     p->before = p->right + m + 1, p->facing = p->before + p->right[m], p->behind = p->facing + p->right[m];
 }
 
-/* Gives a place to one array; `memory` NULL: counts only. */
-static double *placed(double *memory, size_t *used, size_t count) {
-    double *place = memory ? memory + *used : NULL;
-    *used += count;
-    return place;
+/* Whole numbers to work in, from `memory` on; their number. */
+static size_t counts(Passage *p, int *memory) {
+    const size_t m = 2 * (size_t)p->n, good = p->brief ? (size_t)p->moves : (size_t)p->lanes;
+    p->chosen = memory;
+    if (memory) p->good = memory + m;
+    return m + good;
 }
 
 /* Places for what is kept of the steps, from `memory` on; their number. */
 static size_t keeps(Passage *p, double *memory) {
-    const size_t n = p->n, square = n * n, steps = p->lean && p->moves ? 1 : (size_t)p->moves, reads = p->reads;
+    const size_t n = p->n, square = n * n, reads = p->reads, steps = p->lean && p->moves ? 1 : (size_t)p->moves;
     size_t used = 0;
     p->after = placed(memory, &used, n * (n + 1) / 2 * (p->lean ? p->ends : p->count));
-    p->stage1 = placed(memory, &used, steps * 2 * square), p->stage2 = placed(memory, &used, steps * 2 * square);
     p->factor = placed(memory, &used, steps * square), p->swaps = placed(memory, &used, steps * n);
+    if (p->brief) p->factors = placed(memory, &used, (size_t)p->moves * factors_length(p));
     p->gain = placed(memory, &used, reads * p->r * n), p->keep = placed(memory, &used, reads * square);
     p->inverse = placed(memory, &used, reads * p->r * p->r), p->reached = placed(memory, &used, reads * square);
     return used;
@@ -36,10 +38,12 @@ static size_t keeps(Passage *p, double *memory) {
 
 /* Places to work in, from `memory` on; their number. */
 static size_t works(Passage *p, double *memory) {
-    const size_t n = p->n, r = p->r, filled = p->order ? (size_t)p->right[2 * n] : 0;
+    const size_t n = p->n, r = p->r;
     size_t used = 0;
     p->work = placed(memory, &used, 17 * n * n + 4 * (r * r + r * n));
     p->sizes = placed(memory, &used, 2 * n);
-    p->values = placed(memory, &used, p->order ? 6 * n + filled : 0);
+    if (!p->order) return used;
+    p->values = placed(memory, &used, (2 * (size_t)p->nnz + 2 * n + factors_length(p)) * p->lanes);
+    if (!p->brief) p->factors = placed(memory, &used, factors_length(p) * p->lanes);
     return used;
 }

@@ -44,46 +44,71 @@ INLINE void add_to_two(
 }
 
 #if defined(__AVX2__) && defined(__GNUC__)
+#include <immintrin.h>
 /* Rows and columns of a block of sums that stays in the registers of a processor with AVX2, columns of one row of them. */
 enum { TALL = 4, BROAD = 8, BROADER = 16 };
 typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
+typedef long long Chosen __attribute__((vector_size(32)));
 
-/* A block of C += sign A B; see `add_product`. */
+/* The first `count` of four numbers. */
+INLINE __m256i first_of(int count) {
+    const Chosen own = {-(count > 0), -(count > 1), -(count > 2), -(count > 3)};
+    return (__m256i)own;
+}
+
+/* Four numbers; `some`: only those that are chosen, zero else. */
+INLINE Four four(const double *from, const int some, __m256i chosen) {
+    return some ? (Four)_mm256_maskload_pd(from, chosen) : *(const Four *)from;
+}
+
+INLINE void add_four(double *to, const int some, __m256i chosen, Four sum) {
+    if (some)
+        _mm256_maskstore_pd(to, chosen, (__m256d)(four(to, 1, chosen) + sum));
+    else
+        *(Four *)to += sum;
+}
+
+/* A block of C += sign A B, see `add_product`: of four columns, and four more unless `half`; the last ones `some`. */
 INLINE void add_block(
-    double *C, int wide, double sign, const double *A, int tall, int step, const double *B, int across, int inner
+    double *C, int wide, double sign, const double *A, int tall, int step, const double *B, int across, int inner,
+    const int half, const int some, __m256i chosen
 ) {
     Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
     for (int k = 0; k < inner; ++k, A += step, B += across) {
-        const Four left = *(const Four *)B, right = *(const Four *)(B + 4);
-        const double one = A[0], two = A[tall], three = A[2 * tall], four = A[3 * tall];
-        a += one * left, b += one * right, c += two * left, d += two * right;
-        e += three * left, f += three * right, g += four * left, h += four * right;
+        const Four left = four(B, half && some, chosen);
+        const double one = A[0], two = A[tall], three = A[2 * tall], four_ = A[3 * tall];
+        a += one * left, c += two * left, e += three * left, g += four_ * left;
+        if (half) continue;
+        const Four right = four(B + 4, some, chosen);
+        b += one * right, d += two * right, f += three * right, h += four_ * right;
     }
-    *(Four *)C += sign * a, *(Four *)(C + 4) += sign * b, C += wide;
-    *(Four *)C += sign * c, *(Four *)(C + 4) += sign * d, C += wide;
-    *(Four *)C += sign * e, *(Four *)(C + 4) += sign * f, C += wide;
-    *(Four *)C += sign * g, *(Four *)(C + 4) += sign * h;
+    const Four left[4] = {a, c, e, g}, right[4] = {b, d, f, h};
+    for (int i = 0; i < 4; ++i, C += wide) {
+        add_four(C, half && some, chosen, sign * left[i]);
+        if (!half) add_four(C + 4, some, chosen, sign * right[i]);
+    }
 }
 
-/* The first columns of own += sign (sum of shares of chosen rows of B). */
-INLINE void add_broad(
-    double *own, double sign, const double *share, const int *rows, int count, const double *B, int wide
+/* The first columns of own += sign (sum of shares of chosen rows of B): `fours` times four, at most four times; of the
+ * last four `some`. */
+INLINE void add_fours(
+    double *own, double sign, const double *share, const int *rows, int count, const double *B, int wide, const int fours,
+    const int some, __m256i chosen
 ) {
-    Four a = {0.0}, b = {0.0}, c = {0.0}, d = {0.0}, e = {0.0}, f = {0.0}, g = {0.0}, h = {0.0};
+    Four even[4] = {{0.0}}, odd[4] = {{0.0}};
     int j = 0;
     for (; j + 2 <= count; j += 2) {
         const double one = share[j], two = share[j + 1];
-        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
-        const Four *second = (const Four *)(B + (size_t)rows[j + 1] * wide);
-        a += one * first[0], b += one * first[1], c += one * first[2], d += one * first[3];
-        e += two * second[0], f += two * second[1], g += two * second[2], h += two * second[3];
+        const double *first = B + (size_t)rows[j] * wide, *second = B + (size_t)rows[j + 1] * wide;
+        for (int f = 0; f < fours; ++f) {
+            even[f] += one * four(first + 4 * f, some && f == fours - 1, chosen);
+            odd[f] += two * four(second + 4 * f, some && f == fours - 1, chosen);
+        }
     }
-    if (j < count) {
-        const Four *first = (const Four *)(B + (size_t)rows[j] * wide);
-        a += share[j] * first[0], b += share[j] * first[1], c += share[j] * first[2], d += share[j] * first[3];
-    }
-    Four *at = (Four *)own;
-    at[0] += sign * (a + e), at[1] += sign * (b + f), at[2] += sign * (c + g), at[3] += sign * (d + h);
+    if (j < count)
+        for (int f = 0; f < fours; ++f)
+            even[f] += share[j] * four(B + (size_t)rows[j] * wide + 4 * f, some && f == fours - 1, chosen);
+    for (int f = 0; f < fours; ++f) add_four(own + 4 * f, some && f == fours - 1, chosen, sign * (even[f] + odd[f]));
 }
 #else
 enum { TALL = 2 };
@@ -94,11 +119,25 @@ INLINE void add_chosen(
     double *RESTRICT own, double sign, const double *share, const int *rows, int count, const double *B, int wide,
     int columns
 ) {
-    int j = 0;
 #if defined(__AVX2__) && defined(__GNUC__)
+    const __m256i all = first_of(4), chosen = first_of(columns % 4);
     for (; columns >= BROADER; columns -= BROADER, own += BROADER, B += BROADER)
-        add_broad(own, sign, share, rows, count, B, wide);
-#endif
+        add_fours(own, sign, share, rows, count, B, wide, 4, 0, all);
+    switch (columns) {
+    case 0: return;
+    case 4: add_fours(own, sign, share, rows, count, B, wide, 1, 0, all); return;
+    case 8: add_fours(own, sign, share, rows, count, B, wide, 2, 0, all); return;
+    case 12: add_fours(own, sign, share, rows, count, B, wide, 3, 0, all); return;
+    default: break;
+    }
+    switch (columns / 4) {
+    case 0: add_fours(own, sign, share, rows, count, B, wide, 1, 1, chosen); return;
+    case 1: add_fours(own, sign, share, rows, count, B, wide, 2, 1, chosen); return;
+    case 2: add_fours(own, sign, share, rows, count, B, wide, 3, 1, chosen); return;
+    default: add_fours(own, sign, share, rows, count, B, wide, 4, 1, chosen); return;
+    }
+#else
+    int j = 0;
     for (; j + 4 <= count; j += 4) {
         const double a = sign * share[j], b = sign * share[j + 1], c = sign * share[j + 2], d = sign * share[j + 3];
         const double *RESTRICT one = B + (size_t)rows[j] * wide, *RESTRICT two = B + (size_t)rows[j + 1] * wide,
@@ -110,6 +149,7 @@ INLINE void add_chosen(
         const double *RESTRICT one = B + (size_t)rows[j] * wide;
         for (int i = 0; i < columns; ++i) own[i] += a * one[i];
     }
+#endif
 }
 
 /* C += sign A B, (rows x inner) (inner x columns): rows of C and of B lie `wide` and `across` apart, entries of A `tall`
@@ -119,15 +159,22 @@ INLINE void add_product(
     int inner, int columns
 ) {
     int i = 0;
+#if defined(__AVX2__) && defined(__GNUC__)
+    const __m256i all = first_of(4), chosen = first_of(columns % 4);
+#endif
     for (; i + TALL <= rows; i += TALL) {
         double *own = C + (size_t)i * wide;
         const double *share = A + (size_t)i * tall;
 #if defined(__AVX2__) && defined(__GNUC__)
         int j = 0;
-        for (; j + BROAD <= columns; j += BROAD) add_block(own + j, wide, sign, share, tall, step, B + j, across, inner);
-        for (int r = 0; r < TALL && j < columns; r += 2)
-            add_to_two(own + r * wide + j, own + (r + 1) * wide + j, sign, share + r * tall, share + (r + 1) * tall, step,
-                       B + j, across, inner, columns - j);
+        for (; j + BROAD <= columns; j += BROAD)
+            add_block(own + j, wide, sign, share, tall, step, B + j, across, inner, 0, 0, all);
+        if (columns - j > 4)
+            add_block(own + j, wide, sign, share, tall, step, B + j, across, inner, 0, 1, chosen);
+        else if (columns - j == 4)
+            add_block(own + j, wide, sign, share, tall, step, B + j, across, inner, 1, 0, all);
+        else if (columns > j)
+            add_block(own + j, wide, sign, share, tall, step, B + j, across, inner, 1, 1, chosen);
 #else
         add_to_two(own, own + wide, sign, share, share + tall, step, B, across, inner, columns);
 #endif
@@ -262,12 +309,32 @@ INLINE void spread(const double *RESTRICT half, int n, double *RESTRICT square) 
         for (int i = j; i < n; ++i, ++t) square[i * n + j] = square[j * n + i] = half[t];
 }
 
+#if defined(__AVX2__) && defined(__GNUC__)
+/* B <- A' of four rows and columns. */
+INLINE void turn_four(const double *A, int across, double *B, int wide) {
+    const __m256d a = _mm256_loadu_pd(A), b = _mm256_loadu_pd(A + across), c = _mm256_loadu_pd(A + 2 * (size_t)across),
+                  d = _mm256_loadu_pd(A + 3 * (size_t)across);
+    const __m256d ab = _mm256_unpacklo_pd(a, b), ba = _mm256_unpackhi_pd(a, b);
+    const __m256d cd = _mm256_unpacklo_pd(c, d), dc = _mm256_unpackhi_pd(c, d);
+    _mm256_storeu_pd(B, _mm256_permute2f128_pd(ab, cd, 0x20));
+    _mm256_storeu_pd(B + wide, _mm256_permute2f128_pd(ba, dc, 0x20));
+    _mm256_storeu_pd(B + 2 * (size_t)wide, _mm256_permute2f128_pd(ab, cd, 0x31));
+    _mm256_storeu_pd(B + 3 * (size_t)wide, _mm256_permute2f128_pd(ba, dc, 0x31));
+}
+#endif
+
 /* B <- A', A (rows x columns): rows lie `across` and `wide` apart; squares of it at a time, which stay in the cache. */
 static void turn(const double *RESTRICT A, int across, int rows, int columns, double *RESTRICT B, int wide) {
-    enum { SIDE = 8 };
+    enum { SIDE = 4 };
     for (int i = 0; i < rows; i += SIDE)
         for (int j = 0; j < columns; j += SIDE) {
             const int last = i + SIDE < rows ? i + SIDE : rows, end = j + SIDE < columns ? j + SIDE : columns;
+#if defined(__AVX2__) && defined(__GNUC__)
+            if (i + SIDE <= rows && j + SIDE <= columns) {
+                turn_four(A + (size_t)i * across + j, across, B + (size_t)j * wide + i, wide);
+                continue;
+            }
+#endif
             for (int c = j; c < end; ++c)
                 for (int r = i; r < last; ++r) B[(size_t)c * wide + r] = A[(size_t)r * across + c];
         }

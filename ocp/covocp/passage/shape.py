@@ -47,4 +47,4 @@ def _factors(own: Ordering) -> list[NDArray[Any]]:
     of_row = np.repeat(np.arange(height), np.diff(own.begins))
     facing = np.argsort(own.columns, kind="stable")  # by the row that has the entry before its diagonal
     left = np.searchsorted(own.columns[facing], np.arange(height + 1))
-    return [own.order, rank, left, own.begins, of_row[facing], facing, own.columns]
+    return [own.order, rank, left, own.begins, own.order[of_row[facing]], facing, own.order[own.columns]]

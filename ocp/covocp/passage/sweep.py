@@ -118,7 +118,7 @@ class _Workspaces:
     """Memory of passages: taken for a call, given back after it; what was used last is kept."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[_Sweep, int]] = []
+        self._kept: list[tuple[_Sweep, int, int]] = []  # and the bytes that each memory has
         self._lock = threading.Lock()
 
     def take(self, sweep: _Sweep) -> int:
@@ -133,12 +133,12 @@ class _Workspaces:
     def give(self, sweep: _Sweep, memory: int) -> None:
         """Keep memory for the next call, and free the oldest where it has become too much."""
         with self._lock:
-            self._kept.append((sweep, memory))
+            self._kept.append((sweep, memory, int(needed()["passage_held"](memory))))
             self._free(0, 1)
 
     def _free(self, more: int, least: int) -> None:
         """Free the oldest, down to so many, until there is room for more bytes."""
-        while len(self._kept) > least and more + sum(owner.bytes for owner, _ in self._kept) > KEPT_BYTES:
+        while len(self._kept) > least and more + sum(held for *_, held in self._kept) > KEPT_BYTES:
             needed()["passage_free"](self._kept.pop(0)[1])
 
 
@@ -275,11 +275,13 @@ class _Slopes(Node):
         sweep, count, library = self._sweep, self._sweep.get_n_in(), needed()
         places, slopes = library["addresses"](arguments), library["addresses"](results)
         given, seeds = sweep.padded(places[:count]), places[count + 1]
-        memory = _WORKSPACES.take(sweep)
+        memory, failed = _WORKSPACES.take(sweep), 0
         for k in range(self._directions):
             own = sweep.padded(sweep.direction(slopes, k))
-            library["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
+            failed += library["passage_reverse"](memory, *given, sweep.seed(seeds, k), *own)
         _WORKSPACES.give(sweep, memory)
+        if failed:
+            raise MemoryError(f"no memory for the slopes of {sweep.count} steps")
         return 0
 
     def has_forward(self, nfwd: int) -> bool:

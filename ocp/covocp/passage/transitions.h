@@ -10,44 +10,65 @@
 typedef struct {
     int rows, nnz, rest, steps; /* states; nonzeros of A, its columns past the states; steps of an interval */
     const int *row, *col;       /* of the nonzeros */
+    /* Row by row: where rows begin, where those among the states end, their places, columns, and room for what is there. */
+    int *begin, *among, *which, *across;
+    double *shares;
 } Steps;
 
-/* K = A [D; I], I at the places of an interval's rest; the first `active` of `wide` columns. */
-static void slopes_of(
-    const Steps *s, const double *RESTRICT A, const int *places, const double *D, int active, int wide,
-    double *RESTRICT K
-) {
-    for (int i = 0; i < s->rows; ++i) memset(K + (size_t)i * wide, 0, sizeof(double) * active);
-    for (int q = 0; q < s->nnz; ++q) {
-        if (s->row[q] >= s->rows) continue;
-        double *RESTRICT own = K + (size_t)s->row[q] * wide;
-        if (s->col[q] >= s->rows) {
-            own[places[s->col[q] - s->rows]] += A[q];
-            continue;
+/* The nonzeros of the states' rates row by row, in `memory` of 2 (rows + 1 + nnz) whole numbers. */
+static void by_rows(Steps *s, int *memory) {
+    int count = 0;
+    s->begin = memory, s->among = s->begin + s->rows + 1, s->which = s->among + s->rows + 1, s->across = s->which + s->nnz;
+    memset(memory, 0, sizeof(int) * 2 * (s->rows + 1));
+    for (int q = 0; q < s->nnz; ++q)
+        if (s->row[q] < s->rows) ++s->begin[s->row[q]];
+    for (int i = 0; i <= s->rows; ++i) { /* where rows begin, twice */
+        const int own = s->begin[i];
+        s->begin[i] = s->among[i] = count, count += i < s->rows ? own : 0;
+    }
+    for (int rest = 0; rest < 2; ++rest) {
+        for (int q = 0; q < s->nnz; ++q) { /* those among the states come first: columns rise */
+            if (s->row[q] >= s->rows || (s->col[q] >= s->rows) != rest) continue;
+            const int at = s->among[s->row[q]]++;
+            s->which[at] = q, s->across[at] = s->col[q];
         }
-        const double *RESTRICT other = D + (size_t)s->col[q] * wide;
-        const double share = A[q];
-        for (int j = 0; j < active; ++j) own[j] += share * other[j];
+        if (!rest) continue;
+        for (int i = 0; i < s->rows; ++i)
+            for (s->among[i] = s->begin[i]; s->among[i] < s->begin[i + 1] && s->across[s->among[i]] < s->rows;) ++s->among[i];
     }
 }
 
-/* One step: D moves; K and moved are spare. */
+/* Row i of K = A [D; I], I at the places of an interval's rest; the first `active` of `wide` columns. */
+INLINE void row_of(
+    const Steps *s, int i, const double *A, const int *places, const double *D, int active, int wide, double *own
+) {
+    const int first = s->begin[i], count = s->among[i] - first;
+    for (int t = 0; t < count; ++t) s->shares[t] = A[s->which[first + t]];
+    memset(own, 0, sizeof(double) * active);
+    add_chosen(own, 1.0, s->shares, s->across + first, count, D, wide, active);
+    for (int t = first + count; t < s->begin[i + 1]; ++t) own[places[s->across[t] - s->rows]] += A[s->which[t]];
+}
+
+/* One step: D moves; K (a row), moved (twice D) and sum are spare. */
 static void carry(
-    const Steps *s, const double *A, const int *places, int active, int wide, double *RESTRICT D, double *RESTRICT K,
-    double *RESTRICT moved, double *RESTRICT sum
+    const Steps *s, const double *A, const int *places, int active, int wide, double *D, double *RESTRICT K, double *moved,
+    double *sum
 ) {
     static const double reach[4] = {0.5, 0.5, 1.0, 0.0}, weight[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
+    const size_t all = (size_t)s->rows * wide;
     for (int stage = 0; stage < 4; ++stage) {
-        slopes_of(s, A + (size_t)stage * s->nnz, places, stage ? moved : D, active, wide, K);
+        const double *from = stage ? moved + (stage % 2 ? 0 : all) : D;
+        double *to = moved + (stage % 2 ? all : 0);
         for (int i = 0; i < s->rows; ++i) {
-            const size_t at = (size_t)i * wide;
-            for (int j = 0; j < active; ++j) {
-                sum[at + j] = (stage ? sum[at + j] : D[at + j]) + weight[stage] * K[at + j];
-                moved[at + j] = D[at + j] + reach[stage] * K[at + j];
-            }
+            const double *RESTRICT old = D + (size_t)i * wide, *RESTRICT before = (stage ? sum : D) + (size_t)i * wide;
+            double *RESTRICT total = (stage < 3 ? sum : to) + (size_t)i * wide, *RESTRICT next = to + (size_t)i * wide;
+            row_of(s, i, A + (size_t)stage * s->nnz, places, from, active, wide, K);
+            for (int j = 0; j < active; ++j) total[j] = before[j] + weight[stage] * K[j];
+            for (int j = 0; stage < 3 && j < active; ++j) next[j] = old[j] + reach[stage] * K[j];
         }
     }
-    for (int i = 0; i < s->rows; ++i) memcpy(D + (size_t)i * wide, sum + (size_t)i * wide, sizeof(double) * active);
+    for (int i = 0; i < s->rows; ++i)
+        memcpy(D + (size_t)i * wide, moved + all + (size_t)i * wide, sizeof(double) * active);
 }
 
 /* Slopes of the end of each segment by its start, and by the rest of its intervals.
@@ -61,15 +82,21 @@ EXPORT int NAME(transitions)(
     int rows, int nnz, const int *row, const int *col, int rest, int steps, int segments, const int *lengths,
     const int *places, const int *active, const double *slopes, double *results
 ) {
-    const Steps s = {rows, nnz, rest, steps, row, col};
+    Steps s = {rows, nnz, rest, steps, row, col, NULL, NULL, NULL, NULL, NULL};
     int widest = 0, interval = 0;
     for (int g = 0; g < segments; ++g) {
         interval += lengths[g];
         if (active[interval - 1] > widest) widest = active[interval - 1];
     }
     const size_t all = (size_t)rows * widest;
-    double *D = room(4 * all, sizeof(double)), *K = D + all, *moved = K + all, *sum = moved + all;
-    if (!D) return 1;
+    double *D = room(4 * all + widest + nnz, sizeof(double)), *moved = D + all, *sum = moved + 2 * all, *K = sum + all;
+    int *order = room(2 * ((size_t)rows + 1 + nnz), sizeof(int));
+    if (!D || !order) {
+        free(D), free(order);
+        return 1;
+    }
+    by_rows(&s, order);
+    s.shares = K + widest;
     interval = 0;
     for (int g = 0; g < segments; ++g) {
         const int wide = active[interval + lengths[g] - 1];
@@ -83,7 +110,7 @@ EXPORT int NAME(transitions)(
             for (int i = 0; i < rows; ++i) results[(size_t)j * rows + i] = D[(size_t)i * wide + j];
         results += (size_t)rows * wide;
     }
-    free(D);
+    free(D), free(order);
     return 0;
 }
 
@@ -126,7 +153,7 @@ EXPORT int NAME(passed_back)(
     const int *places, const int *active, const double *slopes, const double *by_states, const double *by_costs,
     double *results
 ) {
-    const Steps s = {rows, nnz, rest, steps, row, col};
+    const Steps s = {rows, nnz, rest, steps, row, col, NULL, NULL, NULL, NULL, NULL};
     double *slope = room(4 * (size_t)rows + 1, sizeof(double)), *by_rate = slope + rows, *by_place = by_rate + rows + 1;
     if (!slope) return 1;
     int interval = 0;

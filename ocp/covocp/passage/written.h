@@ -4,8 +4,9 @@
 static size_t written_length(const int *shape, int of) {
     Passage p;
     described(&p, shape);
+    p.full = 1;
     const size_t slopes = (size_t)p.n * (p.n + 1) / 2 + 2 * (size_t)p.nnz * p.moves;
-    return (of ? slopes : keeps(&p, NULL)) + works(&p, NULL);
+    return (of ? slopes : keeps(&p, NULL) + stages(&p, NULL)) + works(&p, NULL);
 }
 
 /* Half-vectors after each step, and behind them what slopes need. */
@@ -14,8 +15,10 @@ static void written_forward(
 ) {
     Passage p;
     described(&p, shape);
-    p.chosen = chosen, p.h1 = h1, p.h2 = h2;
-    works(&p, result + keeps(&p, result));
+    p.full = 1, p.h1 = h1, p.h2 = h2;
+    counts(&p, chosen);
+    result += keeps(&p, result);
+    works(&p, result + stages(&p, result));
     passes(&p, p.n, first, NULL);
 }
 
@@ -28,8 +31,10 @@ static void written_slopes(
     described(&p, shape);
     const size_t half = (size_t)p.n * (p.n + 1) / 2, entries = (size_t)p.nnz * p.moves;
     double *by_h1 = result + half, *by_h2 = by_h1 + entries;
-    p.chosen = chosen, p.h1 = h1, p.h2 = h2;
-    keeps(&p, (double *)passed); /* which `back` only reads */
+    p.full = 1, p.h1 = h1, p.h2 = h2;
+    counts(&p, chosen);
+    passed += keeps(&p, (double *)passed); /* which `back` only reads */
+    stages(&p, (double *)passed);
     works(&p, by_h2 + entries);
-    back(&p, p.n, seed, result, by_h1, by_h2, NULL, NULL);
+    back(&p, p.n, NULL, seed, result, by_h1, by_h2, NULL, NULL);
 }

@@ -26,7 +26,7 @@ from covocp.passage.shape import Pattern, shape
 from covocp.passage.sweep import Told, entries
 
 # What the bodies call, in the order in which C must see it.
-SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "back.h", "places.h", "written.h")
+SOURCES = ("memory.h", "rows.h", "sparse.h", "forward.h", "few.h", "back.h", "places.h", "written.h")
 WHAT = ("forward", "slopes")
 WIDTH = 24  # numbers of a line
 Form = Literal["evaluated", "written"]
@@ -163,7 +163,7 @@ class _Evaluated(Node):
         """Of CasADi."""
         if results[0] is None:
             return 0
-        chosen = np.empty(2 * int(self._shape[0]), dtype=np.intc)
+        chosen = np.empty(2 * int(self._shape[0]) + 1, dtype=np.intc)
         places = needed()["addresses"]((*self.filled(arguments), *results))
         self._run(self._shape.ctypes.data, chosen.ctypes.data, *places)
         return 0
@@ -173,4 +173,4 @@ def _body(name: str, what: str, own: NDArray[np.intc]) -> str:
     """A call of written.h."""
     given = ", ".join(f"arg[{i}]" for i in range(3 if what == WHAT[0] else 4))
     call = f"written_{what}({name}, chosen, {given}, res[0]);"
-    return f"  int chosen[{2 * own[0]}];\n  if (res[0]) {call}\n  return 0;\n"
+    return f"  int chosen[{2 * own[0] + 1}];\n  if (res[0]) {call}\n  return 0;\n"

@@ -27,6 +27,8 @@ AT_START, REACHED = 1e-3, 1e-9
 PRIOR_AT_START, PRIOR_REACHED = 1e3, 10.0
 # Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
 GIVEN_SHARE = 1e-6
+# What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
+NOTHING = 1e-50
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
 SMALL, LARGE = 0.1, 1e3
 
@@ -65,14 +67,14 @@ def magnitudes(statement: Statement, guess: Trajectory, parameters: Array, *, re
     alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
     alone = np.where(np.isfinite(span), np.minimum(span, 1.0), alone)
     least = np.where(np.isfinite(span), (REACHED if reached else AT_START) * np.minimum(span, 1.0), 0.0)
-    x = np.where(found > 0, np.clip(found, least, span), alone)
+    x = np.where(found > NOTHING, np.clip(found, least, span), alone)
     u = np.ones(statement.nu)
     for block in statement.states:
-        x[block.span] = _as_given(statement, block, x[block.span], found[block.span] > 0, reached)
+        x[block.span] = _as_given(statement, block, x[block.span], found[block.span] > NOTHING, reached)
     for block in statement.controls:
         own = np.abs(guess.u[:, block.span]).max(axis=0, initial=0.0)
-        size = np.minimum(np.where(own > 0, own, 1.0), _half_range(statement, block))
-        u[block.span] = _as_given(statement, block, size, own > 0, reached)
+        size = np.minimum(np.where(own > NOTHING, own, 1.0), _half_range(statement, block))
+        u[block.span] = _as_given(statement, block, size, own > NOTHING, reached)
     return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
 
 
@@ -159,6 +161,6 @@ def _matrix_scales(statement: Statement, e: Array) -> Array:
     for block in statement.matrices:
         rows, columns = half_indices(block.size)
         diagonal = np.abs(e[:, block.span][:, rows == columns]).max(axis=0, initial=0.0)
-        diagonal = np.where(diagonal > 0, diagonal, 1.0)
+        diagonal = np.where(diagonal > NOTHING, diagonal, 1.0)
         scales[block.span] = np.sqrt(diagonal[rows]) * np.sqrt(diagonal[columns])
     return scales
