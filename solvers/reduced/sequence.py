@@ -35,6 +35,8 @@ AT_ROUNDOFF = 1e-11
 NEARLY_WHOLE = 0.05
 # Share of what the controls spend that a cost must have to count as one.
 SPENT = 0.1
+# Share of what the controls change of the cost in their units that is none: where all of them end at zero.
+NONE_SPENT = 1e-12
 # Weights of violations above their multipliers.
 ABOVE = 1.5
 # Relative changes of the cost below this are roundoff.
@@ -218,7 +220,8 @@ class Sequence:
     def _gain(self, place: Place, step: Step, curvature: Curvature) -> float:
         """What the subproblem promises, relative to the cost or to what controls spend of it."""
         z = place.w[self._layout.chosen]
-        size = max(abs(place.cost), SPENT * float(z @ curvature.matrix @ z), float(np.finfo(float).tiny))
+        whole = NONE_SPENT * float(np.trace(curvature.matrix))
+        size = max(abs(place.cost), SPENT * float(z @ curvature.matrix @ z), whole, float(np.finfo(float).tiny))
         return max(float(step.change @ curvature.matrix @ step.change), 0.0) / size
 
     def _searched(

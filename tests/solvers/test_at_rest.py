@@ -1,0 +1,47 @@
+"""Plants that are at rest already: nothing has a magnitude, and no share of the cost says anything."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import covocp as co
+
+
+def regulator(*, unit: float = 1.0, dense: bool = False) -> co.Problem:
+    """A damped mass at rest, kept there; `unit`: of lengths, in metres."""
+    ocp = co.Problem(duration=10.0, name="at rest")
+    x, v = (ocp.state(name, initial=0.0, variance=0.01 * unit**2 if dense else None) for name in "xv")
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.1 * v, noise=1e-4 * unit**2 if dense else None)
+    cost = (x**2 + v**2 + u**2) / unit**2
+    if dense:
+        ocp.measurement("y", x, noise=1e-3 * unit**2)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=cost, terminal=0 * E[x, x])
+    else:
+        ocp.minimize(running=cost)
+    return ocp
+
+
+@pytest.mark.parametrize("intervals", [20, 100, 640])
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "auto", "gradient"])
+def test_rest_is_found_without_a_word(method, intervals):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = co.solve(regulator(), method, intervals=intervals, progress=False)
+    assert found.cost < 1e-20
+    assert np.abs(found["u"]).max() < 1e-10
+    assert found.stats["iterations"] < 200
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # of a cost of 1e-12, which is nothing
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+def test_in_any_unit_and_beside_a_filter(method, unit):
+    for dense in (False, True):
+        found = co.solve(regulator(unit=unit, dense=dense), method, intervals=40, progress=False)
+        assert found.cost < 1e-12
