@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from decided import everywhere
@@ -55,3 +57,42 @@ def test_the_condition_is_among_the_residuals():
     plain.dynamics(x, u)
     plain.minimize(running=u**2, terminal=(x - 1.0) ** 2)
     assert solve(plain, intervals=10).optimality.decisions is None
+
+
+def used_in_one_phase(*, last: bool) -> co.Phases:
+    """An integrator from 0 to 1 in 2 s with least energy, 0.5, and a number that is best at 2, in one of two phases."""
+    parts = []
+    for name in ("A", "B"):
+        first = name == "A"
+        ocp = co.Problem(1.0, name=name)
+        x = ocp.state("x", initial=0.0 if first else None, final=None if first else 1.0)
+        d, u = ocp.decision("d", guess=0.5), ocp.control("u")
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2 + (0.01 * (d - 2.0) ** 2 * (1.0 + x**2) if first != last else 0.0))
+        parts.append(ocp)
+    return co.Phases(parts)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_phase_that_does_not_use_a_decision_has_nothing_to_complain_of(last):
+    """Its slope is roundoff there, and had been compared with itself."""
+    solution = co.solve(used_in_one_phase(last=last), intervals=10, progress=False)
+    assert float(solution["A"]["d"]) == pytest.approx(2.0, rel=1e-6)
+    assert max(phase.optimality.decisions for phase in solution) < 1e-6
+    assert "LARGE" not in str(solution)
+
+
+def test_a_wrong_decision_of_a_phase_is_told():
+    """Moved from the best value 2 by m: a slope of 0.02 m (1 + mean x^2), x = (1 + t) / 2; told from 1e-4 on."""
+    solution = co.solve(used_in_one_phase(last=True), intervals=10, progress=False)
+    phase = solution["B"]
+    given = np.array([0.0, -phase.costates.state[0, 1]])
+    for moved in (2e-3, 0.2):
+        t = phase.extremal.trajectory
+        x = t.x + moved * np.eye(2)[1]
+        extremal = replace(phase.extremal, trajectory=replace(t, x=x))
+        slopes = decision_slopes(extremal, discrete_costates(extremal)[0], given, others=0.25)
+        assert slopes.total[0] == pytest.approx(0.02 * moved * (1.0 + 7.0 / 12.0), rel=5e-3)
+        # a tenth of the whole cost by the magnitude of the decision is more than the terms, which vanish at 2
+        assert slopes.relative == pytest.approx(slopes.total[0] * (2.0 + moved) / 0.05, rel=2e-2)
+        assert slopes.relative > 1e-4

@@ -9,7 +9,9 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.residuals import VANISHING
 from covocp.base.short_repr import short_repr
+from covocp.extremal.control_error import absolute_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -18,6 +20,7 @@ from covocp.extremal.inside import instant_jumps
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.scales import magnitudes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,27 +30,33 @@ class DecisionSlopes:
     Attributes:
         total: int H_d dt and all end terms, with the multipliers of the bounds.
         size: sum of the absolute terms.
+        floor: a tenth of the cost by the magnitude of the decision: what has no terms, as in a phase that does not use
+            the decision, leaves a slope of roundoff, which is the whole of its size.
     """
 
     total: Array
     size: Array
+    floor: Array
 
     __repr__ = short_repr
 
     @property
     def relative(self) -> float:
-        """The largest relative to its terms."""
-        share = np.abs(self.total) / np.maximum(self.size, np.finfo(float).tiny)
-        return float(share.max(initial=0.0))
+        """The largest relative to its terms, or to the floor where that is more."""
+        size = np.maximum(np.maximum(self.size, self.floor), np.finfo(float).tiny)
+        return float((np.abs(self.total) / size).max(initial=0.0))
 
 
-def decision_slopes(extremal: Extremal, costates: Costates, given: Array | None = None) -> DecisionSlopes:
+def decision_slopes(
+    extremal: Extremal, costates: Costates, given: Array | None = None, others: float = 0.0
+) -> DecisionSlopes:
     """Slopes of the Lagrangian by the decisions along an extremal, by its costates.
 
     Args:
         extremal: the solution.
         costates: of its multipliers, at the nodes.
         given: multipliers of initial states that an earlier statement of a chain gives, (nx,).
+        others: size of the cost of the rest of a chain.
     """
     if extremal.mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
@@ -56,7 +65,15 @@ def decision_slopes(extremal: Extremal, costates: Costates, given: Array | None 
     at_start = start_slopes(extremal, costates)[rows]
     total = at_start + _mismatches(extremal, costates)[rows]
     total = total if given is None else total + given[rows]
-    return DecisionSlopes(total=total, size=_sizes(extremal, costates))
+    cost = VANISHING * (absolute_cost(extremal) + others)
+    return DecisionSlopes(total=total, size=_sizes(extremal, costates), floor=cost / _magnitudes(extremal))
+
+
+def _magnitudes(extremal: Extremal) -> Array:
+    """Of the decisions: the larger one of where they are and of what their guesses and bounds say."""
+    st, t = extremal.statement, extremal.trajectory
+    stated = magnitudes(st, t, extremal.parameters).x[st.decisions]
+    return np.maximum(np.abs(t.x[0, st.decisions]), stated)
 
 
 def start_slopes(extremal: Extremal, costates: Costates) -> Array:

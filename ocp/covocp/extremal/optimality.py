@@ -72,7 +72,8 @@ class Optimality:
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
             had. Negative: the solution is a saddle.
         decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
-            multipliers of its bounds; relative to the sum of the absolute terms; None without decisions.
+            multipliers of its bounds; relative to the sum of the absolute terms or, where that is less, to a tenth of
+            the cost by the magnitude of the decision; None without decisions.
         cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
             cost (E-1) from the covariances of the loop; None without a closed loop.
         cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
@@ -347,7 +348,9 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
 def _decisions(extremal: Extremal, costates: Costates, within: Within | None) -> float | None:
     if not extremal.statement.decisions:
         return None
-    return decision_slopes(extremal, costates, None if within is None else within.start).relative
+    if within is None:
+        return decision_slopes(extremal, costates).relative
+    return decision_slopes(extremal, costates, within.start, within.size).relative
 
 
 def _curvature(extremal: Extremal) -> float | None:
