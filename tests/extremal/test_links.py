@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 import covocp as co
+from covocp.solving import phases_outcome
 
 
 def _bryson_denham(duration: float, name: str, *, first: bool, limit: float = 1 / 9) -> co.Problem:
@@ -53,3 +57,54 @@ def test_a_decision_at_its_bound_counts_once() -> None:
     assert solution.link_residuals[0] < 1e-7
     for phase in solution:
         assert phase.optimality.decisions < 1e-6
+
+
+def _at_rest() -> co.Phases:
+    """An integrator that begins and ends at zero: no costates, and a cost that is the variance at the end."""
+    parts = []
+    for name in ("A", "B"):
+        first = name == "A"
+        ocp = co.Problem(1.0, name=name)
+        x = ocp.state(
+            "x", initial=0.0 if first else None, final=None if first else 0.0, variance=0.1 if first else None
+        )
+        u = ocp.control("u")
+        ocp.dynamics(x, u, noise=0.01)
+        ocp.measurement("m", x, noise=0.1)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=u**2, terminal=0.0 if first else E[x, x])
+        parts.append(ocp)
+    return co.Phases(parts)
+
+
+def test_costates_that_vanish_meet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What roundoff differs by is nothing of the cost, though 1 % of itself; a jump of the costate is told."""
+    seen: list[Any] = []
+    residual = phases_outcome.link_residual
+    monkeypatch.setattr(phases_outcome, "link_residual", lambda *args: seen.append(args) or residual(*args))
+    solution = co.solve(_at_rest(), intervals=20, progress=False)
+    assert solution.link_residuals[0] < 1e-7
+    assert "LARGE" not in str(solution)
+    before, after, link = seen[0]
+    deviation = float(solution["A"]["E"].max()) ** 0.5  # what x has for a magnitude, as it rests
+    for jump in (1e-2, 1e-4):
+        broken = replace(before, within=replace(before.within, end=before.within.end + jump))
+        told = residual(broken, after, link)
+        assert told == pytest.approx(min(1.0, jump * deviation / (0.1 * solution.cost)), rel=1e-2)
+        assert told > 1e-4
+
+
+def test_a_jump_of_costates_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative to the costate, which is 2 u = 1 along the whole: from 0 to 1 in two seconds."""
+    seen: list[Any] = []
+    residual = phases_outcome.link_residual
+    monkeypatch.setattr(phases_outcome, "link_residual", lambda *args: seen.append(args) or residual(*args))
+    parts = [co.Problem(1.0, name=name) for name in ("A", "B")]
+    for first, ocp in zip((True, False), parts, strict=True):
+        x, u = ocp.state("x", initial=0.0 if first else None, final=None if first else 1.0), ocp.control("u")
+        ocp.dynamics(x, u)
+        ocp.minimize(running=u**2)
+    co.solve(co.Phases(parts), intervals=10, progress=False)
+    before, after, link = seen[0]
+    broken = replace(before, within=replace(before.within, end=before.within.end + 0.01))
+    assert residual(broken, after, link) == pytest.approx(0.01, rel=1e-4)

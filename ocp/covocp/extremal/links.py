@@ -12,7 +12,9 @@ import numpy as np
 
 from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
+from covocp.base.residuals import VANISHING
 from covocp.base.short_repr import short_repr
+from covocp.extremal.control_error import absolute_cost
 from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
 from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
@@ -20,6 +22,7 @@ from covocp.extremal.hamiltonian import Costates
 from covocp.statement.chain import Link
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.nlp import terminal_slopes
+from covocp.transcription.scales import magnitudes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +216,9 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     """Largest difference of p(T) and k_x + mu + J_x' (p+ + mu+) at a link, of p+ + mu+ and zero where a state is free.
 
     mu and mu+ are the multipliers of bounds that act there, which may hold a state on either side of the link. Of
-    states that are not prescribed; relative to the largest costate on both sides.
+    states that are not prescribed; relative to the largest costate on both sides or, where that is less, as a change of
+    the cost if all of these states moved by their magnitudes, relative to a tenth of it: costates that vanish are
+    roundoff, and so is what they differ by.
 
     Args:
         before: what ends there.
@@ -225,13 +230,18 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     own = terminal_slopes(
         first.statement, first.trajectory, first.parameters, first.multipliers.end, first.multipliers.path[-1]
     )[0]
-    missed = (end - own - before.within.end - before.bounds[1])[_loose(first, -1)]
+    loose = _loose(first, -1)
+    missed = (end - own - before.within.end - before.bounds[1])[loose]
     start = slopes_at_start(second, after.costates)[0] + after.bounds[0]
     given = np.isin(np.arange(start.size), link.states)
-    free = _loose(second, 0) & ~given
-    missed = np.concatenate([missed, start[free], (start + after.within.start)[given & _loose(second, 0)]])
+    free, passing = _loose(second, 0) & ~given, _loose(second, 0) & given
+    missed = np.abs(np.concatenate([missed, start[free], (start + after.within.start)[passing]]))
+    units, later = (magnitudes(e.statement, e.trajectory, e.parameters).x for e in (first, second))
+    changed = float((missed * np.concatenate([units[loose], later[free], later[passing]])).sum())
     size = max(float(np.abs(passed.costates.state).max(initial=0.0)) for passed in (before, after))
-    return float(np.abs(missed).max(initial=0.0)) / max(size, float(np.finfo(float).tiny))
+    tiny = float(np.finfo(float).tiny)
+    cost = VANISHING * (absolute_cost(first) + before.within.size)
+    return min(float(missed.max(initial=0.0)) / max(size, tiny), changed / max(cost, tiny))
 
 
 def _loose(extremal: Extremal, node: int) -> Any:

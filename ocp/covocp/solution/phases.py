@@ -84,7 +84,8 @@ class PhasesSolution:
         converged: whether the method's own test was met.
         message: how the method ended.
         phases: their solutions in order.
-        link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p; nan
+        link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p or,
+            where that is less, as a change of the cost; see `covocp.extremal.links.link_residual`; nan
             along controls that were given, where p+ is had from the later phase alone.
         violations: of constraints, by name with that of the phase.
         stats: iterations, times, what the method counts.
