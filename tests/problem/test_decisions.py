@@ -284,6 +284,38 @@ def test_a_decision_that_nothing_depends_on_is_refused():
     assert "a variance counts where" in refused(ocp.statement)
 
 
+def test_an_entry_that_nothing_depends_on_is_refused_by_its_index():
+    """It would end in the middle of its bounds, as if it had been chosen; in phases where no phase uses it."""
+
+    def vector(name="plain", *, used, first=True):
+        ocp = co.Problem(1.0, name)
+        d = ocp.decision("d", 3, guess=0.3, lower=0.05, upper=1.0)
+        x, u = ocp.state("x", initial=0.0 if first else None), ocp.control("u")
+        ocp.dynamics(x, u * d[0])
+        ocp.minimize(running=u**2 + sum((d[k] - 0.5) ** 2 for k in used), terminal=(x - 1.0) ** 2)
+        return ocp
+
+    assert "'d[1]' (declared" in refused(vector(used=(0, 2)).statement, "Nothing depends on the decision")
+    refused(vector(used=()).statement, "Nothing depends on the decision 'd[1]' and 'd[2]'")
+    np.testing.assert_allclose(solve(vector(used=(1, 2)), intervals=5)["d"][1:], 0.5, rtol=1e-6)
+    parts = [vector("A", used=(1,)), vector("B", used=(), first=False)]
+    refused(co.Phases(parts).chain, "Nothing depends on the decision 'd[2]'", "some phase")
+    parts = [vector("A", used=(1,)), vector("B", used=(2,), first=False)]
+    solution = co.solve(co.Phases(parts), intervals=5, progress=False)
+    np.testing.assert_allclose(solution["A"]["d"][1:], 0.5, rtol=1e-6)
+    assert max(phase.optimality.decisions for phase in solution) < 1e-4
+
+
+def test_a_cost_that_falls_for_ever_with_one_entry_is_refused():
+    """Also where something else depends on another entry."""
+    ocp = co.Problem(1.0)
+    d = ocp.decision("d", 2, guess=0.5)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u + d[0])
+    ocp.minimize(running=u**2 - d[1], terminal=(x - 1.0) ** 2)
+    refused(ocp.statement, "unbounded", "'d[1]'")
+
+
 @pytest.mark.parametrize(("sign", "bound"), [(-1.0, "upper"), (1.0, "lower")])
 def test_a_cost_that_falls_for_ever_is_refused(sign, bound):
     """Said before anything is computed; with the bound it is solved."""

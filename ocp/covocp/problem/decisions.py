@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.checks import bound_columns, check_inside, column
 from covocp.base.errors import ProblemError
@@ -68,23 +69,47 @@ def check_decisions(problem: Declarations) -> None:
     costs = list(problem.cost or ())
     others = _everything_but_costs(problem)
     for entry in decisions_of(problem):
-        if _uses(others, entry.symbol):
-            continue
-        if not _uses(costs, entry.symbol):
+        elsewhere = entries_used(others, entry.symbol)
+        if names := unused_names(entry, elsewhere | entries_used(costs, entry.symbol)):
             raise ProblemError(
-                f"Nothing depends on the decision '{entry.name}' (declared at {entry.where}).",
+                f"Nothing depends on the decision {names} (declared at {entry.where}).",
                 expected="its symbol in dynamics, noise, measurements, initial values or variances that count, "
                 "costs or constraints",
                 received="none of them contains it",
-                remedy=f"use '{entry.name}' where it acts, or remove it (a variance counts where "
+                remedy=f"use {names} where it acts, or remove it (a variance counts where "
                 "estimation_covariance() or minimize_expected() makes it do so)",
             )
-        _check_bounded(entry, costs)
+        _check_bounded(entry, costs, elsewhere)
+
+
+def entries_used(expressions: list[Any], symbol: ca.MX) -> NDArray[np.bool_]:
+    """For each entry of a symbol whether some expression depends on it."""
+    used = [value for value in expressions if isinstance(value, ca.MX) and ca.depends_on(value, symbol)]
+    if not used:
+        return np.zeros(symbol.numel(), dtype=bool)
+    return np.asarray(ca.which_depends(ca.veccat(*used), symbol, 1, False), dtype=bool)
+
+
+def unused_names(entry: State, used: NDArray[np.bool_]) -> str:
+    """What of a decision nothing depends on, as a message names it: the whole, or its entries; "" where all is used.
+
+    No solver would move such an entry from the middle of its bounds, and a solution would show it as if chosen.
+    """
+    if used.all():
+        return ""
+    if not used.any():
+        return f"'{entry.name}'"
+    return " and ".join(f"'{entry.name}[{k}]'" for k in np.flatnonzero(~used))
 
 
 def matters(problem: Declarations, symbol: ca.MX) -> bool:
     """Whether anything that is stated, costs included, depends on a symbol."""
-    return _uses([*_everything_but_costs(problem), *(problem.cost or ())], symbol)
+    return _uses(stated(problem), symbol)
+
+
+def stated(problem: Declarations) -> list[Any]:
+    """All expressions of a problem that matter for its solution, costs included."""
+    return [*_everything_but_costs(problem), *(problem.cost or ())]
 
 
 def _everything_but_costs(problem: Declarations) -> list[Any]:
@@ -102,13 +127,19 @@ def _uses(expressions: list[Any], symbol: ca.MX) -> bool:
     return any(ca.depends_on(expression, symbol) for expression in expressions)
 
 
-def _check_bounded(entry: State, costs: list[Any]) -> None:
-    """A cost that is linear in a decision, on which nothing else depends, falls without end where no bound stops it."""
+def _check_bounded(entry: State, costs: list[Any], elsewhere: NDArray[np.bool_]) -> None:
+    """A cost that is linear in a decision, on which nothing else depends, falls without end where no bound stops it.
+
+    Args:
+        entry: the decision.
+        costs: terminal and running cost.
+        elsewhere: of its entries, whether something else depends on them.
+    """
     slopes = [ca.jacobian(cost, entry.symbol) for cost in costs]
     if any(ca.symvar(slope) for slope in slopes):
         return
     values = [np.asarray(ca.evalf(ca.densify(slope)).full()).ravel() for slope in slopes]
-    for k in range(entry.size):
+    for k in np.flatnonzero(~elsewhere):
         own = [value[k] for value in values if value[k] != 0.0]
         sides = (("upper", entry.upper[k], -1.0), ("lower", entry.lower[k], 1.0))
         for side, bound, sign in sides:

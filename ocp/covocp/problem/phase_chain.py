@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.matrices import half_length, pack_symbolic
-from covocp.problem.decisions import decisions_of, matters
+from covocp.problem.decisions import decisions_of, entries_used, stated, unused_names
 from covocp.problem.declarations import Declarations, Parameter
 from covocp.problem.expected_cost import ESTIMATE, GAIN
 from covocp.problem.freeze import freeze
@@ -201,17 +201,21 @@ def _number(value: Any) -> Any:
 
 
 def _check_decisions(phases: Sequence[Declarations], jumps: Sequence[Any]) -> None:
-    """Something in some phase, or what passes between two, depends on each decision."""
-    passing = ca.veccat(*(value for jump in jumps for value in (jump.expression, jump.noise)))
+    """Something in some phase, or what passes between two, depends on each entry of each decision."""
+    passing = [value for jump in jumps for value in (jump.expression, jump.noise)]
     declared = [(phase, entry) for phase in phases for entry in decisions_of(phase)]
-    used = {e.name for phase, e in declared if matters(phase, e.symbol) or ca.depends_on(passing, e.symbol)}
+    used: dict[str, Any] = {}
+    for phase, entry in declared:
+        own = entries_used([*stated(phase), *passing], entry.symbol)
+        before = used.get(entry.name, own)  # sizes that differ are refused where the phases meet
+        used[entry.name] = before | own if before.shape == own.shape else before
     for _, entry in declared:
-        if entry.name not in used:
+        if names := unused_names(entry, used[entry.name]):
             _refuse(
-                f"Nothing depends on the decision '{entry.name}' (declared at {entry.where}).",
+                f"Nothing depends on the decision {names} (declared at {entry.where}).",
                 "its symbol in dynamics, noise, initial values, costs, constraints or jumps of some phase",
                 "none of them contains it",
-                f"use '{entry.name}' where it acts, or remove it",
+                f"use {names} where it acts, or remove it",
             )
 
 
