@@ -88,6 +88,18 @@ def drifted(size=1, final=None):
     return ocp
 
 
+def test_a_control_that_the_problem_does_not_have_is_named_with_what_it_has():
+    """No solution is spoken of, as there is none."""
+    ocp = co.Problem(1.0, name="arm")
+    x, torque, d = ocp.state("x", initial=0.0), ocp.control("torque"), ocp.decision("d", guess=1.0)
+    ocp.dynamics(x, torque + d)
+    ocp.minimize(running=torque**2, terminal=(x - 1.0) ** 2 + d**2)
+    said = refused(lambda: co.evaluate(ocp, nominal={"torqe": 1.0}), "'torqe'", "'arm'", "perhaps 'torque' is meant")
+    assert "solution" not in said
+    assert "torque, d" in said
+    refused(lambda: co.evaluate(ocp, nominal={co.Problem(1.0).control("torque"): 1.0}), "of another problem")
+
+
 def test_all_ways_to_give_a_constant():
     """Number, array, function, symbol as key, and the control's own guess."""
     ocp = drifted()

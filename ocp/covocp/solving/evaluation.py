@@ -13,7 +13,7 @@ from typing import Any, cast, overload
 import numpy as np
 
 from covocp.base.checks import as_number, check_kind, column
-from covocp.base.errors import ProblemError, evaluating, no_option
+from covocp.base.errors import ProblemError, evaluating, no_option, spelling
 from covocp.base.expressions import Given
 from covocp.base.later import later
 from covocp.base.matrices import Array, distinct, unpack
@@ -249,10 +249,26 @@ def _check_goes_on(name: str, values: Array, span: slice, linked: Mapping[int, f
 
 
 def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]:
-    """What a dict gives of controls and decisions, by name."""
-    blocks = (*statement.controls, *(block for block in statement.states if block.role == "decision"))
-    names = tuple(block.name for block in blocks)
-    return {name_of(key, statement.symbols, names): value for key, value in nominal.items()}
+    """What a dict gives of controls and decisions, by name.
+
+    Raises:
+        ProblemError: the problem has none of that name.
+    """
+    decisions = tuple(block.name for block in statement.states if block.role == "decision")
+    names = (*(block.name for block in statement.controls), *decisions)
+    result: dict[str, Any] = {}
+    for key, value in nominal.items():
+        name = name_of(key, statement.symbols, names, missing_ok=True)
+        if not name:
+            kinds = "control or decision" if decisions else "control"
+            raise ProblemError(
+                f"The nominal gives '{key}'"[:100] + f", and '{statement.name}' has no {kinds} of that name.",
+                expected=f"a symbol or name of {', '.join(names)}" if names else f"nothing: it has no {kinds}",
+                received=repr(key)[:100],
+                remedy=spelling(key, names, "correct or remove it"),
+            )
+        result[name] = value
+    return result
 
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
