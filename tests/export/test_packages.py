@@ -275,6 +275,11 @@ def test_a_folder_of_other_things_is_not_overwritten_at_all(tmp_path):
     file.write_text("text")
     with pytest.raises(co.ExportError, match="no folder"):
         export_c(LAW, file, overwrite=True)
+    for other in (target, file):  # nothing is advised that would be refused
+        with pytest.raises(co.ExportError) as caught:
+            export_c(LAW, other)
+        assert "overwrite" not in str(caught.value)
+        assert "choose another" in caught.value.remedy
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch):

@@ -58,18 +58,22 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
                 f"{target}, which holds the current folder",
                 "os.chdir() to its parent before, and give the path from there; nothing was changed",
             )
+        known = whole and _replaceable(target)
+        holds = "" if known else ", which holds other things" if whole else ", which is no folder"
         if not overwrite:
             raise _refused(
                 target.name,
                 "a folder that does not exist yet",
-                str(target),
-                "choose another, or overwrite=True (in the shell --overwrite)",
+                f"{target}{holds}",
+                "choose another, or overwrite=True (in the shell --overwrite)"
+                if known
+                else "choose another: nothing but packages and empty folders is replaced",
             )
-        if not whole or (any(target.iterdir()) and not (target / MARK).is_file()):
+        if not known:
             raise _refused(
                 target.name,
                 "with overwrite=True: a package that export_c has written, or an empty folder",
-                f"{target}, which holds other things" if whole else f"{target}, which is no folder",
+                f"{target}{holds}",
                 "choose another folder; nothing was changed",
             )
     if not parent.is_dir():
@@ -77,6 +81,11 @@ def check_folder(directory: str | os.PathLike[str], overwrite: bool) -> Path:
     if not os.access(parent, os.W_OK):
         raise _refused(target.name, "a place that can be written to", str(parent), "choose another place")
     return target
+
+
+def _replaceable(target: Path) -> bool:
+    """Whether a folder is one that `overwrite` replaces: a package, or empty."""
+    return (target / MARK).is_file() or not any(target.iterdir())
 
 
 def _works_in(target: Path) -> bool:
