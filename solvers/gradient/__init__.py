@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from covocp.solvers.gradient.method import NOT_TAKEN as NOT_TAKEN
 from covocp.solvers.gradient.method import GradientSolver as GradientSolver
 from covocp.solvers.gradient.method import Iteration as Iteration
 from covocp.solvers.gradient.method import one_iteration as one_iteration

@@ -60,6 +60,12 @@ from covocp.transcription.trajectory import Trajectory
 
 # Relative difference of two entries of a metric that count as equal.
 SYMMETRIC = 1e-9
+# Options of the mesh that this method has no use for, and why; `solving.methods` does not offer them.
+NOT_TAKEN = {
+    "segments": "it belongs to shooting",
+    "covariances": "it belongs to shooting",
+    "points": "its penalties act at the nodes",
+}
 
 
 KINDS = {
@@ -162,13 +168,17 @@ def _meshed(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """The mesh in one segment with propagated matrices.
 
     Raises:
-        ProblemError: an option of shooting.
+        ProblemError: one of the options that are not taken.
     """
-    for name in ("segments", "covariances"):
-        if getattr(options, name) != "auto":
-            raise _option_error(name, "nothing: it belongs to shooting", getattr(options, name))
-    if options.points not in ("auto", 1):
-        raise _option_error("points", "'auto' or 1: its penalties act at the nodes; 'ipopt' has more", options.points)
+    for name, why in NOT_TAKEN.items():
+        value = getattr(options, name)
+        if value != "auto" and not (name == "points" and value == 1):  # 1 asks for what it does
+            raise ProblemError(
+                f"The gradient method takes no '{name}': {why}.",
+                expected=f"no {name}=",
+                received=f"{name}={value!r}"[:100],
+                remedy=f"leave it out, or solve by 'ipopt', which has {name}=",
+            )
     mesh = resolve_mesh(statement, options, parameters)
     return replace(mesh, segments=(mesh.intervals,), eliminated=True, points=1)
 

@@ -127,7 +127,7 @@ def test_jumps_that_do_not_fit_are_refused() -> None:
     [
         ({"method": "gradient", "variant": "chord"}, "'variant' of the gradient method does not apply to phases"),
         ({"method": "gradient", "weight": [1.0]}, "'weight' of the gradient method does not apply to phases"),
-        ({"method": "gradient", "covariances": "states"}, "'covariances' of the gradient method"),
+        ({"method": "gradient", "covariances": "states"}, "The gradient method takes no 'covariances'"),
         ({"nominal": "deterministic"}, "Phases are not solved that way"),
         ({"guess": "everywhere"}, "The guess is an unknown word"),
         ({"starts": 3}, "The options of multistart are given, but not multistart"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import phased
 import pytest
 from problems import solve
 from refusals import empty, lag, refused, simple, uncertain, wrong
@@ -67,9 +68,20 @@ def test_no_segment():
     solve(lag()[0], segments=0)
 
 
-@wrong("'segments'", "belongs to shooting")
-def test_segments_of_the_gradient_method():
-    co.solve(lag()[0], "gradient", segments=3)
+@pytest.mark.parametrize("option", [{"segments": 3}, {"covariances": "states"}, {"points": 2}])
+def test_what_the_gradient_method_does_not_take_is_to_be_left_out(option):
+    """No value of it would be right, so none is asked for; it is not offered for a misspelt one either."""
+    (name,) = option
+    with pytest.raises(co.ProblemError, match=f"takes no '{name}'") as caught:
+        co.solve(lag()[0], "gradient", **option)
+    assert caught.value.remedy.startswith("leave it out")
+    for problem in (lag()[0], phased.bounce()):
+        with pytest.raises(co.ProblemError, match="has no option 'foo'") as caught:
+            co.solve(problem, "gradient", foo=1)
+        assert name not in caught.value.expected.removeprefix("one of ").split(", ")
+        with pytest.raises(co.ProblemError, match="has no option 'foo'") as caught:
+            co.solve(problem, "ipopt", foo=1)
+        assert name in caught.value.expected.removeprefix("one of ").split(", ")
 
 
 @wrong("'substeps'", "positive whole number", "'fine'")

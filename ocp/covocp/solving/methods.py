@@ -35,6 +35,12 @@ def method_options(method: str) -> dict[str, Any]:
     return {name: p.default for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
 
 
+def mesh_options(method: str) -> tuple[str, ...]:
+    """Options of the mesh that a method takes."""
+    not_taken = getattr(importlib.import_module(METHODS[method]), "NOT_TAKEN", ())
+    return tuple(field.name for field in fields(Options) if field.name not in not_taken)
+
+
 def check_method(method: str) -> None:
     """There must be a method of that name.
 
@@ -59,7 +65,8 @@ def divided_options(method: str, nominal: Given, options: Mapping[str, Any]) -> 
     known, own = {field.name for field in fields(Options)}, method_options(method)
     for name in options:
         if name not in known and name not in own:
-            raise no_option(f"The method '{method}'", name, options[name], [*known, *own], ARGUMENTS)
+            taken = [*mesh_options(method), *own]
+            raise no_option(f"The method '{method}'", name, options[name], taken, ARGUMENTS)
     if nominal not in NOMINALS:
         raise ProblemError(
             "The option 'nominal' has an unknown value.",

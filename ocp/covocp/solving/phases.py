@@ -17,7 +17,7 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
-from covocp.solving.methods import METHODS, method_options
+from covocp.solving.methods import METHODS, mesh_options, method_options
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
@@ -113,7 +113,7 @@ def _divided(method: str, of_method: Sequence[str], options: dict[str, Any]) -> 
     known = [field.name for field in fields(Options)]
     for name in options:
         if name not in known and name not in of_method:
-            raise no_option(f"The method '{method}'", name, options[name], [*known, *of_method], ())
+            raise no_option(f"The method '{method}'", name, options[name], [*mesh_options(method), *of_method], ())
     of_mesh = {name: value for name, value in options.items() if name in known}
     return of_mesh, {name: value for name, value in options.items() if name in of_method}
 
