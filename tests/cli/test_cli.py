@@ -142,6 +142,14 @@ def test_quiet_prints_nothing(capsys, tmp_path):
     assert (tmp_path / "f.pdf").exists()
 
 
+def test_quiet_leaves_warnings(capsys):
+    """A result that may be wrong is not passed in silence, and the help says so."""
+    code, out, err = run(capsys, "solve", "bryson_denham", "--intervals", 4, "--quiet")
+    assert (code, out) == (0, "")
+    assert err.startswith("covocp: warning: ")
+    assert "print errors and warnings only" in run(capsys, "solve", "--help")[1]
+
+
 def test_a_script_that_takes_the_sine_of_a_symbol_is_told_whose_to_take(capsys, tmp_path):
     """CasADi's own words are "'to_double' not defined"."""
     path = tmp_path / "sine.py"

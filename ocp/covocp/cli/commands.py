@@ -170,7 +170,7 @@ def _common(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     parser.add_argument(
         "--option", action="append", default=[], metavar="NAME=VALUE", help="an option of the solver; may be repeated"
     )
-    parser.add_argument("--quiet", action="store_true", help="print errors only")
+    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     methods = ", ".join(co.methods())
     if several:
         words = f"one of {methods}; may be given several times, {', '.join(COMPARED)} by default"
