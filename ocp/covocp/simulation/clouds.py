@@ -30,6 +30,8 @@ from covocp.plot.figure import (
 )
 from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.paths import outline
+from covocp.simulation.rows import places
+from covocp.statement.statement import error_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,15 +120,11 @@ def chosen_parts(
 ) -> tuple[list[tuple[str, str, int]], list[tuple[int, int]]]:
     """Components as (label, name of the symbol, row of y) and pairs of rows at the end."""
     n = sample.size
+    found = places(sample)
     every = {}
-    for block in sample.blocks:
-        if block.kind in ("state", "unknown", "control"):
-            try:
-                rows, _ = sample.rows(block.name)
-            except ProblemError:  # gains that were optimised
-                continue
-            labels = [block.name if block.size == 1 else f"{block.name}[{i}]" for i in range(block.size)]
-            every[block.name] = [(label, block.name, rows.start + i) for i, label in enumerate(labels)]
+    for rows, block in (found[b.name] for b in sample.blocks if b.name in found):
+        entries = error_names((block,))
+        every[block.name] = [(label, block.name, rows.start + i) for i, label in enumerate(entries)]
     if not names:
         moving = {b.name for b in sample.blocks if b.kind != "unknown" or sample.estimated}
         components = [entry for name, entries in every.items() for entry in entries if name in moving]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,11 +21,11 @@ from covocp.base.threads import cached, methods_one_at_a_time
 from covocp.simulation.chances import Share, chance_shares
 from covocp.simulation.constraints import Rows
 from covocp.simulation.counts import Count, count
+from covocp.simulation.rows import place_of
 from covocp.simulation.sampling import Moments, degrees_of_freedom, mean_band, mean_square_band, robust_deviation
 from covocp.simulation.step_choice import StepChoice
 from covocp.simulation.verdict import Verdict, judge
 from covocp.simulation.workers import Failure
-from covocp.statement.names import name_of, split_entry
 from covocp.statement.statement import Block
 
 if TYPE_CHECKING:
@@ -156,7 +156,10 @@ class MonteCarlo:
         return float(1.0 - self.stayed.mean())
 
     def mean(self, key: Given) -> Array:
-        """Sample mean of the actual values of a state, an unknown or a control, (K,) or (K, size)."""
+        """Sample mean of the actual values of a state, an unknown or a control, (K,) or (K, size).
+
+        Of an attitude, which has no mean as a vector, that of its deviation: a rotation vector in body axes.
+        """
         rows, block = self.rows(key)
         nominal = self.nominal_control if block.kind == "control" else self.nominal
         return self._shaped(nominal[:, block_rows(rows, block, self.size)] + self.moments.mean[:, rows], block)
@@ -334,24 +337,7 @@ class MonteCarlo:
         Raises:
             ProblemError: where it is not among them.
         """
-        kinds = ("state", "unknown", "control") if controls else ("state", "unknown")
-        found: dict[str, tuple[slice, Block]] = {}
-        first = 0
-        for block in (b for kind in ("state", "unknown") for b in self.blocks if b.kind == kind):
-            if first + block.size <= self.size:
-                found[block.name] = (slice(first, first + block.size), block)
-                first += block.size
-        for block in (b for b in self.blocks if b.kind == "control" and "control" in kinds):
-            if block.offset < self.nominal_control.shape[1]:
-                start = 2 * self.size + block.offset
-                found[block.name] = (slice(start, start + block.size), block)
-        name = name_of(key, self.symbols, tuple(found), sizes={n: b.size for n, (_, b) in found.items()})
-        entry = split_entry(name)
-        if name in found or entry is None:
-            return found[name]
-        rows, owner = found[entry[0]]
-        first = rows.start + entry[1]
-        return slice(first, first + 1), replace(owner, name=name, size=1, offset=owner.offset + entry[1])
+        return place_of(self, key, controls=controls)
 
     @staticmethod
     def _shaped(values: Array, block: Block) -> Array:
