@@ -40,13 +40,15 @@ def test_bands_are_the_numbers(sample):
 
 
 def test_ellipses_are_those_of_the_covariances(sample):
+    """The predicted ones lie about the nominal, those of the runs about their mean, as their bands do."""
     axes = panels(sample.plot(("x", "b"), sigmas=(1.0, 2.0)))["deviation of b at T"]
-    for colour, covariance in (
-        (PREDICTED, sample.predicted[-1]),
-        (SAMPLE, sample.deviations.T @ sample.deviations / 300),
+    mean = sample.deviations.mean(axis=0)
+    for colour, covariance, centre in (
+        (PREDICTED, sample.predicted[-1], np.zeros(2)),
+        (SAMPLE, np.cov(sample.deviations.T, bias=True), mean),
     ):
         for size, line in zip((1.0, 2.0), lines(axes, colour), strict=True):
-            points = np.array(line.get_data())
+            points = np.array(line.get_data()) - centre[:, None]
             distance = np.einsum("ik,ij,jk->k", points, np.linalg.inv(covariance), points)
             np.testing.assert_allclose(distance, size**2, rtol=1e-9)
 

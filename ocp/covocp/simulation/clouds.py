@@ -63,8 +63,8 @@ def plot_monte_carlo(
 
     A panel of deviations has the predicted standard deviation as a band, mean and standard deviation of the sample as
     dashed lines, and some runs; of states and unknowns also the errors of the filter, predicted and in the runs; of
-    states and controls their limits. A cloud has the runs at the end, the predicted ellipses and, dashed, those of the
-    sample.
+    states and controls their limits. A cloud has the runs at the end, the predicted ellipses about the nominal and,
+    dashed, those of the sample about its mean.
 
     Args:
         sample: what `simulate` returned.
@@ -222,7 +222,7 @@ def _label(name: str, unit: str) -> str:
 def draw_cloud(
     axes: Axes, sample: MonteCarlo, pair: tuple[int, int], units: Mapping[str, str], sigmas: tuple[float, ...]
 ) -> None:
-    """Terminal scatter of two components, with the ellipses of prediction and sample."""
+    """Terminal scatter of two components, with the ellipses of the prediction and, about its mean, of the sample."""
     rows = list(pair)
     values = sample.deviations[sample.stayed][:, rows]
     predicted = sample.predicted[-1][np.ix_(rows, rows)]
@@ -230,10 +230,11 @@ def draw_cloud(
     view = VIEW * np.where(size > 0, size, 1.0)
     shown = values[:DOTS]
     axes.plot(shown[:, 0], shown[:, 1], linestyle="none", marker=".", markersize=1.8, color=GREY, alpha=0.5, zorder=1)
-    own = values.T @ values / max(1, len(values))
+    mean = values.sum(axis=0) / max(1, len(values))
+    own = values.T @ values / max(1, len(values)) - np.outer(mean, mean)
     for k in sigmas:
         axes.plot(*outline(predicted, k), color=PREDICTED, linewidth=1.4, zorder=3)
-        axes.plot(*outline(own, k), color=SAMPLE, linewidth=1.2, linestyle=DASHED, zorder=3)
+        axes.plot(*(mean[:, None] + outline(own, k)), color=SAMPLE, linewidth=1.2, linestyle=DASHED, zorder=3)
     axes.set_xlim(-view[0], view[0])
     axes.set_ylim(-view[1], view[1])
     beyond = int(np.count_nonzero((np.abs(values) > view).any(axis=1))) + int(np.count_nonzero(~sample.stayed))
@@ -274,5 +275,5 @@ def draw_legend(
     if clouds:
         widths = ", ".join(f"{k:g}" for k in sigmas)
         handles.append(Line2D([], [], color=PREDICTED, label=f"predicted ellipses ({widths} deviations)"))
-        handles.append(Line2D([], [], color=SAMPLE, linestyle=DASHED, label="ellipses of the runs"))
+        handles.append(Line2D([], [], color=SAMPLE, linestyle=DASHED, label="ellipses of the runs about their mean"))
     place_legend(figure, handles)
