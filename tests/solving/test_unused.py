@@ -156,6 +156,29 @@ def test_a_decision_has_a_guess_without_a_time():
     assert co.solve(ocp, intervals=30, progress=False).cost == pytest.approx(1.0)
 
 
+def test_one_value_for_each_entry_has_no_time():
+    """As many numbers as entries, which are near the number of intervals by chance; rows are what is counted."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 18, initial=0.0, final=1.0), ocp.control("u", 18, guess=np.ones(18))
+    ocp.dynamics(x, u)
+    ocp.minimize(running=ca.sumsqr(u))
+    assert run(ocp).cost == pytest.approx(18.0)
+    assert run(ocp, guess={"u": np.ones((3, 18))}).converged
+    with pytest.warns(co.CovocpWarning, match="guess of 'u' has 17 rows"):
+        run(ocp, guess={"u": np.ones((17, 18))})
+
+
+def test_a_gain_that_nobody_guessed_is_not_blamed():
+    """A condition on the spread makes the 16 entries of the gain controls, which start somewhere."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", 4, initial=0.0, final=0.3, variance=0.02), ocp.control("u", 4)
+    ocp.dynamics(x, u, noise=1e-3)
+    ocp.measurement("m", x, noise=1e-2)
+    ocp.chance(x[0], upper=0.6, probability=0.9, at="final", name="limit")
+    ocp.minimize_expected(running=ca.sumsqr(u), terminal_weight={x: 1.0})
+    assert run(ocp).converged
+
+
 def beside(use):
     """x' = u, and a second control v in what `use` declares, beside the rate and the cost."""
     ocp = co.Problem(1.0)

@@ -12,7 +12,7 @@ from covocp.base.errors import warn_user
 from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
 from covocp.statement.names import chosen_entry
-from covocp.statement.statement import Statement
+from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
 
 if TYPE_CHECKING:
@@ -49,25 +49,38 @@ def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Sta
     Args:
         guesses: by name.
         options: of the mesh, graded or not.
-        statement: whose decisions have guesses without a time.
+        statement: of the symbols, whose sizes tell what of a guess is over time.
     """
-    decided = {block.name for block in statement.states if block.role != "moving"}
+    blocks = {block.name: block for block in statement.blocks}
     known = {options.intervals, options.intervals + 1, options.nodes().size - 1, options.nodes().size}
     for name, guess in guesses.items():
-        if guess is None or callable(guess) or name in decided:
-            continue
-        try:
-            shape = real_numbers(guess).shape
-        except (TypeError, ValueError, OverflowError):  # no array: refused where it is read
-            continue
-        if not shape:
-            continue
-        if known.isdisjoint(shape) and max(shape) >= WAYPOINTS * options.intervals:
+        rows = _rows_over_time(guess, blocks.get(name))
+        if rows >= WAYPOINTS * options.intervals and rows not in known:
             warn_user(
-                f"The guess of '{name}' has {max(shape)} rows, and {options.intervals} intervals have "
+                f"The guess of '{name}' has {rows} rows, and {options.intervals} intervals have "
                 f"{options.intervals + 1} nodes: its rows are taken as evenly spread over the duration. Give a row for "
                 "each node, a few waypoints, or a function of t/T."
             )
+
+
+def _rows_over_time(guess: Given, block: Block | None) -> int:
+    """Rows of a guess that is an array over time, 0 of any other: one value for each entry has no time.
+
+    Such are the guesses of decisions and matrices, and those that gains have where the user gave none.
+    """
+    timeless = block is not None and (block.role != "moving" or block.kind == "matrix")
+    if guess is None or callable(guess) or timeless:
+        return 0
+    try:
+        shape = real_numbers(guess).shape
+    except (TypeError, ValueError, OverflowError):  # no array: refused where it is read
+        return 0
+    size = 1 if block is None else block.size
+    if not shape or (size > 1 and shape == (size,)):
+        return 0
+    if shape[1:] == (size,):
+        return int(shape[0])
+    return int(shape[1] if shape[0] == size and len(shape) == 2 else shape[0])
 
 
 def _mention_nothing_learnt(problem: Declarations) -> None:
