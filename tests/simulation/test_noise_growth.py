@@ -73,10 +73,10 @@ def test_what_phases_before_have_added_counts():
         assert sample[k].verdict.deviations[0].grown == pytest.approx(np.sqrt(end[0]), rel=5e-3)
 
 
-def cubic(noise: Any, measured: Any) -> Any:
+def cubic(noise: Any, measured: Any, least: float = -np.inf) -> Any:
     """Runs of x' = -x^3 + u: the rate holds them closer together than its slope says."""
     ocp = co.Problem(2.0)
-    x, u = ocp.state("x", initial=0.5, variance=0.3), ocp.control("u")
+    x, u = ocp.state("x", initial=0.5, variance=0.3), ocp.control("u", lower=least)
     ocp.dynamics(x, -(x**3) + u, noise=noise(x, u))
     ocp.measurement("m", x, noise=measured(x))
     ocp.minimize_expected(running=0.5 * u**2 + x**2)
@@ -94,6 +94,16 @@ def test_a_system_of_constant_noise_is_too_nonlinear():
     assert not sample.grown.any()
     assert sample.verdict.reasons == ("nonlinear",)
     assert "noise, which varies" not in str(sample)
+    assert "no run is unstable or short of control" in str(sample.verdict)
+
+
+def test_a_few_runs_short_of_control_are_not_denied():
+    """Four of a thousand ask for more control than there is, which explains nothing, but they are there."""
+    sample = cubic(lambda x, u: 0.2, lambda x: 0.1, least=-1.1)
+    assert 0 < sample.asked.any(axis=1).mean() < 0.01
+    assert sample.verdict.reasons == ("nonlinear",)
+    assert "too few runs are unstable or short of control to explain it, so the system is too" in str(sample.verdict)
+    assert "no run" not in str(sample.verdict)
 
 
 def test_without_feedback_the_noise_may_be_to_blame():

@@ -140,7 +140,7 @@ class Verdict:
         found += ["noise"] if noise else []
         if (self.unstable >= NOTICEABLE and noise != "all") or self.left > self.unanswered:
             found.append("unstable")
-        if self.asked >= NOTICEABLE and (self.limited or not self.law):
+        if self._short >= NOTICEABLE:
             found.append("saturated")
         enough = noise == "all" or any(name != "noise" for name in found)
         return tuple(found) if enough else (*found, "law" if self.law else "nonlinear")
@@ -205,12 +205,24 @@ class Verdict:
             return f"{_percent(self.asked)} of the runs ask for more control than there is{most}{cut}"
         if reason == "law":
             return (
-                "no run is unstable or short of control, so this law is not the filter and feedback of the design, is "
+                f"{self._not_enough}, so this law is not the filter and feedback of the design, is "
                 "stepped too rarely, or the system is too nonlinear for this spread"
             ) + (f" ({_percent(self.asked)} asked for more control than the nominal has)" if self.asked else "")
         grows = ", or the noise, which varies with it, grows with it too much" if self.unknown_noise else ""
-        left = "what is left means that " if "noise" in self.reasons else "no run is unstable or short of control, so "
+        left = "what is left means that " if "noise" in self.reasons else f"{self._not_enough}, so "
         return f"{left}the system is too nonlinear for this spread{grows}"
+
+    @property
+    def _short(self) -> float:
+        """Share of the runs that were short of control; a law without limits was given what it asked for."""
+        return self.asked if self.limited or not self.law else 0.0
+
+    @property
+    def _not_enough(self) -> str:
+        """That neither unstable runs nor those short of control explain what is seen: there are none, or too few."""
+        if self.unstable or self.left or self._short:
+            return "too few runs are unstable or short of control to explain it"
+        return "no run is unstable or short of control"
 
 
 def judge(sample: MonteCarlo) -> Verdict:
