@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figures import entries_of, main_lines, panels
 from phased import bounce
+from phased_loops import lag
 
 import covocp as co
+from covocp.plot.figure import plot_solutions
+from covocp.plot.loop_panels import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +59,17 @@ def test_a_figure_is_written(solution: co.PhasesSolution, tmp_path: Path) -> Non
     solution.plot("v", over="x")
     with pytest.raises(co.ProblemError, match="no option 'gains'"):
         solution.plot(gains=True)
+
+
+def test_root_mean_squares_of_phases_have_all_parts() -> None:
+    """Phases follow each other: they are one loop. Compared ones lack the part that follows from the others."""
+    loops = co.solve(co.Phases([lag(1.0, "A", last=False), lag(1.0, "B", first=False)]), intervals=10, progress=False)
+    axes = panels(loops.plot("rms"))["rms of x"]
+    assert entries_of(axes) == ["deviation", "error of the estimate", "estimate"]
+    drawn = [(line.get_xdata(), line.get_ydata()) for line in main_lines(axes)]
+    assert len(drawn) == 6
+    for k, phase in enumerate(loops):
+        loop, times = phase.loop, phase.t + loops.starts[k]
+        for (t, y), matrix in zip(drawn[3 * k : 3 * k + 3], (loop.X, loop.E, loop.Xhat), strict=True):
+            assert y[np.isin(t, times)] == pytest.approx(np.sqrt(matrix[:, 0, 0]), rel=1e-9)
+    assert entries_of(panels(plot_solutions([loops[0], loops[0]], "rms"))["rms of x"]) == list(PARTS[:2])

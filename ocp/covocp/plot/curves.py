@@ -106,11 +106,11 @@ class Covariances(NamedTuple):
 
 
 class Drawn:
-    """A solution sampled for drawing."""
+    """A solution sampled for drawing; `phase`: of several that follow each other, which are one to what is drawn."""
 
-    def __init__(self, solution: Solution, order: int) -> None:
+    def __init__(self, solution: Solution, order: int, *, phase: bool = False) -> None:
         """Choose the times."""
-        self.solution, self.order = solution, order
+        self.solution, self.order, self.phase = solution, order, phase
         self.covariance = next((b for b in solution.blocks if b.estimation and b.covariance), None)
         nodes, parts = np.unique(solution.t), -(-SAMPLES // solution.mesh.intervals)
         if solution.mesh.control == "constant":  # rates jump at the nodes, which a smooth curve would follow

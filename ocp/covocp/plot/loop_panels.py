@@ -32,8 +32,8 @@ def knows(solution: Solution, word: str) -> bool:
 def rms(drawn: Sequence[Drawn], key: Given, blocks: Mapping[str, Block], units: Mapping[str, str]) -> list[Panel]:
     """Root mean squares of the deviations of a symbol or an expression.
 
-    Of one closed loop with their parts, of several with the error of the estimate. Of unknown constants, whose actual
-    deviations nothing changes, the error of the estimate alone.
+    Of one closed loop, also of several phases, with their parts, of several that are compared with the error of the
+    estimate. Of unknown constants, whose actual deviations nothing changes, the error of the estimate alone.
     """
     name = key if isinstance(key, str) else shortened(key)
     block = block_of(key, blocks.values()) if isinstance(key, str) else None
@@ -44,7 +44,8 @@ def rms(drawn: Sequence[Drawn], key: Given, blocks: Mapping[str, Block], units: 
     if closed and kind == "unknown":
         shown = (1,)
     elif closed and kind == "state" and len(entries) <= SEPARATE_ENTRIES:
-        shown = (0, 1, 2) if len(drawn) == 1 else (0, 1)  # the third would follow from the others
+        compared = len(drawn) > 1 and not drawn[0].phase
+        shown = (0, 1) if compared else (0, 1, 2)  # the third would follow from the others
     curves: list[list[Curve]] = [[] for _ in entries]
     for d in drawn:
         parts = d.spread(key)

@@ -66,11 +66,14 @@ def choose_panels(
     units: Mapping[str, str],
 ) -> list[Panel]:
     """The panels of a figure; see `covocp.plot.figure.plot_solutions`.
+    phases: bool = False,
 
     Raises:
         ProblemError: a name is in none of the solutions.
+    `phases`: whether the solutions follow each other, instead of being compared.
+
     """
-    drawn = [Drawn(solution, i) for i, solution in enumerate(solutions)]
+    drawn = [Drawn(solution, i, phase=phases) for i, solution in enumerate(solutions)]
     blocks: dict[str, Block] = {}
     for solution in solutions:
         for block in solution.blocks:

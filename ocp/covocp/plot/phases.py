@@ -64,7 +64,7 @@ def plot_phases(
         check_target(path, SUFFIXES)
     phases = list(solution.phases)
     words = units_in(phases) | dict(units or {})
-    panels = choose_panels(phases, names, costates=costates, over=over, units=words)
+    panels = choose_panels(phases, names, costates=costates, over=over, units=words, phases=True)
     shifts = solution.starts if over is None else np.zeros(len(phases))
     return drawn_figure(
         [solution],
