@@ -13,7 +13,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, half_indices
 from covocp.base.short_repr import short_repr
-from covocp.blocks.rotation_chart import rotation_vectors
+from covocp.plot.attitude_panels import attitude_panels
 from covocp.plot.chance_panels import CHANCE, chance_names, chance_panels
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, product_unit, shortened, unit_of
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
@@ -346,22 +346,10 @@ def _part_of(expression: Any, symbol: Any) -> bool:
     return bool(ca.is_equal(expression, symbol)) or chosen_entry(expression, symbol) >= 0
 
 
-def _attitude(drawn: list[Drawn], block: Block) -> list[Panel]:
-    """The rotation vector of an attitude and its length, the angle."""
-    curves = []
-    for d in drawn:
-        if d.knows(block.name):
-            vectors = np.rad2deg(rotation_vectors(d.sample[block.name]))
-            values = np.column_stack([vectors, np.linalg.norm(vectors, axis=1)])
-            curves += [Curve(t=d.t, y=column, order=d.order, entry=i) for i, column in enumerate(values.T)]
-    entries = (*(f"about {axis}" for axis in "xyz"), "angle")
-    return [Panel(label=f"{block.name} [°]", entries=entries, curves=tuple(curves))]
-
-
 def _vector(drawn: list[Drawn], block: Block, units: Mapping[str, str]) -> list[Panel]:
     """A state with its band and target, a control, an unknown or a parameter with its band."""
     if block.tangent:
-        return _attitude(drawn, block)
+        return attitude_panels(drawn, block)
     curves = []
     for d in drawn:
         if not d.knows(block.name):
