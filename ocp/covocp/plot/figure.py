@@ -63,6 +63,7 @@ CONSTANT = 1e-5
 CONSTANT_RANGE = 0.05  # of the value, on both sides
 PANEL = (3.3, 2.15)  # width, height in inches
 SINGLE = (4.8, 3.2)  # of a panel alone
+INSIDE, BESIDE = 4, 12  # entries that a legend within a panel explains, and one beside it, which is as high
 HEAD = 0.6  # inches for title and legend
 RESOLUTION = 200  # dots an inch
 # Backends of matplotlib that show nothing by themselves.
@@ -425,7 +426,7 @@ def _near_bounds(panel: Panel) -> list[float]:
 
 
 def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
-    """Which entry is which, within the panel."""
+    """Which entry is which: within the panel, or beside it where so many curves leave no room."""
     from matplotlib.lines import Line2D
 
     shown = sorted({curve.entry for curve in panel.curves})
@@ -434,7 +435,11 @@ def _entry_legend(axes: Axes, panel: Panel, count: int) -> None:
     for k, label in zip(shown, labels, strict=True):
         style = _line(k) if count == 1 else {"color": "#555555", "linestyle": _line(k)["linestyle"]}
         handles.append(Line2D([], [], label=plain_text(label), **style))
-    axes.legend(handles=handles, ncols=columns, fontsize=7, handlelength=2.0, labelspacing=0.3)
+    look: dict[str, Any] = {"fontsize": 7, "handlelength": 2.0, "labelspacing": 0.3}
+    if columns > 1 and INSIDE < len(handles) <= BESIDE:
+        axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), **look)
+    else:
+        axes.legend(handles=handles, ncols=columns, **look)
 
 
 def _folded(label: str) -> str:

@@ -25,6 +25,8 @@ from covocp.statement.time_data import in_words
 
 # Matrices up to this size are shown whole, larger ones by their diagonal.
 WHOLE_MATRIX = 2
+# Entries of a covariance that share a panel, at most: there are so many colours, and dashes, for solutions compared.
+COLOURED, DASHED = 7, 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,14 +66,14 @@ def choose_panels(
     gains: bool = False,
     over: Given = None,
     units: Mapping[str, str],
+    phases: bool = False,
 ) -> list[Panel]:
     """The panels of a figure; see `covocp.plot.figure.plot_solutions`.
-    phases: bool = False,
+
+    `phases`: whether the solutions follow each other, instead of being compared.
 
     Raises:
         ProblemError: a name is in none of the solutions.
-    `phases`: whether the solutions follow each other, instead of being compared.
-
     """
     drawn = [Drawn(solution, i, phase=phases) for i, solution in enumerate(solutions)]
     blocks: dict[str, Block] = {}
@@ -443,18 +445,31 @@ def _pairs(block: Block) -> list[list[tuple[int, int]]]:
 
 
 def _pair(drawn: list[Drawn], key: tuple[str, str], units: Mapping[str, str]) -> list[Panel]:
-    """A block of the covariance of the actual deviations, between the nodes as the whole matrix has it."""
-    curves: list[Curve] = []
-    names: tuple[str, ...] = ()
-    for d in [d for d in drawn if all(not isinstance(part, str) or d.knows(part) for part in key)] or drawn:
-        values = d.block(*key)
-        names = tuple(f"{i}, {j}" for i in range(values.shape[1]) for j in range(values.shape[2]))
-        flat = values.reshape(values.shape[0], -1)
-        curves += [Curve(t=d.t, y=flat[:, k], order=d.order, entry=k) for k in range(flat.shape[1])]
+    """A block of the covariance of the actual deviations, between the nodes as the whole matrix has it.
+
+    Of a symbol with itself each entry once. Where these would not be told apart each row has a panel.
+    """
+    chosen = [d for d in drawn if all(not isinstance(part, str) or d.knows(part) for part in key)] or drawn
+    blocks = [(d, d.block(*key)) for d in chosen]
+    count, width = (max(values.shape[axis] for _, values in blocks) for axis in (1, 2))
+    rows = [[(i, j) for j in range(i if key[0] == key[1] else 0, width)] for i in range(count)]
+    every = [pair for row in rows for pair in row]
     closed = any(d.solution.loop is not None for d in drawn)
     matrix = COVARIANCES[0] if closed else next(b.name for b in drawn[0].solution.blocks if b.estimation)
-    label = f"{matrix}[{key[0]}, {key[1]}]" + product_unit(list(key), units)
-    return [Panel(label=label, entries=names, curves=tuple(curves))]
+    unit = product_unit(list(key), units)
+    panels = []
+    most = DASHED if len(drawn) > 1 and not drawn[0].phase else COLOURED
+    for group in [every] if len(every) <= most else rows:
+        curves = [
+            Curve(t=d.t, y=values[:, i, j], order=d.order, entry=k)
+            for d, values in blocks
+            for k, (i, j) in enumerate(group)
+            if i < values.shape[1] and j < values.shape[2]
+        ]
+        row = key[0] if len(group) == len(every) else f"{key[0]}[{group[0][0]}]"
+        names = tuple(f"{i}, {j}" for i, j in group)
+        panels.append(Panel(label=f"{matrix}[{row}, {key[1]}]{unit}", entries=names, curves=tuple(curves)))
+    return panels
 
 
 def _costates(drawn: list[Drawn], block: Block) -> list[Panel]:
