@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from attitudes import steered
-from figures import edges_of, legend_of, main_lines, panels
+from figures import edges_of, legend_of, main_lines, panels, values_of
 
 import covocp as co
 from covocp.blocks import so3
@@ -86,3 +86,43 @@ def test_what_is_required_at_the_end_is_marked_where_it_is(goal):
         expected[3] = 360 - expected[3]
     assert found == pytest.approx(expected, abs=1e-6)
     assert "required at the end" in legend_of(figure)
+
+
+def test_an_entry_of_a_quaternion_has_its_own_band():
+    """q = (cos t/2, sin t/2, 0, 0) spreads by half an error, of which q0 has the share sin t/2 and q1 cos t/2."""
+    solution = spun(0.8)
+    half = 0.8 * np.pi * solution.t / 2
+    shares = (np.abs(np.sin(half)), np.abs(np.cos(half)), np.ones_like(half), np.ones_like(half))
+    for k, share in enumerate(shares):
+        axes = panels(solution.plot(f"C[{k}]"))[f"C q{k}"]
+        (curve,) = (line.get_ydata() for line in main_lines(axes))
+        assert [curve[0], curve[-1]] == pytest.approx(solution["C"][[0, -1], k], abs=1e-12)
+        low, high = edges_of(axes, solution.t)
+        assert (high - low) / 2 == pytest.approx(np.sqrt(VARIANCE) / 2 * share, abs=1e-7)
+
+
+def test_an_entry_of_the_error_has_a_root_mean_square():
+    solution = spun(0.8)
+    (rms,) = values_of(solution.plot(("rms", "C[1]")), "rms of C[1] [rad]")
+    assert rms == pytest.approx(np.full(rms.shape, np.sqrt(VARIANCE)), rel=1e-6)
+    with pytest.raises(co.ProblemError, match="no entry 3"):
+        solution.plot(("C[3]", "C[3]"))
+
+
+def test_no_ellipse_of_the_error_stands_about_entries_of_the_quaternion():
+    solution = co.solve(correlated(), intervals=8, progress=False)
+    (axes,) = panels(solution.plot("p", over="C[1]")).values()
+    assert len(axes.lines) == 4  # the curve, its start, both edges of its band
+    assert len(panels(solution.plot("p", over="y"))["p"].lines) > 6
+
+
+def correlated():
+    """An attitude and two positions, all uncertain."""
+    ocp = co.Problem(1.0, "correlated")
+    p, y, u = ocp.state("p", initial=0.0, variance=0.3), ocp.state("y", initial=0.0, variance=0.2), ocp.control("u", 3)
+    ocp.attitude("C", initial=np.eye(3), rate=u, variance=[0.1, 0.2, 0.3])
+    ocp.dynamics(p, u[0], noise=0.1)
+    ocp.dynamics(y, u[1], noise=0.1)
+    ocp.estimation_covariance()
+    ocp.minimize(running=ca.sumsqr(u - 1))
+    return ocp

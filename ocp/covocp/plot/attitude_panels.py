@@ -8,9 +8,10 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.blocks import so3
-from covocp.blocks.rotation_chart import rotation_vectors
+from covocp.blocks.rotation_chart import rotation_chart, rotation_vectors
 from covocp.plot.curves import Curve, Drawn, Panel
 from covocp.solution.solution import Solution
+from covocp.statement.names import split_entry
 from covocp.statement.statement import Block
 
 # Share of a whole turn up to which a band is drawn: there the rotation vector, and how far it spreads, has no end.
@@ -19,7 +20,12 @@ ENTRIES = (*(f"about {axis}" for axis in "xyz"), "angle")
 
 
 def attitude_panels(drawn: Sequence[Drawn], block: Block) -> list[Panel]:
-    """The rotation vector of an attitude and its length, the angle, whose band would bend at zero: it has none."""
+    """The rotation vector of an attitude and its length, the angle, whose band would bend at zero: it has none.
+
+    Of an entry of its quaternion that entry.
+    """
+    if block.size == 1:
+        return [_entry_panel([d for d in drawn if d.knows(block.name)], block.name)]
     curves = []
     for d in [d for d in drawn if d.knows(block.name)]:
         quaternions = d.sample[block.name]
@@ -39,6 +45,21 @@ def attitude_panels(drawn: Sequence[Drawn], block: Block) -> list[Panel]:
             for i, column in enumerate(values.T)
         ]
     return [Panel(label=f"{block.name} [°]", entries=ENTRIES, curves=tuple(curves))]
+
+
+def _entry_panel(drawn: Sequence[Drawn], name: str) -> Panel:
+    """An entry of a quaternion; to first order dq = B(q) e with the error e in body axes."""
+    owner, k = split_entry(name) or (name, 0)
+    curves = []
+    for d in drawn:
+        quaternions, deviation = d.sample[owner], None
+        if d.covariance is not None and d.rows(owner):
+            basis = np.array([rotation_chart().basis(q).full()[k] for q in quaternions])
+            deviation = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", basis, d.block(owner, owner), basis), 0.0))
+        certain = deviation is None or not np.any(deviation)
+        curves.append(Curve(t=d.t, y=quaternions[:, k], deviation=None if certain else deviation, order=d.order))
+    label = f"{owner} q{k}"
+    return Panel(label=label, entries=(label,), curves=tuple(curves))
 
 
 def _deviation(drawn: Drawn, name: str, vectors: Array) -> Array | None:

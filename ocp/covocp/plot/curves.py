@@ -17,7 +17,7 @@ from covocp.solution.reading import other_loop
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
-from covocp.statement.statement import Block, error_size
+from covocp.statement.statement import Block
 from covocp.transcription.before_reading import ESTIMATE
 
 # Curves are sampled at the nodes, on coarser meshes at least this often.
@@ -199,7 +199,7 @@ class Drawn:
 
     def block(self, a: Given, b: Given) -> Array:
         """Covariance of the actual deviations between two symbols at the times, (K, size of a, size of b)."""
-        if self.covariance is None or not (isinstance(a, str) and isinstance(b, str)):
+        if self.covariance is None or not all(isinstance(key, str) and self.rows(key) for key in (a, b)):
             return self.between(self.solution.covariance(a, b))  # says what is wrong with them
         return self.covariances.X[:, self.rows(a)][:, :, self.rows(b)]
 
@@ -230,12 +230,12 @@ class Drawn:
         count, width = solution.t.size, sum(b.size for b in controls)
         if isinstance(key, str):
             block = solution.block(key)
-            rows = error_size(block)
-            by_state, by_control = np.zeros((rows, len(augmented))), np.zeros((rows, width))
+            own = block.size if block.kind == "control" else len(self.rows(key))
+            by_state, by_control = np.zeros((own, len(augmented))), np.zeros((own, width))
             if block.kind == "control":
                 by_control[:, block.span] = np.eye(block.size)
             else:
-                by_state[:, self.rows(key)] = np.eye(rows)
+                by_state[:, self.rows(key)] = np.eye(own)
             return tuple(np.tile(v, (count, 1, 1)) for v in (by_state, by_control))  # type: ignore[return-value]
         statement = solution.extremal.statement  # not known where the solution was read from a file alone
         states = dict.fromkeys(label.split("[")[0] for label in augmented)

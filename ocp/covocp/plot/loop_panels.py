@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,6 +39,8 @@ def rms(drawn: Sequence[Drawn], key: Given, blocks: Mapping[str, Block], units: 
     name = key if isinstance(key, str) else shortened(key)
     block = block_of(key, blocks.values()) if isinstance(key, str) else None
     kind = block.kind if block is not None else "state"
+    if block is not None and block.size == 1:  # also an entry of the error of an attitude
+        block = replace(block, tangent=0)
     entries = error_names((_as_block(name, key) if block is None else block,))
     closed = any(d.solution.loop is not None for d in drawn)
     shown: tuple[int, ...] = (0,)

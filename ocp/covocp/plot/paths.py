@@ -74,7 +74,9 @@ def _comparable(one: str, other: str, units: Mapping[str, str]) -> bool:
 def _ellipses(drawn: Drawn, key: Given, panel: Panel) -> list[Ellipse]:
     """Ellipses of two states or unknowns at some nodes, where both are uncertain."""
     rows = [drawn.rows(name) if isinstance(name, str) else [] for name in (key, panel.key)]
-    if any(len(own) != 1 for own in rows) or rows[0] == rows[1]:
+    blocks = [block_of(name, drawn.solution.blocks) for name in (key, panel.key) if isinstance(name, str)]
+    turned = any(block is not None and block.tangent for block in blocks)  # its rows are not of its entries
+    if turned or any(len(own) != 1 for own in rows) or rows[0] == rows[1]:
         return []
     solution = drawn.solution
     full = solution.values[drawn.covariance.name] if drawn.covariance is not None else np.zeros(0)
