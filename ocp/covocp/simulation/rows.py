@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import accumulate
 from typing import TYPE_CHECKING
 
-from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.statement.augmented import augmented_blocks, check_no_quaternion_entry, without_rows
 from covocp.statement.names import name_of, sizes_of, split_entry
-from covocp.statement.statement import Block, error_names, error_size
+from covocp.statement.statement import Block
 
 if TYPE_CHECKING:
     from covocp.simulation.monte_carlo import MonteCarlo
@@ -18,20 +17,9 @@ if TYPE_CHECKING:
 Place = tuple[slice, Block]
 
 
-def augmented_blocks(sample: MonteCarlo) -> tuple[Block, ...]:
-    """The states and unknowns that have rows in the augmented state, their sizes and offsets in it.
-
-    Of an attitude these are the three of its error. Decisions and integrals are states without rows.
-    """
-    both = [block for kind in ("state", "unknown") for block in sample.blocks if block.kind == kind]
-    own = [block for block in both if error_names((block,))[0] in sample.augmented]
-    offsets = accumulate((error_size(block) for block in own), initial=0)
-    return tuple(replace(b, size=error_size(b), offset=offset) for b, offset in zip(own, offsets, strict=False))
-
-
 def places(sample: MonteCarlo, *, controls: bool = True) -> dict[str, Place]:
     """Where the states and unknowns, and the controls that are fed back, lie among the rows (2n + m), by name."""
-    found = {b.name: (slice(b.offset, b.offset + b.size), b) for b in augmented_blocks(sample)}
+    found = {b.name: (slice(b.offset, b.offset + b.size), b) for b in augmented_blocks(sample.blocks, sample.augmented)}
     for block in sample.blocks:
         if controls and block.kind == "control" and block.offset < sample.nominal_control.shape[1]:
             start = 2 * sample.size + block.offset
@@ -64,16 +52,15 @@ def _check_rows(sample: MonteCarlo, key: Given, found: dict[str, Place]) -> None
     Raises:
         ProblemError: it is a symbol of the problem that has none.
     """
+    check_no_quaternion_entry(key, sample.symbols, sample.blocks, found)
     every = {block.name: block for block in sample.blocks if block.kind in ("state", "unknown", "control")}
     name = name_of(key, sample.symbols, tuple(every), missing_ok=True, sizes=sizes_of(every.values()))
     entry = split_entry(name)
     owner = every.get(name if name in every or entry is None else entry[0])
     if owner is None:
         return
-    if owner.tangent and name not in every and not isinstance(key, str):
-        raise _without(name, found, f"an entry of the quaternion of '{owner.name}'", "rows are those of its error")
     if owner.name not in found:
-        raise _without(name, found, *_kind(owner, sample))
+        raise without_rows(name, found, *_kind(owner, sample))
 
 
 def _kind(block: Block, sample: MonteCarlo) -> tuple[str, str]:
@@ -85,12 +72,3 @@ def _kind(block: Block, sample: MonteCarlo) -> tuple[str, str]:
     if block.offset < sample.nominal_control.shape[1]:
         return "a control", "this is known of states and unknowns"
     return "a control that is not fed back", "it is the same in all runs, that of the solution"
-
-
-def _without(name: str, found: dict[str, Place], what: str, why: str) -> ProblemError:
-    return ProblemError(
-        f"There are no deviations of '{name}' here: {why}.",
-        expected="a symbol or name of " + ", ".join(found),
-        received=f"'{name}', {what}",
-        remedy="ask for one of these",
-    )

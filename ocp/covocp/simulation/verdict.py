@@ -9,8 +9,8 @@ import numpy as np
 
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.short_repr import short_repr
-from covocp.simulation.rows import augmented_blocks
 from covocp.simulation.sampling import degrees_of_freedom, mean_square_band, robust_deviation
+from covocp.statement.augmented import augmented_blocks
 
 if TYPE_CHECKING:
     from covocp.simulation.monte_carlo import MonteCarlo
@@ -227,8 +227,8 @@ class Verdict:
 
 def judge(sample: MonteCarlo) -> Verdict:
     """The verdict on a simulation."""
-    stayed, states = sample.stayed, sum(b.size for b in augmented_blocks(sample) if b.kind == "state")
-    names, n = sample.augmented, sample.size
+    stayed, names, n = sample.stayed, sample.augmented, sample.size
+    states = sum(b.size for b in augmented_blocks(sample.blocks, names) if b.kind == "state")
     predicted, errors = (standard_deviations(v[-1]) for v in (sample.predicted, sample.predicted_error))
     flown, intended = (np.sqrt(v.clip(0.0))[:states] for v in (np.diagonal(sample.design[-1]), sample.intended))
     broken = ~(np.abs(flown - intended) <= AS_PROMISED * intended) & (intended > 0)

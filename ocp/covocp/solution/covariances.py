@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +10,8 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array, is_semidefinite
 from covocp.solution.reading import name_in
+from covocp.statement.augmented import augmented_blocks, check_no_quaternion_entry
 from covocp.statement.names import block_of
-from covocp.statement.statement import error_names, error_size
 from covocp.transcription.before_reading import ESTIMATE
 
 if TYPE_CHECKING:
@@ -57,13 +55,8 @@ def covariance_between(solution: Solution, a: Given, b: Given) -> Array:
 
 def _augmented_span(solution: Solution, key: Given) -> slice:
     """Rows of a state, an unknown or an entry of one in the covariances of the augmented state."""
-    both = [q for kind in ("state", "unknown") for q in solution.blocks if q.kind == kind]
-    own = [q for q in both if error_names((q,))[0] in solution.augmented]  # constants of a gain have no row
-    offsets = accumulate((error_size(q) for q in own), initial=0)
-    rows = tuple(
-        replace(q, kind="state", size=error_size(q), offset=offset, tangent=0)
-        for q, offset in zip(own, offsets, strict=False)
-    )
+    rows = augmented_blocks(solution.blocks, solution.augmented)
+    check_no_quaternion_entry(key, solution.symbols, solution.blocks, [block.name for block in rows])
     found = block_of(name_in(solution, key, rows), rows)
     assert found is not None
     return found.span
