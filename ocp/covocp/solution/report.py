@@ -35,6 +35,8 @@ NO_GAIN = 1e-7
 GAIN, DEVIATIONS, PLACES = "C", "deviations", ("at the end", "on the way")
 # Name of the count that says why a gain is free.
 ASKED = "gain_asked"
+# Name of the count that says by what other options a run was made again, where it did not find its way as asked.
+OTHERWISE = "other_ways"
 # Multipliers below this share of the cost are not shown.
 NEGLIGIBLE = 1e-6
 # Relative difference of costs below which two starts count as having found the same optimum.
@@ -378,6 +380,8 @@ def _effort(solution: Solution) -> Section:
     effort = [_counted(stats["iterations"], "iteration")] if stats.get("iterations", -1) >= 0 else []
     if (seconds := solution_seconds(stats)) is not None:
         effort.append(f"{seconds:.3g} s")
+    if stats.get(OTHERWISE):
+        effort.append(f"{'found' if solution.converged else 'nor found'} by {stats[OTHERWISE]}")
     if stats.get("left_saddle"):
         effort.append("started again from a saddle")
     if "starts" in stats and solution.within is None:

@@ -25,6 +25,7 @@ from covocp.extremal.mesh_error import OPTIMISED, finer_steps, steps_along
 from covocp.problem.builder import Problem
 from covocp.problem.expected_cost import deterministic, statement_of
 from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.around_nominal import closed_around
@@ -41,6 +42,7 @@ from covocp.solving.gain_start import best_gain, meeting_conditions, with_best_g
 from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.other_minima import away_from_saddle, without_turns
+from covocp.solving.other_ways import other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.suited_mesh import regraded, suits
@@ -137,8 +139,8 @@ class Solver:
         self._own = own
         other = method not in ("ipopt", "auto") or str(self._own.get("plugin", "ipopt")) != "ipopt"
         patient = other or "max_iterations" in self._own
-        self._loosened = bool(self._best) and can_be_loosened(solved) and not patient
-        if self._loosened:  # there is another way
+        self._otherwise = bool(self._best) and not patient
+        if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
         if asked.refine is not None:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
@@ -288,7 +290,10 @@ class Solver:
             outcome, start = from_starts(self._prepared, values, several, reporter)
             if outcome.converged or reporter.stop:
                 break
-        outcome = outcome if outcome.converged or best is None else self._tightened(outcome, values, best, reporter)
+        if best is not None and self._otherwise and not outcome.converged:
+            outcome = self._tightened(outcome, values, best, reporter)
+            near = guess if isinstance(guess, Solution) else best
+            outcome = outcome if outcome.converged else self._by_other_ways(outcome, values, near, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
 
     def _laid_out(self) -> Options:
@@ -349,7 +354,7 @@ class Solver:
 
     def _tightened(self, failed: Outcome, values: Array, best: Solution, reporter: Progress) -> Outcome:
         """Solved by way of loosened limits of the spread, from the best gain; else as it failed."""
-        if reporter.stop or not self._loosened:
+        if reporter.stop or not can_be_loosened(self._solved):
             return failed
         mesh = self._prepared.mesh
         begin = make_guess(self._solved, mesh, values, best)
@@ -366,6 +371,27 @@ class Solver:
 
         found = tightened(self._solved, begin.trajectory, mesh, values, run, lambda: reporter.stop)
         return failed if found is None else with_stats(found, **counted(failed, found))
+
+    def _by_other_ways(self, failed: Outcome, values: Array, near: Solution, reporter: Progress) -> Outcome:
+        """Solved from the same start with other steps or an approximate Hessian, where one finds it; else as it failed.
+
+        Steps that find it are those of later runs.
+        """
+        for way in other_ways(self._solved, self._options, self._prepared.mesh, self._own):
+            if reporter.stop:
+                break
+            try:
+                prepared = self._ready(way.options, **way.own)
+                found = prepared.solve(values, make_guess(self._solved, prepared.mesh, values, near), reporter)
+            except CovocpError:  # another one may apply
+                continue
+            if found.converged:
+                if way.options is not self._options:
+                    self._keep(way.options, prepared)
+                return with_stats(found, **counted(failed, found), **{OTHERWISE: way.words})
+            tried = [*filter(None, [failed.stats.get(OTHERWISE)]), way.words]
+            failed = with_stats(failed, **counted(failed, found), **{OTHERWISE: " and ".join(tried)})
+        return failed
 
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
         """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
@@ -467,16 +493,21 @@ class Solver:
         if not outcome.converged:
             if allow_failure:
                 return solution
-            raise failure(self.statement.name, self.method, outcome, solution, "" if impossible else self._other_way())
+            raise failure(
+                self.statement.name, self.method, outcome, solution, "" if impossible else self._other_way(outcome)
+            )
         if assess:
             mention_doubts(solution)
             mention_limits(solution)
         return solution
 
-    def _other_way(self) -> str:
-        """A line for a run that failed, where another method is known to be more robust."""
+    def _other_way(self, failed: Outcome) -> str:
+        """A line for a run that failed, where another method or other options are known to be more robust."""
         ipopt = self.method == "ipopt" and self._own.get("plugin", "ipopt") == "ipopt"
-        return OTHER_WAY if ipopt and is_suited(self._solved, self._prepared.mesh) else ""
+        if ipopt and is_suited(self._solved, self._prepared.mesh):
+            return OTHER_WAY
+        left = other_ways(self._solved, self._options, self._prepared.mesh, self._own) if self._best and ipopt else ()
+        return told_ways(str(failed.stats.get(OTHERWISE, "")), left)
 
 
 def _classical_costs(problem: Problem, options: Options) -> Costs:

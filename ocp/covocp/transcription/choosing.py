@@ -99,13 +99,11 @@ def _choose_points(statement: Statement, options: Options, substeps: int, group:
     Raises:
         ProblemError: given substeps that do not end at the given points.
     """
-    if statement.loop is not None and statement.loop.shared and options.substeps == "auto":
-        substeps = max(substeps, 2 * group)  # as below, also where the limits are those of another phase
+    if options.substeps == "auto" and _asks_for_gain(statement):
+        substeps = max(substeps, 2 * group)  # the spread of the controls is free where it begins, at t = 0
     if not (statement.path.size or statement.bounded_states):
         return substeps, 1
     if options.points == "auto":
-        if statement.path.realised is not None and options.substeps == "auto":
-            substeps = max(substeps, 2 * group)  # the spread of the controls is free where it begins, at t = 0
         return substeps, max(1, substeps // group)
     least = options.points * group if options.points > 1 else 1
     if options.substeps != "auto" and substeps % least:
@@ -116,6 +114,18 @@ def _choose_points(statement: Statement, options: Options, substeps: int, group:
             remedy="leave substeps='auto', or take a divisor of them as points",
         )
     return -(-substeps // least) * least, options.points
+
+
+def _asks_for_gain(statement: Statement) -> bool:
+    """Whether a gain is free because X is in a condition or a cost, perhaps of another phase.
+
+    By one Runge-Kutta step an interval a large gain at the start takes Xhat below zero, and the cost with it: runs
+    from an optimum went on until they had no iterations left (a pendulum with a limit at the end that did not act).
+    """
+    loop = statement.loop
+    if loop is None:
+        return False
+    return loop.shared or loop.spread is not None or any(entry.realised is not None for entry in statement.conditions)
 
 
 def _too_few_substeps(substeps: int, rate: float) -> ProblemError:
