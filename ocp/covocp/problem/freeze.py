@@ -375,7 +375,8 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
         return None
     slopes = [ca.densify(entry) for entry in stacked.substitute(v.F, v.G, v.A, v.B, v.N, v.Q)]
     (gain, running, terminal, end) = stacked.substitute(v.gain, v.running, v.terminal, v.end)
-    u = stacked.inputs[1][: slopes[3].shape[0]]
+    weighed = slopes[3].shape[0]  # controls; what follows them, a free gain, is not in the running cost
+    own_weight = ca.hessian(running, stacked.inputs[1])[0][:weighed, :weighed]
     by_parts = None
     if v.alternative is not None:
         by_parts = stacked.function("by_parts", stacked.substitute(v.alternative, v.product))
@@ -385,9 +386,7 @@ def _loop(problem: Declarations, stacked: Stacked) -> Loop | None:
         gain=stacked.function("gain", [ca.densify(gain)]),
         running=stacked.function("running", [running], without=("matrices",)),
         terminal=stacked.function("terminal", [terminal, ca.densify(end)], without=("control", "matrices", "time")),
-        extra_control=stacked.function(
-            "extra", [ca.densify(slopes[3] - ca.hessian(running, u)[0])], without=("matrices",)
-        ),
+        extra_control=stacked.function("extra", [ca.densify(slopes[3] - own_weight)], without=("matrices",)),
         weighed=None
         if v.weighed is None
         else stacked.function("weighed", list(map(ca.densify, stacked.substitute(*v.weighed))), without=("matrices",)),

@@ -35,7 +35,7 @@ def samples(problem: Declarations, stacked: Stacked) -> Samples | None:
         return None
     value = ca.vertcat(*stacked.substitute(*(entry.expression for entry in taken)))
     slope = ca.densify(stacked.augmented_jacobian(value))
-    variances = [ca.densify(entry) for entry in stacked.substitute(*(entry.noise for entry in taken))]
+    variances = [_entries(entry) for entry in stacked.substitute(*(entry.noise for entry in taken))]
     blocks = measured_blocks(taken)
     reading = stacked.symbolic.sym("reading", len(taken))  # type: ignore[attr-defined]
     outputs = _updated(problem, stacked, [slope[block.span, :] for block in blocks], variances, reading)
@@ -43,7 +43,9 @@ def samples(problem: Declarations, stacked: Stacked) -> Samples | None:
     return Samples(
         blocks=blocks,
         places=tuple(entry.instants for entry in taken),
-        measurement=stacked.function("sampled", [value, slope, ca.diagcat(*variances)], without=("matrices",)),
+        measurement=stacked.function(
+            "sampled", [value, slope, ca.densify(ca.diagcat(*variances))], without=("matrices",)
+        ),
         groups=tuple(
             tuple(block.offset + row for row in rows)
             for block, variance in zip(blocks, variances, strict=True)
@@ -84,9 +86,16 @@ def _offsets(problem: Declarations) -> list[int]:
 def _uncorrelated(variance: Expr) -> list[tuple[list[int], Any]]:
     """Rows of a measurement one by one where their noises are independent, which needs no matrix inverse."""
     size = variance.shape[0]
-    if ca.sparsify(variance).sparsity().is_diag():
-        return [([i], variance[i, i]) for i in range(size)]
-    return [(list(range(size)), variance)]
+    if variance.sparsity().is_diag():
+        return [([i], ca.densify(variance[i, i])) for i in range(size)]
+    return [(list(range(size)), ca.densify(variance))]
+
+
+def _entries(variance: Expr) -> Any:
+    """A variance without the entries that are zero, where that can be told: those of a call have no numbers."""
+    if isinstance(variance, ca.SX):
+        return ca.sparsify(variance)
+    return variance if ca.symvar(variance) else ca.MX(ca.sparsify(ca.evalf(variance)))
 
 
 def _read(E: Expr, H: Expr, R: Expr, reading: Expr) -> Any:

@@ -44,8 +44,22 @@ class Stacked:
     def function(self, name: str, expressions: list[Any], *, without: tuple[str, ...] = ()) -> ca.Function:
         """A function of the stacked vectors, with named inputs."""
         kept = [(symbol, label) for symbol, label in zip(self.inputs, INPUTS, strict=True) if label not in without]
+        expressions = self._bare(
+            expressions, [s for s, label in zip(self.inputs, INPUTS, strict=True) if label in without]
+        )
         outputs = [f"out{i}" for i in range(len(expressions))]
         return ca.Function(name, [k[0] for k in kept], expressions, [k[1] for k in kept], outputs)
+
+    def _bare(self, expressions: list[Any], others: list[Any]) -> list[Any]:
+        """Expressions without symbols on which no entry of them depends: those of a call name all that it was made of.
+
+        X at the end is a block of the covariance that the gain, a control, makes the rest of.
+        """
+        if self.symbolic is not ca.MX:
+            return expressions
+        entries = ca.veccat(*expressions)
+        unused = [s for s in others if not ca.jacobian_sparsity(entries, s).nnz()]
+        return list(ca.substitute(expressions, unused, [ca.MX.zeros(s.shape) for s in unused]))
 
     def with_spread(self, name: str, expressions: list[Any], size: int) -> ca.Function:
         """A function of the stacked vectors and of the half-vector of X, of so many rows: the user's expressions."""
