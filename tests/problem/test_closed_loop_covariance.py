@@ -80,6 +80,42 @@ def test_linear_costs_keep_the_best_gain_and_others_ask_for_a_free_one():
     assert "X in the running cost" in str(of(lambda x, u, X: X.deviation(u)))
 
 
+def cost_of_the_end(by):
+    """Of a double integrator with a terminal cost by(X, x)."""
+    ocp = co.Problem(1.0)
+    x = ocp.state("x", 2, initial=[0.0, 0.0], variance=[0.4, 0.1])
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], u), noise=[0.0, 0.5])
+    ocp.measurement("m", x[0], noise=0.2)
+    X = ocp.closed_loop_covariance()
+    ocp.minimize_expected(running=u**2, terminal=by(X, x))
+    return co.solve(ocp, intervals=10, progress=False).cost
+
+
+def test_a_variance_is_the_entry_of_its_block_in_a_terminal_cost():
+    """Written out by component it has no entry of a control, which costs nothing at one instant."""
+
+    wanted = cost_of_the_end(lambda X, x: 5 * X[x, x][0, 0])
+    assert cost_of_the_end(lambda X, x: 5 * X[x[0], x[0]]) == pytest.approx(wanted, rel=1e-9)
+    assert cost_of_the_end(lambda X, x: 5 * X[2 * x[0], x[0] / 2]) == pytest.approx(wanted, rel=1e-9)
+    free = cost_of_the_end(lambda X, x: 5 * X.deviation(x[0]) ** 2)  # a gain of pieces, of second order
+    assert free == pytest.approx(wanted, rel=1e-4)
+
+
+def test_factors_of_what_is_singular_where_nothing_scatters():
+    """Determinant and inverse by CasADi's factorisations are those written out."""
+
+    det = lambda V: V[0, 0] * V[1, 1] - V[0, 1] ** 2  # noqa: E731
+    pairs = {
+        "det": (ca.det, det),
+        "inv": (lambda V: 0.01 * ca.trace(ca.inv(V)), lambda V: 0.01 * ca.trace(V) / det(V)),
+        "solve": (lambda V: 0.01 * ca.solve(V, ca.DM([1.0, 0.0]))[0], lambda V: 0.01 * V[1, 1] / det(V)),
+    }
+    for name, pair in pairs.items():
+        factored, written = (cost_of_the_end(lambda X, x, of=of: of(X[x, x])) for of in pair)
+        assert factored == pytest.approx(written, rel=1e-6), name
+
+
 def _after(call):
     ocp, *rest = stated()
     call(ocp, *rest)

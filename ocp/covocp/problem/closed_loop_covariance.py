@@ -27,7 +27,7 @@ from covocp.problem.checks import check_name
 from covocp.problem.declarations import Control, Declarations, Expansion, Expected, Gain, State, Unknown
 from covocp.problem.estimation_covariance import block_between, with_estimation
 from covocp.problem.matrices import Spread
-from covocp.statement.statement import error_names, error_size
+from covocp.statement.statement import entry_names, error_names, error_size
 
 SPREAD = "X"
 # Variances are not smaller than this in expressions: a root has a slope where nothing scatters, as at the start.
@@ -180,8 +180,12 @@ def _without(cost: Expr, half: Any, n: int) -> Any:
     (plain,) = ca.substitute([cost], [half], [values])
     symbols = ca.symvar(plain)
     some = [np.linspace(0.61, 0.83, symbol.numel()).reshape(symbol.shape) for symbol in symbols]
-    if np.isfinite(ca.Function("plain", symbols, [plain])(*some).full() if symbols else ca.evalf(plain).full()).all():
-        return plain
+    try:
+        there = ca.Function("plain", symbols, [plain])(*some) if symbols else ca.evalf(plain)
+        if np.isfinite(there.full()).all():
+            return plain
+    except RuntimeError:  # CasADi's, of a factorisation: an inverse or a determinant of what is singular there
+        pass
     (plain,) = ca.substitute([cost], [half], [pack_symbolic(ca.MX(ca.DM.eye(n)))])
     return plain
 
@@ -264,7 +268,7 @@ def with_weights(problem: Declarations, expansion: Expansion, running: CostParts
         expansion = replace(
             expansion,
             A=_folded(expansion.A + W[:n, :n]),
-            B=_folded(expansion.B + W[n:, n:]),
+            B=_control_weight(problem, expansion.B, W[n:, n:]),
             N=_folded(expansion.N + W[:n, n:]),
             weighed=(W[:n, :n], W[:n, n:]),
         )
@@ -274,6 +278,33 @@ def with_weights(problem: Declarations, expansion: Expansion, running: CostParts
         return expansion
     added = tuple(ca.MX(0) if part.rest is None else part.rest for part in (running, terminal))
     return replace(expansion, spread=(added[0], added[1]))
+
+
+def _control_weight(problem: Declarations, own: Expr, added: Expr) -> Any:
+    """The weight of the deviations of the controls with what X in the running cost adds to it.
+
+    Raises:
+        ProblemError: a number that is not positive definite: the more is fed back the less it costs.
+    """
+    weight = _folded(own + added)
+    if ca.symvar(weight):
+        return weight
+    numbers = ca.evalf(weight).full()
+    if np.linalg.eigvalsh(numbers)[0] > 0:
+        return weight
+    names = entry_names(problem.controls)
+    first = np.flatnonzero(np.diag(numbers) <= 0)
+    which = f"control '{names[first[0]]}'" if first.size else f"controls {', '.join(names)}"
+    assert problem.expected is not None
+    raise ProblemError(
+        f"{SPREAD} in the running cost makes the weight of the deviations of the {which} no positive one.",
+        expected="positive second derivatives by the controls, or control_weight=, that exceed what the terms of "
+        f"{SPREAD} take away: the more is fed back the less it would cost",
+        received=f"{ca.evalf(own).full().tolist()} of the rest and {ca.evalf(added).full().tolist()} of {SPREAD}"
+        if not ca.symvar(ca.veccat(own, added))
+        else f"weights {numbers.tolist()}",
+        remedy=f"take less of {SPREAD} of the controls away from the running cost, or give control_weight={{...}}",
+    )
 
 
 def _folded(value: Expr) -> Any:

@@ -106,7 +106,7 @@ def block_between(
         return matrix[left, right]
     unit = ca.MX.eye(matrix.shape[0])
     rows, columns = (unit[j, :] if isinstance(j, slice) else j for j in (left, right))
-    return rows @ matrix @ columns.T
+    return ca.densify(rows @ matrix @ columns.T)
 
 
 def _rows(letter: str, entries: Sequence[AugmentedEntry | Control], labels: tuple[str, ...], key: Given) -> Any:
@@ -135,4 +135,4 @@ def _rows(letter: str, entries: Sequence[AugmentedEntry | Control], labels: tupl
             remedy=f"index {letter} with states{', unknowns and controls' if of_loop else ' and unknowns'} of this "
             "problem",
         )
-    return ca.densify(jacobian)
+    return jacobian  # sparse: what it leaves out is no part of a cost or a condition
