@@ -59,7 +59,7 @@ def with_chance(
     """The declarations with one more condition on a probability; arguments and errors as of `Problem.chance`."""
     count = len(own.chances) + sum(c.chance is not None for c in own.constraints)
     label = f"chance {count + 1}" if name is None else name
-    check_place(label, at)
+    check_place(label, at, instants=False)
     value = column_expression(label, "chance", expression)
     check_constrains(label, value, [*(q.symbol for q in own.parameters), own.time])
     check_name(label, list(own.named))

@@ -46,7 +46,7 @@ def with_constraint(
     label = name if name is not None else f"constraint {len(own.constraints) + 1}"
     instant = instant_of(own, label, at, relative, side)
     if at is not None and instant is None:
-        check_place(label, at)
+        check_place(label, at, instants=True)
     value = column_expression(label, "constraint", expression)
     fixed: list[Any] = [*own.parameters, *own.unknowns]
     constants = [*(q.symbol for q in fixed), own.time]
@@ -96,8 +96,13 @@ def _both_limits(label: str, lower: Given, upper: Given, equals: Given, size: in
     return both, both
 
 
-def check_place(label: str, at: Given) -> None:
+def check_place(label: str, at: Given, *, instants: bool) -> None:
     """A place that is no instant is one of three.
+
+    Args:
+        label: of the condition.
+        at: its place.
+        instants: whether it might have been an instant.
 
     Raises:
         ProblemError: it is none.
@@ -105,7 +110,7 @@ def check_place(label: str, at: Given) -> None:
     if not isinstance(at, str) or at not in PLACES:
         raise ProblemError(
             f"'{label}' has an unknown place.",
-            expected="at='path', 'initial' or 'final', or an instant: a number of seconds",
+            expected="at='path', 'initial' or 'final'" + (", or an instant: a number of seconds" if instants else ""),
             received=repr(at),
             remedy="correct at=",
         )

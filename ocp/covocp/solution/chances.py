@@ -26,10 +26,10 @@ SMALL = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Reached:
-    """A condition on a probability at the node where it is tightest, of one row or of several rows together.
+    """A condition on a probability at the node where it is least, of one row or of several rows together.
 
     name: of the condition, of the row where there are several. place: "path", "initial" or "final".
-    asked, reached: probability, of several rows by Boole's bound. time: of the tightest node [s]. margin: by how much
+    asked, reached: probability, of several rows by Boole's bound. time: of that node [s]. margin: by how much
         each limit could be drawn in there, in the unit of the expression; NaN of several rows. deviation: the standard
         deviation there, NaN of several rows.
     """
@@ -65,10 +65,18 @@ def reached(solution: Solution) -> tuple[Reached, ...]:
             allowed = _allowed(*pair)
             missed = np.where((rooms >= -allowed) & (SMALL * s <= allowed), np.maximum(-rooms, 0.0), 0.0)
             shares.append(inside(y, s, pair[0] - missed, pair[1] + missed))
-            k = int(np.argmin(np.where(np.isfinite(rooms), rooms, -np.inf)))
-            own = {"place": limits.place, "asked": limits.each, "reached": float(shares[-1].min())}
+            # where it is least; of several nodes at which it is the same, as 1 where nothing scatters, the tightest
+            k = int(np.lexsort((np.where(np.isfinite(rooms), rooms, -np.inf), shares[-1]))[0])
             result.append(
-                Reached(name=name, time=float(t[k]), margin=float(rooms[k]), deviation=float(s[k]), **own)  # type: ignore[arg-type]
+                Reached(
+                    name=name,
+                    place=limits.place,
+                    asked=limits.each,
+                    reached=float(shares[-1][k]),
+                    time=float(t[k]),
+                    margin=float(rooms[k]),
+                    deviation=float(s[k]),
+                )
             )
         if limits.joint:
             together = np.clip(1.0 - np.sum([1.0 - share for share in shares], axis=0), 0.0, 1.0)
@@ -140,6 +148,6 @@ def chance_section(entries: tuple[Reached, ...]) -> Section:
         rows[-1].append(place if q.met else f"{place}, NOT MET")
     note = (
         "Reached: by the linearised spread, at each node by itself; margin: what each limit could be drawn in by at "
-        "the tightest node. simulate() counts the runs."
+        "the node where it is least. simulate() counts the runs."
     )
     return [Table(columns=columns, rows=rows, words=(0, len(columns) - 1)), Sentence(note, "")]

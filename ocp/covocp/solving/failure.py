@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from covocp.base.errors import SolveError
+from covocp.extremal.densities import impossible_density
 from covocp.extremal.extremal import Outcome
 from covocp.solution.solution import Solution
 from covocp.solving.decisions import bent_data, far_away
@@ -23,10 +26,20 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     """
     lines = [f"  {row}: {value:.6g}" for row, value in list(outcome.violations.items())[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
+    noise = _impossible(outcome)
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
-        f"{violated}{far_away(solution)}{bent_data(solution)}{other_way}"
+        f"{violated}{far_away(solution)}{bent_data(solution)}{noise}{other_way}"
         "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
         solution=solution,
         violations=outcome.violations,
     )
+
+
+def _impossible(outcome: Outcome) -> str:
+    """A line on a noise along the last iterate that none can be: where it has led a run, nothing else is the reason."""
+    try:
+        found = impossible_density(outcome.extremal)
+    except (RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):  # an iterate without values
+        return ""
+    return "" if not found or found in outcome.message else f"\n  Along the last iterate {found}."
