@@ -11,6 +11,7 @@ import pytest
 from scipy.linalg import eigh, null_space
 
 import covocp as co
+from covocp.extremal import curvature
 from covocp.extremal.curvature import mass_matrix, smallest_curvature
 from covocp.transcription.trajectory import Multipliers
 
@@ -192,3 +193,23 @@ def test_a_free_initial_state_counts():
         ocp.minimize(running=0.5 * x**2 + 50.0 * u**2, terminal=-0.5 * y**2)
         verdicts.append(smallest_curvature(at_rest(ocp, 20)).verdict)
     assert verdicts == ["saddle", "minimum"]
+
+
+def test_a_curvature_that_would_take_too_long_is_not_known(monkeypatch):
+    """A product with the Hessian is looked at first: none is waited for where all of them would take too long."""
+    extremal = at_rest(quadratic(1.0, 0.9, 1.0), 30)
+    products = []
+    monkeypatch.setattr(curvature, "_seconds", lambda *_: products.append(1) or 1.0)
+    assert smallest_curvature(extremal, 5.0).verdict == "unknown"
+    known = smallest_curvature(extremal, 1e6)
+    assert known.value == smallest_curvature(extremal).value
+    few = smallest_curvature(extremal, 10.0)  # ten steps, which do not separate 30 eigenvalues
+    assert few.verdict in ("unknown", known.verdict)
+    assert len(products) == 4
+
+
+def test_what_is_not_known_of_a_solution_is_said(monkeypatch):
+    monkeypatch.setattr(curvature, "_seconds", lambda *_: 1e9)
+    solution = solve(quadratic(0.0, 0.5, 1.0), intervals=10)
+    assert np.isnan(solution.optimality.curvature)
+    assert "NOT KNOWN: it would take longer" in " ".join(str(solution).split())

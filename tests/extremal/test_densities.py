@@ -35,6 +35,23 @@ def test_density_that_no_noise_has_is_no_solution(measurement, process, words):
     assert not caught.value.solution.converged
 
 
+@pytest.mark.parametrize("phased", [False, True], ids=["alone", "phases"])
+def test_density_that_no_noise_has_is_named_where_a_run_fails(phased):
+    """It falls with the state, from 0.5 to -0.5: Riccati equations with it lead nowhere."""
+    ocp = co.Problem(3.0, "falling")
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.04), ocp.control("u")
+    ocp.dynamics(x, u, noise=0.05)
+    ocp.measurement("sight", x, noise=0.5 - x)
+    ocp.minimize_expected(running=0.1 * u**2, terminal_weight={x: 1.0})
+    after = co.Problem(1.0, "after")
+    y, w = after.state("x", initial=None, final=1.0), after.control("u")
+    after.dynamics(y, w, noise=0.05)
+    after.measurement("other", y, noise=0.1)
+    after.minimize_expected(running=0.1 * w**2, terminal_weight={y: 1.0})
+    with pytest.raises(co.SolveError, match="measurement noise density of sight is not positive at t = "):
+        co.solve(co.Phases([ocp, after]) if phased else ocp, intervals=20, progress=False)
+
+
 FALLING = [
     ({"measurement": lambda ocp: 1 - 0.41 * ocp.time}, "measurement noise density of m is not positive at t = 2.44 s"),
     (

@@ -161,6 +161,52 @@ def test_rows_together_are_counted_together():
     assert set(runs.chances) == {"wall", "both"}
 
 
+def test_time_margin_and_deviation_are_those_of_the_least_probability():
+    """The spread grows from nothing, where the probability is one, while the nominal moves between its walls."""
+    ocp = co.Problem(4.0)
+    x, u = ocp.state("x", initial=0.0, variance=0.0), ocp.control("u")
+    y = ocp.state("y", initial=0.0, variance=0.0)
+    ocp.dynamics(x, u, noise=0.01)
+    ocp.dynamics(y, 0.1 * u)
+    ocp.minimize(running=(u - 0.5) ** 2)
+    ocp.chance(ca.vertcat(x, x + y), upper=[5.0, 9.0], lower=[-8.0, -1.0], probability=0.9, name="walls")
+    solution = co.solve(ocp, intervals=20, progress=False)
+    for found, values, limits in zip(
+        solution.chances, (solution["x"], solution["x"] + solution["y"]), ((-8.0, 5.0), (-1.0, 9.0)), strict=True
+    ):
+        k = int(np.argmin(np.abs(solution.t - found.time)))
+        s = np.sqrt(0.01 * found.time)
+        assert found.deviation == pytest.approx(s, abs=1e-9)
+        share = norm.cdf((limits[1] - values[k]) / s) - norm.cdf((limits[0] - values[k]) / s) if s else 1.0
+        assert found.reached == pytest.approx(share, abs=1e-12)
+
+
+def test_limits_that_the_error_of_the_filter_alone_passes_are_named():
+    """Of a linear system E is that of every nominal; the value at the end is prescribed, in the middle at best."""
+
+    def steered(**limits):
+        ocp = co.Problem(3.0)
+        x, v = ocp.state("x", initial=0.0, final=1.0, variance=0.04), ocp.state("v", initial=0.0, variance=0.01)
+        u = ocp.control("u")
+        ocp.dynamics(x, v)
+        ocp.dynamics(v, u, noise=0.05)
+        ocp.measurement("position", x, noise=0.02)
+        ocp.minimize_expected(running=0.1 * u**2, terminal_weight={x: 1.0, v: 1.0})
+        if limits:
+            ocp.chance(x, at="final", probability=0.95, name="tight", **limits)
+        return ocp
+
+    s = np.sqrt(co.solve(steered(), intervals=20, progress=False).loop.E[-1, 0, 0])
+    for limits, wider in (
+        ({"lower": 0.98, "upper": 1.02}, norm.isf(0.025) * s - 0.02),
+        ({"upper": 1.1}, norm.isf(0.05) * s - 0.1),
+    ):
+        with pytest.raises(co.SolveError, match=r"no feedback takes X below E.*'tight'") as caught:
+            co.solve(steered(**limits), intervals=20, progress=False)
+        said = float(str(caught.value).split("would have to be ")[1].split(" wider")[0])
+        assert said == pytest.approx(wider, rel=5e-3)
+
+
 def test_files_keep_what_is_reached(tmp_path):
     solution = co.solve(pushed(), intervals=4)
     for name in ("one.npz", "one.json"):
@@ -196,6 +242,7 @@ def test_attitudes_scatter_by_their_tangents():
         ({"upper": 1.0, "lower": 2.0}, "wall"),
         ({"upper": 1.0, "lower": 0.0, "probability": 0.05}, "too small for two limits"),
         ({"at": "middle"}, "unknown place"),
+        ({"at": 1.5}, "at='path', 'initial' or 'final'\n"),  # no instants are offered, which are refused
         ({"smallest": -1.0}, "smallest"),
         ({"joint": "yes"}, "joint"),
     ],

@@ -116,6 +116,26 @@ def test_factors_of_what_is_singular_where_nothing_scatters():
         assert factored == pytest.approx(written, rel=1e-6), name
 
 
+def test_a_weight_of_the_control_that_X_makes_negative_is_named():
+    """0.2 of the running cost, less 0.6: what is fed back would pay."""
+
+    def weighed(by):
+        ocp = co.Problem(1.0)
+        x, u = ocp.state("x", initial=0.0, variance=1.0), ocp.control("push")
+        ocp.dynamics(x, u, noise=0.1)
+        ocp.measurement("m", x, noise=0.1)
+        X = ocp.closed_loop_covariance()
+        ocp.minimize_expected(running=0.1 * u**2 + by * X[u, u])
+        return ocp.statement()
+
+    weighed(-0.09)
+    for by in (-0.3, -0.1):
+        with pytest.raises(
+            co.ProblemError, match=r"X in the running cost.*control 'push'.*\n.*\n.*\n.*control_weight="
+        ):
+            weighed(by)
+
+
 def _after(call):
     ocp, *rest = stated()
     call(ocp, *rest)

@@ -283,3 +283,21 @@ def test_a_control_that_is_used_in_its_phase_is_meant(use):
     from covocp.solving.unused import mention_idle_in
 
     mention_idle_in(two_parts(use))  # warnings are errors
+
+
+@pytest.mark.parametrize(
+    "measured", [lambda x: ca.MX(3.0), lambda x: 3.0, lambda x: 0 * x], ids=["MX", "number", "0 x"]
+)
+@pytest.mark.parametrize("feedback", [True, False], ids=["feedback", "filter"])
+def test_a_measurement_of_nothing_is_warned_about_once(measured, feedback):
+    ocp = co.Problem(3.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.04), ocp.control("u")
+    ocp.dynamics(x, u, noise=0.05)
+    ocp.measurement("blind", measured(x), noise=0.02)
+    if feedback:
+        ocp.minimize_expected(running=0.1 * u**2, terminal_weight={x: 1.0})
+    else:
+        ocp.minimize(running=u**2, terminal=ocp.estimation_covariance()[x, x])
+    with pytest.warns(UserWarning, match="'blind' depends on no state") as caught:
+        co.solve(ocp, intervals=10, progress=False)
+    assert sum("'blind' depends on no state" in str(warning.message) for warning in caught) == 1

@@ -10,16 +10,17 @@ multiplier, a direction counts only if they allow it.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.buffered import Buffered
-from covocp.base.krylov import krylov
+from covocp.base.krylov import LEAST_STEPS, krylov
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.extremal.active_constraints import held_by
@@ -51,7 +52,7 @@ CONE_MISS = 1e-9
 # Entries up to which what all directions do to the points is one matrix.
 FEW_ENTRIES = 1_000_000
 
-Verdict = Literal["minimum", "saddle", "flat"]
+Verdict = Literal["minimum", "saddle", "flat", "unknown"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,8 @@ class Curvature:
         largest: largest absolute eigenvalue of the reduced Hessian.
         error: of both, by roundoff and by the tolerance of the solution.
         direction: of the controls, (N + 1 or N, nu); of the initial states in `start` (nx,).
+
+    The value is NaN where it would take longer to find than was allowed.
     """
 
     value: float
@@ -75,18 +78,28 @@ class Curvature:
 
     @property
     def verdict(self) -> Verdict:
-        """ "minimum", "saddle", or "flat" where the sign is below the error."""
+        """ "minimum", "saddle", "flat" where the sign is below the error, or "unknown"."""
+        if np.isnan(self.value):
+            return "unknown"
         if abs(self.value) <= self.error:
             return "flat"
         return "minimum" if self.value > 0 else "saddle"
 
 
-def smallest_curvature(extremal: Extremal) -> Curvature | None:
-    """The smallest curvature with the terminal time held; None where nothing can move or it cannot be computed."""
+def smallest_curvature(extremal: Extremal, seconds: float = np.inf) -> Curvature | None:
+    """The smallest curvature with the terminal time held; None where nothing can move or it cannot be computed.
+
+    Args:
+        extremal: the solution.
+        seconds: about as long as it may take. A product with the Hessian of a gain that is free takes a second where
+            there are four states, and there may be a hundred of them.
+    """
     if not extremal.statement.nu:
         return None
     try:
-        reduced = _Reduced.of(extremal)
+        reduced = _Reduced.of(extremal, seconds)
+    except _TooLongError:
+        return _unknown(extremal)
     except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):  # a step that cannot be differentiated or solved
         return None
     if reduced is None:
@@ -97,12 +110,16 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     operator = reduced.operator(strict)
     if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
         return None
-    values, vectors, error = _extremes(operator, strict)
+    left = seconds / reduced.seconds - extremal.statement.nu  # products; some were needed for the units
+    steps = int(np.clip(left, LEAST_STEPS, LANCZOS_STEPS))
+    values, vectors, error, known = _extremes(operator, strict, steps)
+    if not known and steps < LANCZOS_STEPS and values[0] >= -error:  # a negative one is there whatever else is
+        return _unknown(extremal)
     value, v = float(values[0]), vectors[:, 0]
     largest = float(np.abs(values).max())
     error = max(error, SOLVED * largest)
     if value < -error and reduced.loose.shape[0]:
-        value, v = _in_the_cone(reduced, v, value, largest, error)
+        value, v = _in_the_cone(reduced, v, value, largest, error, steps)
     z, u = reduced.tangents.forward(reduced.unscaled(v)[:, None])
     start = np.zeros(extremal.statement.nx)
     moving = list(reduced.tangents.start)
@@ -110,19 +127,42 @@ def smallest_curvature(extremal: Extremal) -> Curvature | None:
     return Curvature(value=value, largest=largest, error=error, direction=u[:, :, 0], start=start)
 
 
-def _extremes(operator: Callable[[Array], Array], basis: Array) -> tuple[Array, Array, float]:
-    """Ritz values (rising) and vectors on a subspace, and how far the operator on it was from symmetric."""
+class _TooLongError(Exception):
+    """A few products with the Hessian take longer than all of it may."""
+
+
+def _unknown(extremal: Extremal) -> Curvature:
+    """What is not known."""
+    nothing = np.zeros_like(extremal.trajectory.u), np.zeros(extremal.statement.nx)
+    return Curvature(value=np.nan, largest=np.nan, error=np.inf, direction=nothing[0], start=nothing[1])
+
+
+class _Extremes(NamedTuple):
+    """Ritz values (rising) and vectors on a subspace, how far the operator on it was from symmetric, whether known."""
+
+    values: Array
+    vectors: Array
+    error: float
+    known: bool
+
+
+def _extremes(operator: Callable[[Array], Array], basis: Array, steps: int = LANCZOS_STEPS) -> _Extremes:
+    """Ritz pairs of an operator on a subspace after some Lanczos steps."""
 
     def known(value: float, residual: float, largest: float) -> bool:
         return residual <= min(LANCZOS_TOLERANCE * largest, max(0.5 * abs(value), SOLVED * largest))
 
     order = np.arange(1.0, basis.shape[1] + 1.0)
     start = np.modf(order**2 * GOLDEN)[0] - 0.5  # like random numbers: across no direction
-    found = krylov(operator, start, LANCZOS_STEPS, known)
-    return found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry
+    found = krylov(operator, start, steps, known)
+    settled = found.values.size == start.size or found.beside[-1] == 0.0
+    settled = settled or known(float(found.values[0]), found.residual, float(np.abs(found.values).max()))
+    return _Extremes(found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry, bool(settled))
 
 
-def _in_the_cone(reduced: _Reduced, v: Array, value: float, largest: float, error: float) -> tuple[float, Array]:
+def _in_the_cone(
+    reduced: _Reduced, v: Array, value: float, largest: float, error: float, steps: int
+) -> tuple[float, Array]:
     """The smallest curvature found among the directions that constraints without a multiplier allow.
 
     Negative only with a direction that shows it: the direction itself or its opposite, one that keeps those constraints
@@ -135,14 +175,14 @@ def _in_the_cone(reduced: _Reduced, v: Array, value: float, largest: float, erro
     basis = reduced.null_space(np.vstack([reduced.strict, reduced.loose]))
     best, kept = np.inf, np.zeros_like(v)
     if basis.shape[1]:
-        values, vectors, _ = _extremes(reduced.operator(basis), basis)
+        values, vectors, *_ = _extremes(reduced.operator(basis), basis, steps)
         best, kept = float(values[0]), vectors[:, 0]
     if best < -error:
         return best, kept
     strict = reduced.null_space(reduced.strict)
     for sign in (1.0, -1.0):
         d = _onto_cone(sign * strict.T @ v, rows @ strict)
-        for _ in range(CONE_STEPS):
+        for _ in range(min(CONE_STEPS, steps)):
             length = float(np.linalg.norm(d))
             if length <= CONE_MISS:
                 break
@@ -176,6 +216,7 @@ class _Reduced:
         product: Hessian of the Lagrangian by points and controls there, times a direction of them.
         strict: slopes by v of the rows held with a multiplier, (rows, V), in these units.
         loose: of those without, such that a direction is allowed along which none falls.
+        seconds: that one product takes.
     """
 
     tangents: Tangents
@@ -184,12 +225,17 @@ class _Reduced:
     product: Callable[[Array], Array]
     strict: Array
     loose: Array
+    seconds: float
 
     __repr__ = short_repr
 
     @staticmethod
-    def of(extremal: Extremal) -> _Reduced | None:
-        """The operator along an extremal; None where nothing can move."""
+    def of(extremal: Extremal, seconds: float) -> _Reduced | None:
+        """The operator along an extremal; None where nothing can move.
+
+        Raises:
+            _TooLongError: the products that are needed in any case take longer than this.
+        """
         st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
         fine = refined(extremal)
         held = held_by(fine, extremal.mesh.points)
@@ -203,6 +249,9 @@ class _Reduced:
         between = _between(extremal, fine)
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
+        once = _seconds(product, given)
+        if once * (LEAST_STEPS + st.nu) > seconds:
+            raise _TooLongError
         moving = np.flatnonzero(tangents.free).tolist()
         shares = ca.diag(ca.DM(_shares(fine, product, given)[np.array(moving, dtype=np.intp) % st.nu]))
         metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
@@ -227,6 +276,7 @@ class _Reduced:
             product=_applied(product, given),
             strict=rows[held.strict],
             loose=-side[:, None] * loose,
+            seconds=once,
         )
 
     def unscaled(self, v: Array) -> Array:
@@ -272,6 +322,13 @@ def _applied(product: ca.Function, given: tuple[Any, ...]) -> Callable[[Array], 
         return np.full(direction.shape, np.nan) if outputs is None else outputs[0]
 
     return product_with
+
+
+def _seconds(product: ca.Function, given: tuple[Any, ...]) -> float:
+    """How long one product with a direction takes [s]."""
+    begin = time.perf_counter()
+    product(*given, np.zeros(product.size1_in(product.n_in() - 1)))
+    return max(time.perf_counter() - begin, float(np.finfo(float).tiny))
 
 
 def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:

@@ -70,7 +70,7 @@ class Optimality:
         smallest_eigenvalue: of all covariances at all nodes; inf without covariances.
         curvature: smallest eigenvalue of the reduced Hessian, on the null space of all constraints that hold, relative
             to its largest; 0 where its sign is below its error; None where nothing is left to move, or it cannot be
-            had. Negative: the solution is a saddle.
+            had; nan where it would take too long. Negative: the solution is a saddle.
         decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
             multipliers of its bounds; relative to the sum of the absolute terms or, where that is less, to a tenth of
             the cost by the magnitude of the decision; None without decisions.
@@ -118,6 +118,7 @@ def assess(
     loop: ClosedLoop | None = None,
     cost_identity: float | None = None,
     within: Within | None = None,
+    seconds: float = np.inf,
 ) -> Optimality:
     """Evaluate all necessary conditions along an extremal.
 
@@ -129,6 +130,7 @@ def assess(
         loop: its closed loop.
         cost_identity: difference of its cost and of that from the covariances of the loop.
         within: what the rest of a chain says of it. The curvature, which is one of all together, is then not computed.
+        seconds: about as long as the curvature may take.
 
     Returns:
         The record.
@@ -163,7 +165,7 @@ def assess(
         node_error=node_error(extremal),
         control_error=control_error,
         smallest_eigenvalue=smallest_eigenvalue,
-        curvature=_curvature(extremal) if within is None else None,
+        curvature=_curvature(extremal, seconds) if within is None else None,
         complementarity=complementarity(extremal, others),
         decisions=_decisions(extremal, costates, within),
         cost_identity=cost_identity,
@@ -353,8 +355,8 @@ def _decisions(extremal: Extremal, costates: Costates, within: Within | None) ->
     return decision_slopes(extremal, costates, within.start, within.size).relative
 
 
-def _curvature(extremal: Extremal) -> float | None:
-    result = smallest_curvature(extremal)
+def _curvature(extremal: Extremal, seconds: float) -> float | None:
+    result = smallest_curvature(extremal, seconds)
     if result is None or result.verdict == "flat":
         return None if result is None else 0.0
     return result.value / max(result.largest, np.finfo(float).tiny)

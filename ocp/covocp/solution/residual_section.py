@@ -101,6 +101,8 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
         return "not assessed"
     if name == "control_error" and np.isnan(value) and solution.converged:
         return _not_known(solution)
+    if name == "curvature" and np.isnan(value):
+        return "NOT KNOWN: it would take longer than the solution, solve again with fewer intervals"
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:

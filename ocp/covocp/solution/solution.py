@@ -38,6 +38,7 @@ from covocp.solution.covariances import all_covariances, are_semidefinite, covar
 from covocp.solution.duals import costate_of, multiplier_of
 from covocp.solution.fingerprint import Fingerprint
 from covocp.solution.origin import Origin, origin_of
+from covocp.solution.patience import longest
 from covocp.solution.reading import by_name, expression_values, name_in, other_loop
 from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
@@ -233,7 +234,7 @@ class Solution:
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
             return identities(self.extremal, *known)
-        return assess(self.extremal, self.costates, *known, self.within)
+        return assess(self.extremal, self.costates, *known, self.within, longest(self.stats))
 
     @property
     def cost_identity(self) -> float | None:

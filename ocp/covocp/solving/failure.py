@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from covocp.base.errors import SolveError
-from covocp.extremal.densities import impossible_density
-from covocp.extremal.extremal import Outcome
+from covocp.extremal.densities import impossible_density, impossible_in_phases
+from covocp.extremal.extremal import Extremal, Outcome
 from covocp.solution.solution import Solution
 from covocp.solving.decisions import bent_data, far_away
 
@@ -26,7 +28,7 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     """
     lines = [f"  {row}: {value:.6g}" for row, value in list(outcome.violations.items())[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
-    noise = _impossible(outcome)
+    noise = impossible_noises([outcome.extremal], outcome.message)
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
         f"{violated}{far_away(solution)}{bent_data(solution)}{noise}{other_way}"
@@ -36,10 +38,15 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
     )
 
 
-def _impossible(outcome: Outcome) -> str:
-    """A line on a noise along the last iterate that none can be: where it has led a run, nothing else is the reason."""
+def impossible_noises(extremals: Sequence[Extremal], said: str) -> str:
+    """A line on a noise along the last iterate that none can be: where it has led a run, nothing else is the reason.
+
+    Args:
+        extremals: of the run, one for each phase.
+        said: what is said already.
+    """
     try:
-        found = impossible_density(outcome.extremal)
+        found = impossible_density(extremals[0]) if len(extremals) == 1 else impossible_in_phases(extremals, ())
     except (RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):  # an iterate without values
         return ""
-    return "" if not found or found in outcome.message else f"\n  Along the last iterate {found}."
+    return "" if not found or found in said else f"\n  Along the last iterate {found}."

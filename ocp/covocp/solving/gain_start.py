@@ -33,6 +33,7 @@ from covocp.solution.origin import METHOD
 from covocp.solution.report import ASKED
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import with_stats
+from covocp.solving.below_error import chances_below
 from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
@@ -51,7 +52,10 @@ MET = 0.05
 def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
     """The problem with the best gain, with E for X in its conditions, and without them; none where none asks for X."""
     chosen = [with_best_gain(problem.declarations, conditions=kept) for kept in (True, False)]
-    return tuple(Problem.of(declarations) for declarations in chosen if declarations is not None)
+    problems = tuple(Problem.of(declarations) for declarations in chosen if declarations is not None)
+    for one in problems:
+        one.doubts_told = True  # of the problem that they are made from
+    return problems
 
 
 def best_gain(
@@ -116,8 +120,8 @@ def beyond(own: Declarations, best: Solution | None) -> str:
         if floor[k] > row.limit:
             t = best.t[-floor.size :][k]
             told.append(f"'{row.name}' is {floor[k]:.4g} at {t:.4g} s with E for X, above its limit {row.limit:.4g}")
-    listed = "; ".join(told)
-    return f"; no feedback takes X below E: along the nominal of the best gain {listed}" if told else ""
+    listed = "; ".join([*told, *chances_below(own, best)])
+    return f"; no feedback takes X below E: along the nominal of the best gain {listed}" if listed else ""
 
 
 def free_gain_block(statement: Statement) -> Block | None:

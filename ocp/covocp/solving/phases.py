@@ -17,6 +17,7 @@ from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
 from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
+from covocp.solving.failure import impossible_noises
 from covocp.solving.methods import METHODS, mesh_options, method_options
 from covocp.solving.phases_gain import best_gains, graded_for, meeting_conditions, told
 from covocp.solving.phases_given import intervals_of, of_each, values_of
@@ -151,8 +152,9 @@ def _finished(solution: PhasesSolution, allow_failure: bool) -> PhasesSolution:
         lines = [f"  {name}: {value:.6g}" for name, value in list(solution.violations.items())[:10]]
         violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
         named = f" of '{solution.name}'" if solution.name else ""
+        noise = impossible_noises([phase.extremal for phase in solution.phases], solution.message)
         raise SolveError(
-            f"The phases{named} were not solved by {solution.method}: {solution.message}.{violated}"
+            f"The phases{named} were not solved by {solution.method}: {solution.message}.{violated}{noise}"
             "\n  The last iterate is on this error (.solution): look at its phases, or use it as a guess.",
             solution=solution,  # type: ignore[arg-type]
             violations=solution.violations,

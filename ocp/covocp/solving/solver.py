@@ -45,6 +45,7 @@ from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.other_ways import other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
+from covocp.solving.silent import mention_silent
 from covocp.solving.suited_mesh import regraded, suits
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
@@ -146,7 +147,10 @@ class Solver:
             self._own = refining.adapted(method_options(method), self._own, asked.refine)
         self._prepared = self._ready(self._options)
         self._first, self._remade = (self._options, self._prepared), refine is not None or bool(watched(solved))
+        if not problem.doubts_told:
+            mention_silent(problem.declarations)
         mention_forgotten(problem)
+        self._problem.doubts_told = True
         mention_lengths(self.statement.guesses, self._options, self.statement)
         self._made_in = time.perf_counter() - begin  # [s], told with the first solution
 
