@@ -356,6 +356,7 @@ def test_costs_of_nothing_but_roundoff_are_no_spurious_stationary_point():
     assert "nothing to gain" in str(found)
 
 
+@pytest.mark.filterwarnings("ignore:The measurement 'm' depends on no state")  # as the printout says
 @pytest.mark.parametrize(("measured", "reason"), [(None, "nothing is measured"), (0, "what is measured tells nothing")])
 def test_without_information_nothing_is_fed_back_and_the_printout_says_so(measured, reason):
     solution = solve(uncertain_lag(measured, terminal_weight={"x": 2.0}))
