@@ -91,7 +91,8 @@ def named(name: str) -> Any:
 def members(cls: Any) -> set[str]:
     """Public methods with their arguments, properties and data by name, what a class adds to Python's in brackets."""
     found = set()
-    for name, value in vars(cls).items():
+    own = [base for base in cls.__mro__ if base.__module__.partition(".")[0] == co.__name__]
+    for name, value in [entry for base in reversed(own) for entry in vars(base).items()]:
         function = value.__func__ if isinstance(value, staticmethod) else value
         if not name.startswith("_"):
             found.add(written(name, function) if inspect.isfunction(function) else name)

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, TypeVar, cast
+from typing import Literal, cast
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import checked, text, truth
-from covocp.base.checks import as_number, caller, check_kind, check_positive
+from covocp.base.checks import as_number, caller
 from covocp.base.expressions import Given
-from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.attitude import Attitude, with_attitude
-from covocp.problem.chances import with_chance, with_chance_conditions
-from covocp.problem.checks import as_expression, check_name, check_size, column_expression
+from covocp.problem.chances import with_chance
+from covocp.problem.checks import as_expression, column_expression
 from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_closed_loop
 from covocp.problem.constraints import with_constraint
 from covocp.problem.data import data_over_time
 from covocp.problem.decisions import with_constant
-from covocp.problem.declarations import Chance, Declarations, Free, Gain, Guess, Measurement, Place
-from covocp.problem.description import sections
+from covocp.problem.declarations import Gain, Guess, Measurement, Place
+from covocp.problem.declared import Declared
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
-from covocp.problem.expected_cost import check_first_cost, expected_cost, statement_of
+from covocp.problem.expected_cost import check_first_cost, expected_cost
 from covocp.problem.instants import sampled_at
 from covocp.problem.integrals import with_integral
 from covocp.problem.matrices import plain_matrix
@@ -37,13 +36,10 @@ from covocp.problem.symbols import (
     unknown_constant,
     vector_state,
 )
-from covocp.statement.statement import Statement
-
-Entry = TypeVar("Entry")
 
 
 @methods_one_at_a_time
-class Problem:
+class Problem(Declared):
     """An optimal control problem whose state holds vectors and symmetric (covariance) matrices.
 
     Args:
@@ -57,87 +53,6 @@ class Problem:
     Raises:
         ProblemError: where the duration is not positive.
     """
-
-    def __init__(self, duration: float | Free, name: str = "") -> None:
-        """Start an empty problem."""
-        if not isinstance(duration, Free):
-            duration = check_positive("duration", duration, unit="s")
-        check_kind(name, str, "give name= in words")
-        free = duration if isinstance(duration, Free) else None
-        symbol = ca.MX.sym("duration") if isinstance(duration, Free) else duration
-        self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
-        self._statement: Statement | None = None
-        self._expanded: Declarations | None = None
-        self.doubts_told = self.duration_read = False
-
-    @classmethod
-    def of(cls, declarations: Declarations) -> Problem:
-        """A problem with these declarations."""
-        result = cls(declarations.free_duration or declarations.duration, declarations.name)
-        result._declarations = declarations
-        return result
-
-    @property
-    def declarations(self) -> Declarations:
-        """What is declared so far; once the cost is known, with conditions on probabilities as constraints."""
-        if self._expanded is None:
-            self._expanded = with_chance_conditions(self._declarations)
-        return self._expanded
-
-    @property
-    def stated(self) -> Declarations:
-        """What is declared so far, conditions on probabilities as they were stated."""
-        return self._declarations
-
-    @property
-    def chances(self) -> tuple[Chance, ...]:
-        """Conditions on probabilities as they were stated."""
-        given = self._declarations
-        return (*(c.chance for c in given.constraints if c.chance is not None), *given.chances)
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self._declarations.name
-
-    # What is declared can be read by its groups.
-    states = property(lambda self: self._declarations.states)
-    unknowns = property(lambda self: self._declarations.unknowns)
-    parameters = property(lambda self: self._declarations.parameters)
-    controls = property(lambda self: self._declarations.controls)
-    matrices = property(lambda self: self._declarations.matrices)
-    rates = property(lambda self: self._declarations.rates)
-    measurements = property(lambda self: self._declarations.measurements)
-    constraints = property(lambda self: self._declarations.constraints)
-    cost = property(lambda self: self._declarations.cost)
-    expected = property(lambda self: self._declarations.expected)
-    expansion = property(lambda self: self._declarations.expansion)
-    free_duration = property(lambda self: self._declarations.free_duration)
-
-    def __repr__(self) -> str:
-        """What is declared, by name."""
-        groups = ((kind, getattr(self._declarations, kind)) for kind in ("states", "unknowns", "controls", "matrices"))
-        listed = "".join(f", {kind} {', '.join(q.name for q in group)}" for kind, group in groups if group)
-        return f"Problem('{self.name}'{listed})"
-
-    def __str__(self) -> str:
-        """What print shows: symbols with their data, and the equations in their names."""
-        return as_text(sections(self))
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows: the same tables."""
-        return as_html(sections(self))
-
-    @property
-    def time(self) -> ca.MX:
-        """Symbol of the running time [s]."""
-        return self._declarations.time
-
-    @property
-    def duration(self) -> Any:
-        """Symbol of the terminal time [s], or its number where it is fixed."""
-        self.duration_read = self.duration_read or self.free_duration is None
-        return self._declarations.duration
 
     @checked(unit=text)
     def state(
@@ -605,28 +520,3 @@ class Problem:
         """
         given = {"probability": probability, "joint": joint, "smallest": smallest}
         self._change(with_chance(self._declarations, expression, lower, upper, at, name, **given))
-
-    def statement(self) -> Statement:
-        """The frozen problem that solvers read; built once and kept until something is added.
-
-        Raises:
-            ProblemError: dynamics or cost missing, symbols of another problem, measurement noise singular.
-        """
-        if self._statement is None:
-            self._statement = statement_of(self.declarations)
-        return self._statement
-
-    def _declare(self, name: str, size: Given) -> int:
-        """Check that the name is new and the size sensible."""
-        check_name(name, list(self._declarations.taken))
-        return check_size(name, size)
-
-    def _add(self, group: str, entry: Entry) -> Entry:
-        """One more declaration in a group."""
-        self._change(self._declarations.adding(**{group: entry}))
-        return entry
-
-    def _change(self, declarations: Declarations) -> None:
-        """Other declarations from now on: another statement, and other doubts about it."""
-        self._declarations, self._statement, self.doubts_told = declarations, None, False
-        self._expanded = None

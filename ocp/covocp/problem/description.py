@@ -20,7 +20,7 @@ from covocp.statement.statement import entries_of, entry_names, half_names
 from covocp.statement.time_data import in_words
 
 if TYPE_CHECKING:
-    from covocp.problem.builder import Problem
+    from covocp.problem.declared import Declared
 
 # Entries of a vector or a matrix that are shown one by one, at most.
 MOST_ENTRIES = 24
@@ -31,7 +31,7 @@ FILTER = "F E + E F' + Q"
 UPDATE = " - E M' U^-1 M E"
 
 
-def sections(problem: Problem) -> list[Section]:
+def sections(problem: Declared) -> list[Section]:
     """A problem, complete or not, in sentences and tables.
 
     Args:
@@ -69,7 +69,7 @@ class _Written:
     definitions: tuple[tuple[str, str], ...]
 
     @staticmethod
-    def of(problem: Problem) -> _Written:
+    def of(problem: Declared) -> _Written:
         """Data and equations have names of intermediate results in common."""
         expressions = dict(_expressions(problem))
         vectors: list[Any] = [*problem.states, *problem.unknowns, *problem.parameters, *problem.controls]
@@ -100,7 +100,7 @@ class _Written:
         return [f"[{', '.join(row)}]" for row in rows]
 
 
-def _expressions(problem: Problem) -> Iterator[tuple[tuple[str, str], Any]]:
+def _expressions(problem: Declared) -> Iterator[tuple[tuple[str, str], Any]]:
     """All expressions of a problem by kind and name."""
     for state in problem.states:
         yield ("initial", state.name), state.initial
@@ -171,7 +171,7 @@ def _ranges(lower: Array, upper: Array) -> list[str]:
     return result
 
 
-def _head(problem: Problem) -> Section:
+def _head(problem: Declared) -> Section:
     free = problem.free_duration
     duration = f"{number(problem.declarations.duration)} s" if free is None else f"free, {_ranges_of(free)}"
     return [Sentence(f"{problem.name or 'problem without a name'}: duration {duration}")]
@@ -183,7 +183,7 @@ def _ranges_of(free: Any) -> str:
     return f"at least {number(free.lower)} s{upper}, guess {number(free.guess)} s"
 
 
-def _states(problem: Problem, written: _Written) -> Section:
+def _states(problem: Declared, written: _Written) -> Section:
     rows = []
     for q in (state for state in problem.states if state.role == "moving"):
         initial, final = _free(written("initial", q.name)), _free(written("final", q.name))
@@ -199,7 +199,7 @@ def _filled(cells: list[str], size: int) -> list[str]:
     return [*cells, *[""] * (size - len(cells))]
 
 
-def _decisions(problem: Problem) -> Section:
+def _decisions(problem: Declared) -> Section:
     rows = []
     for q in decisions_of(problem.declarations):
         guess: Any = q.guess
@@ -208,12 +208,12 @@ def _decisions(problem: Problem) -> Section:
     return _table(["decision", "unit", "bounds", "guess"], rows)
 
 
-def _integrals(problem: Problem, written: _Written) -> Section:
+def _integrals(problem: Declared, written: _Written) -> Section:
     rows = [[q.name, q.unit, *written("rate", q.name)] for q in integrals_of(problem.declarations)]
     return _table(["integral", "unit", "of"], rows)
 
 
-def _data(problem: Problem) -> Section:
+def _data(problem: Declared) -> Section:
     """Data over time: how many values, over which times, in which range."""
     rows = []
     for q in problem.declarations.data:
@@ -224,7 +224,7 @@ def _data(problem: Problem) -> Section:
     return _table(["data", "unit", "over time", "range"], rows)
 
 
-def _unknowns(problem: Problem, written: _Written) -> Section:
+def _unknowns(problem: Declared, written: _Written) -> Section:
     rows = []
     for q in problem.unknowns:
         columns = (entry_names((q,)), [q.unit] * q.size, [number(v) for v in q.mean])
@@ -240,7 +240,7 @@ def _values(kind: str, entries: Sequence[tuple[Any, list[str]]], what: str) -> S
     return _table([kind, "unit", what], rows)
 
 
-def _matrices(problem: Problem, written: _Written) -> Section:
+def _matrices(problem: Declared, written: _Written) -> Section:
     """Symmetric matrices: their entries; of large ones, and where the others are zero, those of the diagonal."""
     rows = []
     matrices = [matrix for matrix in problem.matrices if matrix.role == "moving"]
@@ -261,7 +261,7 @@ def _matrices(problem: Problem, written: _Written) -> Section:
     return _table([" or ".join(kinds), "unit", "at 0", "at T", "lower bound"], rows)
 
 
-def _rates(problem: Problem, written: _Written) -> Section:
+def _rates(problem: Declared, written: _Written) -> Section:
     """Rates with the densities of their noise, and what the letters of the filter's mean."""
     rows, notes = [], list[Part]()
     for state in (q for q in problem.states if q.role == "moving"):
@@ -294,7 +294,7 @@ def _filter_note(labels: tuple[str, ...], measured: bool) -> Sentence:
     return Sentence(f"{slopes} by {names}; Q{' and U' if measured else ''}: noise densities", "")
 
 
-def _measurements(problem: Problem, written: _Written) -> Section:
+def _measurements(problem: Declared, written: _Written) -> Section:
     rows = []
     for q in problem.measurements:
         values = written("measurement", q.name)
@@ -310,7 +310,7 @@ def _measurements(problem: Problem, written: _Written) -> Section:
     return _table(titles, rows, code=(2,))
 
 
-def _instants(problem: Problem, instants: tuple[float, ...]) -> str:
+def _instants(problem: Declared, instants: tuple[float, ...]) -> str:
     """When a measurement is taken, in a few words."""
     if not instants:
         return ""
@@ -323,7 +323,7 @@ def _instants(problem: Problem, instants: tuple[float, ...]) -> str:
     return f"at {listed}{', ...' if times.size > MOST_INSTANTS else ''} {unit}"
 
 
-def _weights(problem: Problem) -> list[tuple[str, Any]]:
+def _weights(problem: Declared) -> list[tuple[str, Any]]:
     """The weights of an expected cost, by symbol or as they were given."""
     expected = problem.expected
     if expected is None:
@@ -331,7 +331,7 @@ def _weights(problem: Problem) -> list[tuple[str, Any]]:
     return [("weight of a miss", expected.terminal_weight), ("control weight", expected.control_weight)]
 
 
-def _cost(problem: Problem, written: _Written) -> Section:
+def _cost(problem: Declared, written: _Written) -> Section:
     if ("running", "") not in written.entries:
         return [Sentence("no cost yet: minimize() or minimize_expected()")]
     words = {"terminal": "at T", "running": "integral of"}
@@ -354,7 +354,7 @@ def _cost(problem: Problem, written: _Written) -> Section:
     return _table(["minimise the expected", ""], rows, code=(1,))
 
 
-def _constraints(problem: Problem, written: _Written) -> Section:
+def _constraints(problem: Declared, written: _Written) -> Section:
     rows = []
     places = {"path": "always", "initial": "at 0", "final": "at T"}
     for q in [*(c for c in problem.constraints if c.chance is None), *problem.chances]:
@@ -376,7 +376,7 @@ def _constraints(problem: Problem, written: _Written) -> Section:
     return [*_table(["constraint", "", "", ""], rows, code=(2,)), *_chance_notes(problem)]
 
 
-def _moment(problem: Problem, constraint: Constraint) -> str:
+def _moment(problem: Declared, constraint: Constraint) -> str:
     """The instant at which a constraint holds, in a few words."""
     assert constraint.instant is not None
     free = problem.free_duration is not None
@@ -384,7 +384,7 @@ def _moment(problem: Problem, constraint: Constraint) -> str:
     return f"at {number(time, 4)} {'T' if free else 's'}{'' if constraint.late else ', before'}"
 
 
-def _chance_notes(problem: Problem) -> Section:
+def _chance_notes(problem: Declared) -> Section:
     """By which spread the probabilities are meant, and how several rows share their risk."""
     chances = problem.chances
     if not chances:
