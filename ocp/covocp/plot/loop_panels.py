@@ -10,8 +10,9 @@ import numpy as np
 from covocp.base.expressions import Given
 from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, filter_unit, ratio_unit, shortened, unit_of
 from covocp.solution.solution import Solution
+from covocp.statement.entries import entry_names, error_names
 from covocp.statement.names import block_of
-from covocp.statement.statement import Block, entry_names, error_names
+from covocp.statement.statement import Block
 
 # What may be drawn beside the symbols of the problem: root mean squares, gains of feedback and filter, covariances.
 RMS, FILTER = "rms", "K"

@@ -19,8 +19,9 @@ from covocp.plot.curves import GAIN, SEPARATE_ENTRIES, Curve, Drawn, Panel, prod
 from covocp.plot.loop_panels import COVARIANCES, FILTER, RMS, WORDS, gain, knows, rms
 from covocp.plot.paths import over_panels
 from covocp.solution.solution import Solution
+from covocp.statement.entries import entry_names
 from covocp.statement.names import block_of, chosen_entry, name_of, sizes_of, split_entry
-from covocp.statement.statement import Block, Statement, entry_names
+from covocp.statement.statement import Block, Statement
 from covocp.statement.time_data import in_words
 
 # Matrices up to this size are shown whole, larger ones by their diagonal.

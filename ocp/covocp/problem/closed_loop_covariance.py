@@ -27,7 +27,7 @@ from covocp.problem.checks import check_name
 from covocp.problem.declarations import Control, Declarations, Expansion, Expected, Gain, State, Unknown
 from covocp.problem.estimation_covariance import block_between, with_estimation
 from covocp.problem.matrices import Spread
-from covocp.statement.statement import entry_names, error_names, error_size
+from covocp.statement.entries import entry_names, error_names, error_size
 
 SPREAD = "X"
 # Variances are not smaller than this in expressions: a root has a slope where nothing scatters, as at the start.

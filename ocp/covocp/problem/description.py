@@ -16,7 +16,7 @@ from covocp.problem.decisions import decisions_of
 from covocp.problem.declarations import Chance, Constraint
 from covocp.problem.formulas import formulas
 from covocp.problem.integrals import integrals_of
-from covocp.statement.statement import entries_of, entry_names, half_names
+from covocp.statement.entries import entries_of, entry_names, half_names
 from covocp.statement.time_data import in_words
 
 if TYPE_CHECKING:

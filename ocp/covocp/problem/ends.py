@@ -14,7 +14,8 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.problem.decisions import check_matrix, decisions_of
 from covocp.problem.declarations import Constraint, Declarations, Place
-from covocp.statement.statement import Tied, entry_names, half_names
+from covocp.statement.entries import entry_names, half_names
+from covocp.statement.statement import Tied
 
 OUTPUTS = ("initial_state", "final_state", "initial_matrices", "final_matrices")
 

@@ -15,7 +15,7 @@ from covocp.problem.checks import check_name
 from covocp.problem.declarations import Control, Declarations, State, Unknown
 from covocp.problem.matrices import Matrix, declare_matrix
 from covocp.problem.tangents import tangent_slope
-from covocp.statement.statement import error_names, error_size
+from covocp.statement.entries import error_names, error_size
 
 AugmentedEntry = State | Unknown
 

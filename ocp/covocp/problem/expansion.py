@@ -15,7 +15,7 @@ from covocp.problem.checks import check_dynamics
 from covocp.problem.declarations import Declarations, Expansion, Expected
 from covocp.problem.rates import process_noise
 from covocp.problem.tangents import Moved, drift, moved, tangent_rate
-from covocp.statement.statement import entry_names, error_size
+from covocp.statement.entries import entry_names, error_size
 
 
 def expand(problem: Declarations, expected: Expected, later: Expr = None) -> Expansion:

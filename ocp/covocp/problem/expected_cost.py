@@ -58,8 +58,9 @@ from covocp.problem.integrals import check_expected
 from covocp.problem.matrices import Backward, declare_matrix
 from covocp.problem.measurement_information import inverse_density
 from covocp.problem.samples import ESTIMATE as ESTIMATE
+from covocp.statement.entries import error_names, error_size
 from covocp.statement.names import name_of, split_entry
-from covocp.statement.statement import Statement, error_names, error_size
+from covocp.statement.statement import Statement
 
 # Names of what the derived problem adds to the user's symbols.
 FEEDBACK, GAIN = "S", "C"

@@ -29,7 +29,8 @@ from covocp.problem.samples import measured_blocks, samples
 from covocp.problem.stacked import Stacked, stack
 from covocp.problem.table_ranges import table_ranges
 from covocp.statement.chances import ChanceLimits
-from covocp.statement.statement import Block, Duration, Loop, Statement, error_names, error_size
+from covocp.statement.entries import error_names, error_size
+from covocp.statement.statement import Block, Duration, Loop, Statement
 
 
 def freeze(problem: Declarations, *, part: bool = False) -> Statement:

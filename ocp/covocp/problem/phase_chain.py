@@ -21,7 +21,8 @@ from covocp.problem.matrices import Matrix
 from covocp.problem.phase_chances import with_phase_chances
 from covocp.problem.phase_feedback import WEIGHT, deviations, in_phase, tangent, with_feedback
 from covocp.statement.chain import Chain, Link
-from covocp.statement.statement import Statement, entries_of, entry_names, error_size
+from covocp.statement.entries import entries_of, entry_names, error_size
+from covocp.statement.statement import Statement
 
 
 def chain_of(name: str, names: Sequence[str], phases: Sequence[Declarations], jumps: Sequence[Any]) -> Chain:

@@ -29,7 +29,8 @@ from covocp.problem.closed_loop_covariance import check_no_feedback, free_gain, 
 from covocp.problem.declarations import Declarations, Gain, Parameter
 from covocp.problem.expansion import slope_by
 from covocp.problem.expected_cost import FEEDBACK, check_random, derive
-from covocp.statement.statement import Statement, error_size
+from covocp.statement.entries import error_size
+from covocp.statement.statement import Statement
 
 # Name of the parameter of a phase that stands for S where the next one begins.
 WEIGHT = f"{FEEDBACK}(T)"

@@ -12,7 +12,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import pack_symbolic
 from covocp.problem.checks import as_expression, find_name
 from covocp.problem.declarations import Declarations, Dynamics
-from covocp.statement.statement import error_size
+from covocp.statement.entries import error_size
 
 
 def with_rate(own: Declarations, symbol: Given, rate: Given, noise: Given) -> Declarations:

@@ -9,7 +9,7 @@ import casadi as ca
 
 from covocp.base.expressions import Expr
 from covocp.problem.declarations import Declarations
-from covocp.statement.statement import error_size
+from covocp.statement.entries import error_size
 
 
 def tangent_slope(expression: Expr, entry: Any) -> Any:

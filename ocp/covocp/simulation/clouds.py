@@ -31,7 +31,7 @@ from covocp.plot.figure import (
 from covocp.plot.legends import place_legend, place_title, plain_text
 from covocp.plot.paths import outline
 from covocp.simulation.rows import places
-from covocp.statement.statement import error_names
+from covocp.statement.entries import error_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

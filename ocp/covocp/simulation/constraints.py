@@ -28,7 +28,8 @@ from covocp.simulation.run_parts import Run, part
 from covocp.simulation.schedule import Nominal
 from covocp.solution.solution import Solution
 from covocp.statement.chances import ChanceLimits
-from covocp.statement.statement import Conditions, Statement, entry_names
+from covocp.statement.entries import entry_names
+from covocp.statement.statement import Conditions, Statement
 from covocp.transcription.scales import limit_units, magnitudes
 
 Place = Literal["path", "initial", "final", "inside"]

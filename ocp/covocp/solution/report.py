@@ -15,7 +15,8 @@ from covocp.solution.chances import chance_section
 from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.residual_section import residual_section
-from covocp.statement.statement import Block, Role, entry_names, error_names
+from covocp.statement.entries import entry_names, error_names
+from covocp.statement.statement import Block, Role
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -42,8 +42,9 @@ from covocp.solution.patience import longest
 from covocp.solution.reading import by_name, expression_values, name_in, other_loop
 from covocp.solution.sample import Sample, asked_times
 from covocp.statement.conditions import Conditions
+from covocp.statement.entries import entry_names
 from covocp.statement.names import block_of, entry_values, unknown_name
-from covocp.statement.statement import Block, Statement, entry_names
+from covocp.statement.statement import Block, Statement
 from covocp.transcription.before_reading import ESTIMATE
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory

@@ -6,7 +6,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.solution.solution import Solution
-from covocp.statement.statement import entry_names
+from covocp.statement.entries import entry_names
 
 # A decision or a control (in any unit) that is so many times its magnitude where no bound stops it has no end in sight.
 FAR, FAR_CONTROL = 1e6, 1e12

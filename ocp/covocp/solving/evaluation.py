@@ -34,9 +34,10 @@ from covocp.solving.gain_start import free_gain_block, gain_entries
 from covocp.solving.missed import check_has_loop, missed_by_loop, told
 from covocp.solving.not_finite import with_shortest_steps
 from covocp.solving.unused import mention_forgotten
+from covocp.statement.entries import entry_names
 from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import name_of, stacked_parameters
-from covocp.statement.statement import Statement, entry_names
+from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import INTERVALS, Mesh, Options, control_places

@@ -9,8 +9,9 @@ from typing import Any
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
+from covocp.statement.entries import error_names, error_size
 from covocp.statement.names import name_of, sizes_of, split_entry
-from covocp.statement.statement import Block, error_names, error_size
+from covocp.statement.statement import Block
 
 
 def augmented_blocks(blocks: Iterable[Block], augmented: tuple[str, ...]) -> tuple[Block, ...]:

@@ -11,7 +11,7 @@ and leaves out those that it cannot depend on. `parameters` stacks the known par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -21,7 +21,7 @@ import numpy as np
 
 from covocp.base.expressions import Expr
 from covocp.base.geometry import Geometry
-from covocp.base.matrices import Array, half_indices, half_length
+from covocp.base.matrices import Array, half_length
 from covocp.base.pickling import not_pickled
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
@@ -29,6 +29,7 @@ from covocp.statement.chances import ChanceLimits
 from covocp.statement.conditions import Columns as Columns
 from covocp.statement.conditions import Conditions as Conditions
 from covocp.statement.conditions import Inside
+from covocp.statement.entries import entries_of, entry_names
 from covocp.statement.time_data import TimeData, kinks
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
@@ -462,43 +463,6 @@ def _replaced(column: Expr, entries: tuple[int, ...], values: Expr) -> Any:
     for k, value in zip(entries, ca.vertsplit(values), strict=True):
         rows[k] = value
     return ca.vertcat(*rows)
-
-
-def entry_names(blocks: Iterable[Any]) -> tuple[str, ...]:
-    """Names of the entries of some stacked vectors; those of a quaternion are told from the rows of its error."""
-    return tuple(
-        name
-        for block in blocks
-        for name in (
-            [f"{block.name} q{i}" for i in range(block.size)]
-            if getattr(block, "tangent", 0)
-            else _numbered(block.name, block.size)
-        )
-    )
-
-
-def error_names(blocks: Iterable[Any]) -> tuple[str, ...]:
-    """Names of the rows of a covariance of some states: the entries of a vector, of others those of the tangent."""
-    return tuple(name for block in blocks for name in _numbered(block.name, error_size(block)))
-
-
-def error_size(block: Any) -> int:
-    """Rows of a covariance that a declaration or a block has."""
-    return int(getattr(block, "tangent", 0) or block.size)
-
-
-def _numbered(name: str, size: int) -> list[str]:
-    return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
-
-
-def entries_of(matrix: Any) -> list[str]:
-    """Names of the entries of the half-vector of a declared matrix or its block; an integral is one number."""
-    return [matrix.name] if matrix.role == "integral" else half_names(matrix.name, matrix.labels)
-
-
-def half_names(name: str, labels: tuple[str, ...]) -> list[str]:
-    """Names of the entries of the half-vector of a matrix, such as 'E[x, b]'."""
-    return [f"{name}[{labels[i]}, {labels[j]}]" for i, j in zip(*half_indices(len(labels)), strict=True)]
 
 
 @lru_cache(maxsize=16)

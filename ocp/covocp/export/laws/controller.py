@@ -35,7 +35,8 @@ from covocp.export.laws.law import LARGEST, QUATERNION, Law, Port, flat, span, s
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
 from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, Piece, next_piece, predicted, solved
 from covocp.export.laws.trajectory import times
-from covocp.statement.statement import Statement, entry_names, error_names
+from covocp.statement.entries import entry_names, error_names
+from covocp.statement.statement import Statement
 
 # What is kept of a step that is under way, and after an instant at which a reading did not come.
 ABOUT_KEPT = {

@@ -11,8 +11,9 @@ from covocp.base.errors import warn_user
 from covocp.base.expressions import Expr
 from covocp.export.laws.history import History
 from covocp.export.text.names import identifier
+from covocp.statement.entries import entry_names
 from covocp.statement.names import Limits
-from covocp.statement.statement import Statement, entry_names
+from covocp.statement.statement import Statement
 
 # Share of its size by which a nominal control may lie outside without a word: solvers widen bounds by less.
 ROUNDING = 1e-6

@@ -46,7 +46,7 @@ from covocp.export.laws.law import RETURNED, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import limit_constants, limits_notes, limits_text
 from covocp.export.laws.prediction import CONTINUE
 from covocp.solution.phases import PhasesSolution
-from covocp.statement.statement import entry_names
+from covocp.statement.entries import entry_names
 
 ABOUT_PHASES = (
     "Through several phases: estimate, control and measurement are those of the phase that the time is in, the first "
