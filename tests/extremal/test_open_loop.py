@@ -53,7 +53,7 @@ def flown(solution: co.Solution, estimated: bool = False) -> tuple[float, float]
 
 
 @pytest.mark.parametrize(
-    ("T", "intervals", "estimated"), [(2.0, 25, False), (4.0, 25, False), (2.0, 25, True), (4.0, 50, True)]
+    ("T", "intervals", "estimated"), [(2.0, 25, False), (4.0, 25, False), (2.0, 25, True), (4.0, 60, True)]
 )
 def test_nodes_and_cost_are_told_as_they_fly(T, intervals, estimated):
     """With steps that are too long; what is told is by steps of half the length, so a little less."""

@@ -47,11 +47,13 @@ EXPORT int NAME(passage_tangent)(
     const Passage *p = &k->p;
     const size_t square = (size_t)p->n * p->n, turned = (size_t)p->r * p->n + 2 * square;
     const size_t all = ((size_t)p->n * (p->n + 1) / 2) * p->ends, d = sizeof(double);
-    const int first_time = !k->direction;
+    if (!k->direction) {
+        if (made(k, &k->direction, numbers(p))) return 1;
+        memset(k->direction, 0, d * numbers(p)); /* compared before it is first written */
+    }
     if (made(k, &k->moved, (size_t)p->moves * 5 * square) || made(k, &k->turned, (size_t)p->reads * turned) ||
-        made(k, &k->direction, numbers(p)) || made(k, &k->shifted, all) || keep_stages(k))
+        made(k, &k->shifted, all) || keep_stages(k))
         return 1;
-    if (first_time) memset(k->direction, 0, d * numbers(p)); /* compared before it is first written */
     run(k, p->n, first, h1, h2, told, kicks);
     tangents(k, p->n, d_first, d_h1, d_h2, d_told, d_kicks);
     if (d_after) memcpy(d_after, k->shifted, d * all);

@@ -60,8 +60,8 @@ static void carry(
         const double *from = stage ? moved + (stage % 2 ? 0 : all) : D;
         double *to = moved + (stage % 2 ? all : 0);
         for (int i = 0; i < s->rows; ++i) {
-            const double *RESTRICT old = D + (size_t)i * wide, *RESTRICT before = (stage ? sum : D) + (size_t)i * wide;
-            double *RESTRICT total = (stage < 3 ? sum : to) + (size_t)i * wide, *RESTRICT next = to + (size_t)i * wide;
+            const double *old = D + (size_t)i * wide, *before = (stage ? sum : D) + (size_t)i * wide;
+            double *total = (stage < 3 ? sum : to) + (size_t)i * wide, *next = to + (size_t)i * wide;
             row_of(s, i, A + (size_t)stage * s->nnz, places, from, active, wide, K);
             for (int j = 0; j < active; ++j) total[j] = before[j] + weight[stage] * K[j];
             for (int j = 0; stage < 3 && j < active; ++j) next[j] = old[j] + reach[stage] * K[j];

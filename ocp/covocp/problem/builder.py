@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.arguments import checked, text, truth
-from covocp.base.checks import as_number, caller
+from covocp.base.checks import as_number, caller, check_kind, check_positive
 from covocp.base.expressions import Given
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.attitude import Attitude, with_attitude
@@ -19,7 +19,7 @@ from covocp.problem.closed_loop_covariance import ClosedLoopCovariance, with_clo
 from covocp.problem.constraints import with_constraint
 from covocp.problem.data import data_over_time
 from covocp.problem.decisions import with_constant
-from covocp.problem.declarations import Gain, Guess, Measurement, Place
+from covocp.problem.declarations import Declarations, Free, Gain, Guess, Measurement, Place
 from covocp.problem.declared import Declared
 from covocp.problem.estimation_covariance import EstimationCovariance, with_estimation
 from covocp.problem.expected_cost import check_first_cost, expected_cost
@@ -53,6 +53,17 @@ class Problem(Declared):
     Raises:
         ProblemError: where the duration is not positive.
     """
+
+    def __init__(self, duration: float | Free, name: str = "") -> None:
+        """Start an empty problem."""
+        if not isinstance(duration, Free):
+            duration = check_positive("duration", duration, unit="s")
+        check_kind(name, str, "give name= in words")
+        free = duration if isinstance(duration, Free) else None
+        symbol = ca.MX.sym("duration") if isinstance(duration, Free) else duration
+        self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
+        self._statement = self._expanded = None
+        self.doubts_told = self.duration_read = False
 
     @checked(unit=text)
     def state(

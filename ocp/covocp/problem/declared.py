@@ -6,7 +6,6 @@ from typing import Any, Self, TypeVar
 
 import casadi as ca
 
-from covocp.base.checks import check_kind, check_positive
 from covocp.base.expressions import Given
 from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
@@ -27,17 +26,15 @@ class Declared:
     Arguments, attributes and errors are those of `Problem`.
     """
 
+    _declarations: Declarations
+    _statement: Statement | None
+    _expanded: Declarations | None
+    doubts_told: bool
+    duration_read: bool
+
     def __init__(self, duration: float | Free, name: str = "") -> None:
-        """Start an empty problem."""
-        if not isinstance(duration, Free):
-            duration = check_positive("duration", duration, unit="s")
-        check_kind(name, str, "give name= in words")
-        free = duration if isinstance(duration, Free) else None
-        symbol = ca.MX.sym("duration") if isinstance(duration, Free) else duration
-        self._declarations = Declarations(name=name, duration=symbol, free_duration=free)
-        self._statement: Statement | None = None
-        self._expanded: Declarations | None = None
-        self.doubts_told = self.duration_read = False
+        """Of `Problem`, which begins without declarations."""
+        raise NotImplementedError
 
     @classmethod
     def of(cls, declarations: Declarations) -> Self:

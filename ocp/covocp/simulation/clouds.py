@@ -231,7 +231,7 @@ def draw_cloud(
     shown = values[:DOTS]
     axes.plot(shown[:, 0], shown[:, 1], linestyle="none", marker=".", markersize=1.8, color=GREY, alpha=0.5, zorder=1)
     mean = values.sum(axis=0) / max(1, len(values))
-    own = values.T @ values / max(1, len(values)) - np.outer(mean, mean)
+    own = (values - mean).T @ (values - mean) / max(1, len(values))
     for k in sigmas:
         axes.plot(*outline(predicted, k), color=PREDICTED, linewidth=1.4, zorder=3)
         axes.plot(*(mean[:, None] + outline(own, k)), color=SAMPLE, linewidth=1.2, linestyle=DASHED, zorder=3)

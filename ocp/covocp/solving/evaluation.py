@@ -262,8 +262,9 @@ def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]
         name = name_of(key, statement.symbols, names, missing_ok=True)
         if not name:
             kinds = "control or decision" if decisions else "control"
+            named = f"'{statement.name}'" if statement.name else "the problem"
             raise ProblemError(
-                f"The nominal gives '{key}'"[:100] + f", and '{statement.name}' has no {kinds} of that name.",
+                f"The nominal gives '{key}'"[:100] + f", and {named} has no {kinds} of that name.",
                 expected=f"a symbol or name of {', '.join(names)}" if names else f"nothing: it has no {kinds}",
                 received=repr(key)[:100],
                 remedy=spelling(key, names, "correct or remove it"),
