@@ -213,3 +213,39 @@ def test_what_is_not_known_of_a_solution_is_said(monkeypatch):
     solution = solve(quadratic(0.0, 0.5, 1.0), intervals=10)
     assert np.isnan(solution.optimality.curvature)
     assert "NOT KNOWN: it would take longer" in " ".join(str(solution).split())
+
+
+def beside_a_bound():
+    """J = (int u^2 - 2.5 (int u a)^2 - (int u b)^2 + 30 (int u c)^2)/2, u >= 0: at u = 0 no bound has a multiplier."""
+    ocp = co.Problem(duration=1.0)
+    y, u = ocp.state("y", 3, initial=[0.0, 0.0, 0.0]), ocp.control("u", lower=0.0, guess=lambda s: 0 * s)
+    turn = 2 * np.pi * ocp.time
+    ocp.dynamics(y, u * ca.vertcat(ca.cos(turn), 1 - 0.6 * ca.cos(2 * turn), ca.cos(3 * turn)))
+    ocp.minimize(running=0.5 * u**2, terminal=0.5 * (-2.5 * y[0] ** 2 - y[1] ** 2 + 30 * y[2] ** 2))
+    return ocp
+
+
+def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch):
+    """Of directions that bounds allow the descending one is found after some steps: without them nothing is known."""
+    extremal = at_rest(beside_a_bound(), 40)
+    found = smallest_curvature(extremal)
+    s, u = extremal.mesh.nodes, found.direction.ravel()
+    fine = np.linspace(0.0, 1.0, 4001)
+    v = np.interp(fine, s, u / np.abs(u).max())
+    turn = 2 * np.pi * fine
+    a, b, c = (np.trapezoid(v * w, fine) for w in (np.cos(turn), 1 - 0.6 * np.cos(2 * turn), np.cos(3 * turn)))
+    assert v.min() >= -1e-9
+    assert np.trapezoid(v**2, fine) - 2.5 * a**2 - b**2 + 30 * c**2 < 0  # so it is a saddle
+    products = []
+    applied = curvature._applied
+
+    def counted(product, given):
+        once = applied(product, given)
+        return lambda direction: products.append(1) or once(direction)
+
+    monkeypatch.setattr(curvature, "_applied", counted)
+    monkeypatch.setattr(curvature, "_seconds", lambda *_: 1.0)
+    for most in (9.01, 10.0, 12.0, 20.0, 40.0, 80.0):
+        products.clear()
+        assert smallest_curvature(extremal, most).verdict in ("unknown", "saddle")
+        assert len(products) <= most

@@ -110,16 +110,18 @@ def smallest_curvature(extremal: Extremal, seconds: float = np.inf) -> Curvature
     operator = reduced.operator(strict)
     if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
         return None
-    left = seconds / reduced.seconds - extremal.statement.nu  # products; some were needed for the units
-    steps = int(np.clip(left, LEAST_STEPS, LANCZOS_STEPS))
-    values, vectors, error, known = _extremes(operator, strict, steps)
-    if not known and steps < LANCZOS_STEPS and values[0] >= -error:  # a negative one is there whatever else is
+    left = seconds / reduced.seconds - extremal.statement.nu  # some were needed for the units
+    products = _Products(left=max(left, LEAST_STEPS))
+    values, vectors, error, known = _extremes(operator, strict, products)
+    if not known and values[0] >= -error:  # a negative one is there whatever else is
         return _unknown(extremal)
     value, v = float(values[0]), vectors[:, 0]
     largest = float(np.abs(values).max())
     error = max(error, SOLVED * largest)
     if value < -error and reduced.loose.shape[0]:
-        value, v = _in_the_cone(reduced, v, value, largest, error, steps)
+        value, v, known = _in_the_cone(reduced, v, value, largest, error, products)
+        if not known and value >= -error:
+            return _unknown(extremal)
     z, u = reduced.tangents.forward(reduced.unscaled(v)[:, None])
     start = np.zeros(extremal.statement.nx)
     moving = list(reduced.tangents.start)
@@ -137,8 +139,22 @@ def _unknown(extremal: Extremal) -> Curvature:
     return Curvature(value=np.nan, largest=np.nan, error=np.inf, direction=nothing[0], start=nothing[1])
 
 
+@dataclass(kw_only=True)
+class _Products:
+    """How many products with the Hessian may still be waited for, in all parts of the search together."""
+
+    left: float
+
+    def steps(self, most: int) -> int:
+        """Steps of one product each that are left, and no more than some number."""
+        return int(min(most, max(self.left, 0.0)))
+
+
 class _Extremes(NamedTuple):
-    """Ritz values (rising) and vectors on a subspace, how far the operator on it was from symmetric, whether known."""
+    """Ritz values (rising) and vectors on a subspace, how far the operator on it was from symmetric, whether known.
+
+    Those after all steps count as known: only products that are missing leave it open.
+    """
 
     values: Array
     vectors: Array
@@ -146,7 +162,7 @@ class _Extremes(NamedTuple):
     known: bool
 
 
-def _extremes(operator: Callable[[Array], Array], basis: Array, steps: int = LANCZOS_STEPS) -> _Extremes:
+def _extremes(operator: Callable[[Array], Array], basis: Array, products: _Products) -> _Extremes:
     """Ritz pairs of an operator on a subspace after some Lanczos steps."""
 
     def known(value: float, residual: float, largest: float) -> bool:
@@ -154,47 +170,54 @@ def _extremes(operator: Callable[[Array], Array], basis: Array, steps: int = LAN
 
     order = np.arange(1.0, basis.shape[1] + 1.0)
     start = np.modf(order**2 * GOLDEN)[0] - 0.5  # like random numbers: across no direction
+    steps = products.steps(LANCZOS_STEPS)
+    if not steps:
+        return _Extremes(np.array([np.inf]), np.zeros((basis.shape[0], 1)), 0.0, False)
     found = krylov(operator, start, steps, known)
-    settled = found.values.size == start.size or found.beside[-1] == 0.0
+    products.left -= found.values.size
+    settled = found.values.size == start.size or found.beside[-1] == 0.0 or steps == LANCZOS_STEPS
     settled = settled or known(float(found.values[0]), found.residual, float(np.abs(found.values).max()))
     return _Extremes(found.values, np.asarray(basis @ found.vectors), SAFETY * found.asymmetry, bool(settled))
 
 
 def _in_the_cone(
-    reduced: _Reduced, v: Array, value: float, largest: float, error: float, steps: int
-) -> tuple[float, Array]:
-    """The smallest curvature found among the directions that constraints without a multiplier allow.
+    reduced: _Reduced, v: Array, value: float, largest: float, error: float, products: _Products
+) -> tuple[float, Array, bool]:
+    """The smallest curvature found among the directions that constraints without a multiplier allow; whether known.
 
     Negative only with a direction that shows it: the direction itself or its opposite, one that keeps those constraints
-    as they are, or one that descends into the cone they leave.
+    as they are, or one that descends into the cone they leave. That there is none is known only after all steps.
     """
     rows = reduced.loose / np.maximum(np.linalg.norm(reduced.loose, axis=1), np.finfo(float).tiny)[:, None]
     for sign in (1.0, -1.0):
         if (rows @ (sign * v) >= -CONE_MISS).all():
-            return value, sign * v
+            return value, sign * v, True
     basis = reduced.null_space(np.vstack([reduced.strict, reduced.loose]))
-    best, kept = np.inf, np.zeros_like(v)
+    best, kept, known = np.inf, np.zeros_like(v), True
     if basis.shape[1]:
-        values, vectors, *_ = _extremes(reduced.operator(basis), basis, steps)
+        values, vectors, _, known = _extremes(reduced.operator(basis), basis, products)
         best, kept = float(values[0]), vectors[:, 0]
     if best < -error:
-        return best, kept
+        return best, kept, True
     strict = reduced.null_space(reduced.strict)
     for sign in (1.0, -1.0):
         d = _onto_cone(sign * strict.T @ v, rows @ strict)
-        for _ in range(min(CONE_STEPS, steps)):
+        for _ in range(CONE_STEPS):
             length = float(np.linalg.norm(d))
             if length <= CONE_MISS:
                 break
+            if not products.steps(1):
+                return best, kept, False
+            products.left -= 1
             d /= length
             image = strict.T @ reduced.apply(strict @ d)
             found = float(d @ image)
             if found < best:
                 best, kept = found, strict @ d
             if best < -error:
-                return best, kept
+                return best, kept, True
             d = _onto_cone(d - (image - found * d) / largest, rows @ strict)
-    return best, kept
+    return best, kept, known
 
 
 def _onto_cone(d: Array, rows: Array) -> Array:
