@@ -249,3 +249,24 @@ def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch
         products.clear()
         assert smallest_curvature(extremal, most).verdict in ("unknown", "saddle")
         assert len(products) <= most
+
+
+def test_the_look_at_where_a_run_ended_takes_no_longer_than_it_may(monkeypatch):
+    """A run that ends where it began is looked at, but not for as long as it takes."""
+    products = []
+    applied = curvature._applied
+
+    def counted(product, given):
+        once = applied(product, given)
+        return lambda direction: products.append(1) or once(direction)
+
+    monkeypatch.setattr(curvature, "_applied", counted)
+    counts = []
+    for each, options in ((0.0, {}), (1.1, {}), (1.1, {"time_limit": 5.0}), (1e9, {})):
+        monkeypatch.setattr(curvature, "_seconds", lambda *_, each=each: max(each, 1e-9))
+        products.clear()
+        co.Solver(quadratic(1.0, 0.9, 1.0), intervals=30).solve(progress=False, **options)
+        counts.append(len(products))
+    assert 0 < counts[1] < counts[0]
+    assert 1.1 * counts[1] <= 10.0  # seconds, that a look may take at least
+    assert counts[2:] == [0, 0]

@@ -11,6 +11,7 @@ from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
+from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
@@ -39,6 +40,8 @@ HARDLY = 1e-5
 def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
     """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it; leave a saddle along it.
 
+    The look takes no longer than what else is looked at after a run, nor than a limit of the time leaves.
+
     Args:
         prepared: what ran.
         outcome: of it.
@@ -50,9 +53,11 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
     exact = outcome.stats.get("hessian") == "exact"
     few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
     suspicious = few or bool(outcome.stats.get("concave")) or _stayed(start.trajectory, outcome.extremal)
-    if not outcome.converged or not suspicious:
+    if not outcome.converged or not suspicious or reporter.stop:
         return outcome
-    curvature = later("extremal.curvature").smallest_curvature(outcome.extremal)
+    left, longer = reporter.left[0], longest(outcome.stats)
+    seconds = longer if left is None else min(left, longer)
+    curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
     if curvature is None or curvature.verdict != "saddle":
         return outcome
     candidates = []
