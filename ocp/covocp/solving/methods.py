@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from covocp.base.checks import check_kind
 from covocp.base.errors import ProblemError, no_option, spelling
 from covocp.base.expressions import Given
+from covocp.problem.builder import Problem
 from covocp.transcription.mesh import Options
 
 METHODS = {
@@ -54,6 +56,15 @@ def check_method(method: str) -> None:
             received=repr(method),
             remedy=spelling(method, METHODS, "correct method="),
         )
+
+
+def check_problem(problem: Given) -> None:
+    """What is solved or compared must be a problem.
+
+    Raises:
+        ProblemError: it is something else.
+    """
+    check_kind(problem, Problem, "pass the Problem itself (solutions go into guess=)")
 
 
 def divided_options(method: str, nominal: Given, options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
-from covocp.base.checks import check_kind
 from covocp.base.errors import CovocpError, Interrupted, ProblemError, evaluating
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
@@ -41,6 +40,7 @@ from covocp.solving.failure import failure
 from covocp.solving.gain_start import best_gain, meeting_conditions, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
+from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
 from covocp.solving.other_ways import other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
@@ -65,15 +65,6 @@ OTHER_WAY = "\n  method='auto' may find a way: it tries method 'reduced' first."
 RUN_SECONDS, OTHER_SECONDS = ("build_seconds", "solve_seconds"), "other_seconds"
 # Rows of a covariance from which on a look at the steps along the guess is cheaper than a run that is made again.
 LARGE = 16
-
-
-def check_problem(problem: Given) -> None:
-    """What is solved or compared must be a problem.
-
-    Raises:
-        ProblemError: it is something else.
-    """
-    check_kind(problem, Problem, "pass the Problem itself (solutions go into guess=)")
 
 
 @methods_one_at_a_time
