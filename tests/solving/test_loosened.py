@@ -7,6 +7,7 @@ import pytest
 
 import covocp as co
 from covocp.solving import solver
+from covocp.solving.loosened import PATIENCE_OF_STEPS
 
 
 def brisk(limit=1.2):
@@ -35,6 +36,25 @@ def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
     assert found.stats["iterations"] > alone.stats["iterations"]
     largest = found["v"] + 2.0537489 * np.ravel(found.deviation("v"))  # the quantile of 98 %
     assert largest.max() == pytest.approx(1.2, abs=1e-6)
+
+
+def test_a_step_that_raises_leaves_the_run_that_failed(monkeypatch):
+    """As CasADi does where a linear system is singular."""
+    monkeypatch.setattr(solver, "PATIENCE", 12)
+    monkeypatch.setattr(solver, "other_ways", lambda *_: iter(()))
+    made_ready = solver.made_ready
+
+    class Raises:
+        def solve(self, *_):
+            raise RuntimeError("the linear system is singular")
+
+    def ready(*given, **own):
+        return Raises() if own.get("max_iterations") == PATIENCE_OF_STEPS else made_ready(*given, **own)
+
+    monkeypatch.setattr(solver, "made_ready", ready)
+    found = co.solve(brisk(), intervals=30, progress=False, allow_failure=True)
+    assert not found.converged
+    assert found.stats["iterations"] == 12
 
 
 def test_other_plugins_and_methods_keep_their_own_iterations():

@@ -67,7 +67,7 @@ def tightened(
         problem = statement if wanted == 0.0 else _loosened(statement, missed, wanted)
         try:
             found = run(problem, last, PATIENCE if wanted == 0.0 else PATIENCE_OF_STEPS)
-        except CovocpError:
+        except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the run before it counts
             return None
         found = found if last is None else with_stats(found, **counted(last, found))
         if found.converged:

@@ -98,7 +98,6 @@ class Solver:
         begin = time.perf_counter()
         check_method(method)
         check_problem(problem)
-        self._prepare = partial(made_ready, method)
         given, own = divided_options(method, nominal, options)
         self.method = method
         self.nominal = nominal
@@ -303,8 +302,8 @@ class Solver:
 
     def _ready(self, options: Options, statement: Statement | None = None, **changed: Any) -> Prepared:
         """The problem, or one like it, made ready on a mesh, with other options of the method."""
-        own = {**self._own, **changed}
-        return self._prepare(self._solved if statement is None else statement, options, self._values, **own)
+        statement = self._solved if statement is None else statement
+        return made_ready(self.method, statement, options, self._values, **{**self._own, **changed})
 
     def _suit(self, values: Array, *, nodes: bool) -> None:
         """Another mesh for other values of the parameters where this one is too coarse for them, kept for later runs.
@@ -378,7 +377,7 @@ class Solver:
             try:
                 prepared = self._ready(way.options, **way.own)
                 found = prepared.solve(values, make_guess(self._solved, prepared.mesh, values, near), reporter)
-            except CovocpError:  # another one may apply
+            except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved; another way may apply
                 continue
             if found.converged:
                 if way.options is not self._options:
@@ -461,7 +460,7 @@ class Solver:
                 coarse = Solution.of(outcome, self.method, assess=False)
                 start = make_guess(self._solved, prepared.mesh, values, coarse)
                 again = prepared.solve(values, start, reporter)
-            except CovocpError:  # what the steps are off is told with the solution that there is
+            except (CovocpError, RuntimeError):  # what the steps are off is told with the solution that there is
                 break
             if not again.converged:
                 break
