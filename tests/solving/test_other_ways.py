@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import casadi as ca
+import numpy as np
 import pytest
 
 import covocp as co
-from covocp.solving import solver
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Outcome
+from covocp.solving import other_ways, solver
+from covocp.solving.other_ways import Way, by_other_ways
 
 INTERVALS = {"intervals": 30, "progress": False}
 
@@ -78,12 +82,88 @@ def raising(monkeypatch, where):
     monkeypatch.setattr(solver, "made_ready", ready)
 
 
+def test_without_the_option_of_the_hessian_ipopt_is_another_way(best):
+    """The method "auto" has none; it lets Ipopt run where a gain is free."""
+    auto = co.Solver(swung(), "auto", intervals=30, substeps=1, covariance_step="rk4")
+    found = auto.solve(progress=False)
+    assert found.cost == pytest.approx(best, rel=1e-5)
+    assert "found by method='ipopt' with hessian='limited-memory'" in str(found)
+    assert found.method == auto.solve(progress=False).method == "ipopt"
+    with pytest.raises(co.SolveError, match="method='ipopt' with hessian='limited-memory' may find a way"):
+        co.solve(swung(), method="auto", max_iterations=60, substeps=1, covariance_step="rk4", **INTERVALS)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "auto"])
+@pytest.mark.parametrize("options", [{}, {"covariance_step": "rk4"}], ids=["steps", "hessian"])
+def test_later_solves_begin_the_way_that_found_a_solution(best, method, options):
+    again = co.Solver(swung(), method, intervals=30, substeps=1, **options)
+    first, second = again.solve(progress=False), again.solve(progress=False)
+    assert first.cost == pytest.approx(best, rel=1e-5)
+    assert second.cost == pytest.approx(best, rel=1e-5)
+    assert second.stats["iterations"] < 0.3 * first.stats["iterations"]
+    assert "other_ways" not in second.stats
+
+
+@pytest.mark.parametrize("limit", [413, 415])
+def test_at_a_limit_the_better_iterate_counts_and_no_way_is_blamed(best, limit):
+    """The first run ends after 400 iterations where Xhat is below zero; the limit cuts short what comes after it."""
+    found = co.Solver(swung(), intervals=30, substeps=1).solve(iteration_limit=limit, progress=False)
+    assert not found.converged
+    assert found.cost == pytest.approx(best, rel=1e-3)
+    assert "found by" not in str(found)
+
+
+def test_what_is_told_of_ways_is_what_they_came_to(monkeypatch):
+    """Cut short, by a limit or by the user: the outcome that violates less, or is cheaper, and no word on the way."""
+    extremal = co.solve(swung(limited=False), **INTERVALS).extremal
+    monkeypatch.setattr(other_ways, "make_guess", lambda *_: None)
+
+    def outcome(cost, violation, *, converged=False):
+        violations = {"row": violation} if violation else {}
+        return Outcome(
+            extremal=extremal,
+            cost_terms={"running": cost},
+            converged=converged,
+            message="ended",
+            violations=violations,
+            stats={"iterations": 10},
+        )
+
+    def tried(failed, found, *, stops):
+        reporter = Progress("", show=False)
+
+        class Ready:
+            mesh = extremal.mesh
+
+            def solve(self, *_):
+                reporter.asked = stops
+                return found
+
+        ways = [Way("one", None, {}, {}), Way("two", None, {}, {})]
+        return by_other_ways(failed, None, ways, lambda way: Ready(), reporter)
+
+    junk, near, cheap, dear = outcome(-900.0, 1e-3), outcome(2.0, 1e-4), outcome(1.0, 0.0), outcome(3.0, 0.0)
+    for failed, found, better in ((junk, near, 2.0), (near, junk, 2.0), (dear, cheap, 1.0), (cheap, junk, 1.0)):
+        given, kept = tried(failed, found, stops=True)
+        assert (given.cost_terms["running"], kept) == (better, None)
+        assert given.stats == {"iterations": 20}
+    assert tried(near, outcome(np.nan, np.nan), stops=True)[0].cost_terms["running"] == 2.0
+    given, kept = tried(junk, near, stops=False)
+    assert (given.cost_terms["running"], kept) == (-900.0, None)
+    assert given.stats == {"iterations": 30, "other_ways": "one and two"}
+    given, kept = tried(junk, outcome(1.0, 0.0, converged=True), stops=False)
+    assert given.converged
+    assert kept[0].words == given.stats["other_ways"] == "one"
+
+
 def test_a_way_that_raises_leaves_the_run_that_failed(monkeypatch):
     monkeypatch.setattr(solver, "PATIENCE", 20)
     raising(monkeypatch, lambda options, own: options.covariance_step == "gauss" or "hessian" in own)
     found = co.solve(swung(), substeps=1, allow_failure=True, **INTERVALS)
     assert not found.converged
     assert found.stats["iterations"] == 20
+    with pytest.raises(co.SolveError, match="gauss' and hessian='limited-memory' found nothing either"):
+        co.solve(swung(), substeps=1, **INTERVALS)
 
 
 def test_finer_steps_that_raise_leave_the_solution(monkeypatch):
@@ -94,3 +174,24 @@ def test_finer_steps_that_raise_leave_the_solution(monkeypatch):
     ocp.dynamics(x, u)
     ocp.minimize(running=u**2)
     assert co.solve(ocp, **INTERVALS).cost == pytest.approx(1.0)
+
+
+def beside_limits(*, at):
+    """A position that is not known well enough for its limits, whatever feedback does."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", 2, initial=[0.0, 0.0], variance=[0.2, 0.2]), ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], u), noise=[0.0, 0.5])
+    ocp.measurement("m", x[0], noise=0.5)
+    ocp.closed_loop_covariance()
+    ocp.minimize_expected(running=u**2)
+    ocp.chance(x[0], lower=-0.1, upper=0.1, probability=0.95, at=at)
+    return ocp
+
+
+@pytest.mark.parametrize("options", [{}, {"max_iterations": 60}], ids=["tried", "asked"])
+def test_where_no_feedback_can_help_no_other_way_is_tried_or_named(options):
+    with pytest.raises(co.SolveError, match="no feedback takes X below E") as caught:
+        co.solve(beside_limits(at="initial"), intervals=10, progress=False, **options)
+    assert "may find a way" not in str(caught.value)
+    assert "found nothing either" not in str(caught.value)
+    assert "other_ways" not in caught.value.solution.stats

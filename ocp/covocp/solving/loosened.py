@@ -14,8 +14,11 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
-from covocp.extremal.extremal import Outcome
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Outcome, Prepared
+from covocp.solution.solution import Solution
 from covocp.solving.attempts import counted, with_stats
+from covocp.solving.warm_start import make_guess
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
@@ -29,8 +32,8 @@ FIRST, SMALLEST, MOST = 0.5, 0.02, 20
 # What the start misses of a limit is allowed with so much more.
 ROOM = 1.1
 
-# A run: the statement, the outcome where to start or None for the start itself, iterations at most -> the outcome.
-Run = Callable[[Statement, Outcome | None, int], Outcome]
+# Makes a statement ready, with so many iterations at most.
+Ready = Callable[[Statement, int], Prepared]
 
 
 def can_be_loosened(statement: Statement) -> bool:
@@ -40,33 +43,42 @@ def can_be_loosened(statement: Statement) -> bool:
     )
 
 
-def tightened(
-    statement: Statement, start: Trajectory, mesh: Mesh, parameters: Array, run: Run, stopped: Callable[[], bool]
-) -> Outcome | None:
-    """The outcome of a sequence of problems whose limits are loosened less and less, the last one not at all.
+def tightened(statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress) -> Outcome:
+    """The outcome by way of problems whose limits are loosened less and less, the last one not at all; else as before.
 
     Args:
         statement: the problem.
-        start: what its limits are loosened for.
-        mesh: of the start.
-        parameters: stacked.
-        run: solves a statement.
-        stopped: whether to stop.
-
-    Returns:
-        The outcome of the problem itself; None where the steps became too small before.
+        failed: its outcome before.
+        best: with the best gain, where to start; what the limits are loosened for.
+        ready: makes a problem like it ready on the same mesh.
+        reporter: of iterations.
     """
-    missed = {name: _missed(getattr(statement, name), name, start, mesh, parameters) for name in ("path", "end")}
+    found = _sequence(statement, failed, best, ready, reporter) if can_be_loosened(statement) else None
+    return failed if found is None else with_stats(found, **counted(failed, found))
+
+
+def _sequence(
+    statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress
+) -> Outcome | None:
+    """The outcome of the problem itself; None where the steps became too small before."""
+    mesh, parameters = failed.extremal.mesh, failed.extremal.parameters
+    start = make_guess(statement, mesh, parameters, best)
+    missed = {
+        name: _missed(getattr(statement, name), name, start.trajectory, mesh, parameters) for name in ("path", "end")
+    }
     if not any(np.any(own > 0) for own in missed.values()):
         return None
     share, step, last = 1.0, 0.0, None
     for _ in range(MOST):
-        if stopped():
+        if reporter.stop:
             return None
         wanted = share - step if share - step > SMALLEST / 2 else 0.0
         problem = statement if wanted == 0.0 else _loosened(statement, missed, wanted)
         try:
-            found = run(problem, last, PATIENCE if wanted == 0.0 else PATIENCE_OF_STEPS)
+            if last is not None:
+                start = make_guess(problem, mesh, parameters, Solution.of(last, best.method, assess=False))
+            prepared = ready(problem, PATIENCE if wanted == 0.0 else PATIENCE_OF_STEPS)
+            found = prepared.solve(parameters, start, reporter)
         except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the run before it counts
             return None
         found = found if last is None else with_stats(found, **counted(last, found))

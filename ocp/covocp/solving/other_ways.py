@@ -9,23 +9,39 @@ find it in the fewest iterations.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from covocp.base.errors import CovocpError
+from covocp.base.progress import Progress
+from covocp.extremal.extremal import Outcome, Prepared
+from covocp.solution.report import OTHERWISE
+from covocp.solution.solution import Solution
+from covocp.solving.attempts import cost_of, counted, with_stats
+from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
 
+STEPS, HESSIAN = {"covariance_step": "gauss"}, {"hessian": "limited-memory"}
+
 
 class Way(NamedTuple):
-    """How else a problem is made ready: what to write for it, the options of the mesh, those of the method."""
+    """How else a problem is made ready: what to write for it, the method, other options of the mesh and of the method.
+
+    The method is None where it is the one that was asked for.
+    """
 
     words: str
-    options: Options
+    method: str | None
+    mesh: dict[str, Any]
     own: dict[str, Any]
 
 
-def other_ways(statement: Statement, options: Options, mesh: Mesh, own: Mapping[str, Any]) -> Iterator[Way]:
+def other_ways(
+    statement: Statement, options: Options, mesh: Mesh, own: Mapping[str, Any], taken: Container[str]
+) -> Iterator[Way]:
     """Ways that the user left open, the most robust one first.
 
     Args:
@@ -33,11 +49,59 @@ def other_ways(statement: Statement, options: Options, mesh: Mesh, own: Mapping[
         options: of the run that failed.
         mesh: likewise.
         own: options of the method that were given.
+        taken: names of those that the method takes; "auto", which lets Ipopt run where a gain is free, has fewer.
     """
     if options.covariance_step == "auto" and mesh.step == "rk4" and statement.riccati_forms:
-        yield Way("covariance_step='gauss'", replace(options, covariance_step="gauss"), {})
+        yield Way("covariance_step='gauss'", None, STEPS, {})
     if own.get("hessian", "auto") == "auto" and not mesh.eliminated:
-        yield Way("hessian='limited-memory'", options, {"hessian": "limited-memory"})
+        if "hessian" in taken:
+            yield Way("hessian='limited-memory'", None, {}, HESSIAN)
+        else:
+            yield Way("method='ipopt' with hessian='limited-memory'", "ipopt", {}, HESSIAN)
+
+
+def by_other_ways(
+    failed: Outcome, near: Solution, ways: Iterable[Way], ready: Callable[[Way], Prepared], reporter: Progress
+) -> tuple[Outcome, tuple[Way, Prepared] | None]:
+    """The outcome of the first way that finds one, and the way made ready; else as it failed, and None.
+
+    Where a limit ends a way, or the user does, it is not known whether it would have found one: of both outcomes the
+    better one counts then.
+
+    Args:
+        failed: the run before.
+        near: where to start, as that run did.
+        ways: to try.
+        ready: makes the problem ready that way.
+        reporter: of iterations.
+    """
+    tried: list[str] = []
+    for way in ways:
+        if reporter.stop:
+            break
+        try:
+            prepared = ready(way)
+            start = make_guess(failed.extremal.statement, prepared.mesh, failed.extremal.parameters, near)
+            found = prepared.solve(failed.extremal.parameters, start, reporter)
+        except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved; another way may apply
+            tried.append(way.words)
+            continue
+        both = counted(failed, found) | ({"method": way.method} if way.method else {})
+        if found.converged:
+            return with_stats(found, **both, **{OTHERWISE: way.words}), (way, prepared)
+        if reporter.stop:
+            failed = with_stats(min(failed, found, key=_rank), **both)
+            break
+        tried.append(way.words)
+        failed = with_stats(failed, **counted(failed, found))
+    return (with_stats(failed, **{OTHERWISE: " and ".join(tried)}) if tried else failed), None
+
+
+def _rank(outcome: Outcome) -> tuple[float, float]:
+    """Less is better: what meets the conditions by its cost, anything else by what it violates."""
+    numbers = max(outcome.violations.values(), default=0.0), cost_of(outcome)
+    violation, cost = (number if np.isfinite(number) else np.inf for number in numbers)
+    return violation, cost
 
 
 def told_ways(tried: str, left: Iterable[Way]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import fields, replace
 from functools import partial
@@ -37,12 +37,12 @@ from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
-from covocp.solving.gain_start import best_gain, meeting_conditions, with_best_gain_problems, with_gain_told
-from covocp.solving.loosened import PATIENCE, can_be_loosened, tightened
+from covocp.solving.gain_start import best_gain, beyond, meeting_conditions, with_best_gain_problems, with_gain_told
+from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
 from covocp.solving.other_minima import away_from_saddle, without_turns
-from covocp.solving.other_ways import other_ways, told_ways
+from covocp.solving.other_ways import Way, by_other_ways, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
@@ -99,7 +99,7 @@ class Solver:
         check_method(method)
         check_problem(problem)
         given, own = divided_options(method, nominal, options)
-        self.method = method
+        self.method = self._by = method  # what makes ready: another one where only that finds a way
         self.nominal = nominal
         self.statement: Statement = problem.statement()
         check_magnitudes(self.statement, self.statement.values)
@@ -128,9 +128,8 @@ class Solver:
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = own
-        other = method not in ("ipopt", "auto") or str(self._own.get("plugin", "ipopt")) != "ipopt"
-        patient = other or "max_iterations" in self._own
-        self._otherwise = bool(self._best) and not patient
+        self._by_ipopt = method in ("ipopt", "auto") and str(self._own.get("plugin", "ipopt")) == "ipopt"
+        self._otherwise = bool(self._best) and self._by_ipopt and "max_iterations" not in self._own
         if self._otherwise:  # there is another way
             self._own["max_iterations"] = PATIENCE
         if asked.refine is not None:
@@ -251,12 +250,12 @@ class Solver:
             if self.nominal == "deterministic":
                 outcome = closed_around(outcome, self.statement, self._options, own_steps=self._own_steps)
             if reporter.asked:
-                raise interrupted(Solution.of(outcome, self.method))
+                raise interrupted(Solution.of(outcome, self._by))
             outcome = with_gain_told(self._problem, outcome, first)
             if reporter.spent and not outcome.converged:
                 outcome = replace(outcome, message=f"stopped at {reporter.spent}")
-                return self._timed(self._finish(outcome, allow_failure=True, assess=assess), begin)
-            solution = self._finish(outcome, allow_failure, assess)
+                return self._timed(self._finish(outcome, first, allow_failure=True, assess=assess), begin)
+            solution = self._finish(outcome, first, allow_failure=allow_failure, assess=assess)
             return self._timed(self._beside_classical(solution, values) if assess else solution, begin)
 
     def _timed(self, solution: Solution, begin: float) -> Solution:
@@ -276,7 +275,7 @@ class Solver:
             first = from_coarser(self._solved, self._options, self._prepared.mesh, self._ready, given)
         starts = [guesses]
         if first is not None:
-            coarse = Solution.of(first, self.method, assess=False)
+            coarse = Solution.of(first, self._by, assess=False)
             starts.insert(0, make_guesses(self._solved, self._prepared.mesh, values, coarse))
         if best is not None and guess is not best:
             starts.append(make_guesses(self._solved, self._prepared.mesh, values, best))
@@ -284,10 +283,8 @@ class Solver:
             outcome, start = from_starts(self._prepared, values, several, reporter)
             if outcome.converged or reporter.stop:
                 break
-        if best is not None and self._otherwise and not outcome.converged:
-            outcome = self._tightened(outcome, values, best, reporter)
-            near = guess if isinstance(guess, Solution) else best
-            outcome = outcome if outcome.converged else self._by_other_ways(outcome, values, near, reporter)
+        if best is not None and self._otherwise and not outcome.converged and not reporter.stop:
+            outcome = self._otherwise_solved(outcome, best, guess if isinstance(guess, Solution) else best, reporter)
         return (outcome if first is None else with_stats(outcome, **counted(first, outcome))), start
 
     def _laid_out(self) -> Options:
@@ -300,10 +297,12 @@ class Solver:
             options = replace(options, substeps=around.substeps)
         return options
 
-    def _ready(self, options: Options, statement: Statement | None = None, **changed: Any) -> Prepared:
-        """The problem, or one like it, made ready on a mesh, with other options of the method."""
+    def _ready(
+        self, options: Options, statement: Statement | None = None, by: str | None = None, **changed: Any
+    ) -> Prepared:
+        """The problem, or one like it, made ready on a mesh, by another method or with other options of it."""
         statement = self._solved if statement is None else statement
-        return made_ready(self.method, statement, options, self._values, **{**self._own, **changed})
+        return made_ready(by or self._by, statement, options, self._values, **{**self._own, **changed})
 
     def _suit(self, values: Array, *, nodes: bool) -> None:
         """Another mesh for other values of the parameters where this one is too coarse for them, kept for later runs.
@@ -346,46 +345,38 @@ class Solver:
         if finer is not None:
             self._keep(finer, self._ready(finer))
 
-    def _tightened(self, failed: Outcome, values: Array, best: Solution, reporter: Progress) -> Outcome:
-        """Solved by way of loosened limits of the spread, from the best gain; else as it failed."""
-        if reporter.stop or not can_be_loosened(self._solved):
-            return failed
-        mesh = self._prepared.mesh
-        begin = make_guess(self._solved, mesh, values, best)
+    def _otherwise_solved(self, failed: Outcome, best: Solution, near: Solution, reporter: Progress) -> Outcome:
+        """Solved from the best gain by loosened limits of the spread, or from nearby another way; else as it failed.
 
-        def run(statement: Statement, last: Outcome | None, most: int) -> Outcome:
-            prepared = self._ready(self._options, statement, max_iterations=most)
-            start = (
-                begin
-                if last is None
-                else make_guess(statement, mesh, values, Solution.of(last, self.method, assess=False))
-            )
-            outcome: Outcome = prepared.solve(values, start, reporter)
-            return outcome
-
-        found = tightened(self._solved, begin.trajectory, mesh, values, run, lambda: reporter.stop)
-        return failed if found is None else with_stats(found, **counted(failed, found))
-
-    def _by_other_ways(self, failed: Outcome, values: Array, near: Solution, reporter: Progress) -> Outcome:
-        """Solved from the same start with other steps or an approximate Hessian, where one finds it; else as it failed.
-
-        Steps that find it are those of later runs.
+        The way that finds a solution is that of later runs.
         """
-        for way in other_ways(self._solved, self._options, self._prepared.mesh, self._own):
-            if reporter.stop:
-                break
-            try:
-                prepared = self._ready(way.options, **way.own)
-                found = prepared.solve(values, make_guess(self._solved, prepared.mesh, values, near), reporter)
-            except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved; another way may apply
-                continue
-            if found.converged:
-                if way.options is not self._options:
-                    self._keep(way.options, prepared)
-                return with_stats(found, **counted(failed, found), **{OTHERWISE: way.words})
-            tried = [*filter(None, [failed.stats.get(OTHERWISE)]), way.words]
-            failed = with_stats(failed, **counted(failed, found), **{OTHERWISE: " and ".join(tried)})
-        return failed
+
+        def loosened(statement: Statement, most: int) -> Prepared:
+            return self._ready(self._options, statement, max_iterations=most)
+
+        def ready(way: Way) -> Prepared:
+            return self._ready(replace(self._options, **way.mesh), by=way.method, **way.own)
+
+        outcome = tightened(self._solved, failed, best, loosened, reporter)
+        if outcome.converged or beyond(self._problem.declarations, best):  # which no way changes
+            return outcome
+        outcome, kept = by_other_ways(outcome, near, self._other_ways(), ready, reporter)
+        if kept is not None:
+            self._keep_way(*kept)
+        return outcome
+
+    def _other_ways(self) -> Iterator[Way]:
+        """Those that are open."""
+        taken = method_options(self._by)
+        return other_ways(self._solved, self._options, self._prepared.mesh, self._own, taken)
+
+    def _keep_way(self, way: Way, prepared: Prepared) -> None:
+        """Later runs begin this way, also on other meshes."""
+        self._by, self._own = way.method or self._by, {**self._own, **way.own}
+        self._ungraded = self._ungraded[0], replace(self._ungraded[1], **way.mesh)
+        self._asked = replace(self._asked, **way.mesh)
+        self._keep(replace(self._options, **way.mesh), prepared)
+        self._first = (self._options, prepared) if self._remade else (replace(self._first[0], **way.mesh), prepared)
 
     def _beside_classical(self, solution: Solution, values: Array) -> Solution:
         """The solution with the cost of the classical design beside it; a worse one is a spurious stationary point."""
@@ -414,7 +405,7 @@ class Solver:
                 raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
-        return with_stats(Solution.of(outcome, self.method), **{**solution.stats, **counted(solution, outcome)})
+        return with_stats(Solution.of(outcome, self._by), **{**solution.stats, **counted(solution, outcome)})
 
     def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
@@ -457,7 +448,7 @@ class Solver:
                 break
             try:
                 prepared = self._ready(finer)
-                coarse = Solution.of(outcome, self.method, assess=False)
+                coarse = Solution.of(outcome, self._by, assess=False)
                 start = make_guess(self._solved, prepared.mesh, values, coarse)
                 again = prepared.solve(values, start, reporter)
             except (CovocpError, RuntimeError):  # what the steps are off is told with the solution that there is
@@ -472,36 +463,35 @@ class Solver:
         """The outcome on a mesh of small error, with limits that hold between the nodes, where that is asked for."""
         if not self._remade or reporter.stop:
             return outcome
-        runs = refining.ProblemRuns(self._solved, values, self.method, self._ready, reporter)
+        runs = refining.ProblemRuns(self._solved, values, self._by, self._ready, reporter)
         found = remade(runs.measured(self._options, self._prepared, outcome, refining.unseen(self._own)), runs)
         assert isinstance(found.outcome, Outcome)
         self._keep(found.options[0], found.prepared)
         return found.outcome
 
-    def _finish(self, outcome: Outcome, allow_failure: bool, assess: bool) -> Solution:
-        """An outcome as a solution, with what the user must know about it."""
+    def _finish(self, outcome: Outcome, best: Solution | None, *, allow_failure: bool, assess: bool) -> Solution:
+        """An outcome, perhaps of a run from the best gain, as a solution, with what the user must know about it."""
         impossible = impossible_density(outcome.extremal) if outcome.converged else ""
         if impossible:
             outcome = replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
-        solution = Solution.of(with_stats(outcome, **self._options.grading), self.method, assess=assess)
+        solution = Solution.of(with_stats(outcome, **self._options.grading), self._by, assess=assess)
         if not outcome.converged:
             if allow_failure:
                 return solution
-            raise failure(
-                self.statement.name, self.method, outcome, solution, "" if impossible else self._other_way(outcome)
-            )
+            other_way = "" if impossible else self._other_way(outcome, best)
+            raise failure(self.statement.name, self.method, outcome, solution, other_way)
         if assess:
             mention_doubts(solution)
             mention_limits(solution)
         return solution
 
-    def _other_way(self, failed: Outcome) -> str:
+    def _other_way(self, failed: Outcome, best: Solution | None) -> str:
         """A line for a run that failed, where another method or other options are known to be more robust."""
-        ipopt = self.method == "ipopt" and self._own.get("plugin", "ipopt") == "ipopt"
-        if ipopt and is_suited(self._solved, self._prepared.mesh):
+        if not self._by_ipopt or beyond(self._problem.declarations, best):
+            return ""
+        if self.method == "ipopt" and is_suited(self._solved, self._prepared.mesh):
             return OTHER_WAY
-        left = other_ways(self._solved, self._options, self._prepared.mesh, self._own) if self._best and ipopt else ()
-        return told_ways(str(failed.stats.get(OTHERWISE, "")), left)
+        return told_ways(str(failed.stats.get(OTHERWISE, "")), self._other_ways() if self._best else ())
 
 
 def _classical_costs(problem: Problem, options: Options) -> Costs:
