@@ -18,7 +18,7 @@ from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
 
 # Bytes of passages that are kept for the next call beside the last one.
-KEPT_BYTES = 50_000_000
+KEPT_BYTES = 20_000_000
 
 Given = Mapping[str, Any]
 # Where numbers lie, None where there are none.
