@@ -16,7 +16,7 @@ from covocp.base.matrices import half_length, pack, pack_symbolic, unpack, unpac
 from covocp.base.quadrature import gauss_matrix, riccati_step
 from covocp.models import mars_entry, mass_chain
 from covocp.passage import library
-from covocp.passage.sweep import depends, passed_by, values_by
+from covocp.passage.sweep import _sweep, depends, passed_by, values_by
 from covocp.transcription import shooting
 
 pytestmark = pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
@@ -246,6 +246,21 @@ def test_tangents_of_several_entries_at_once():
     function = ca.Function("f", arguments, [forward, backward])
     one, other = (np.asarray(v.full()) for v in function(pack(E), h1, h2))
     np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14)
+
+
+def test_what_casadi_leaves_out_is_zero():
+    """Arguments without memory, as it gives them for what is zero: no seeds, no kicks, H of zeros."""
+    n = 3
+    E, h1, _ = systems(n, 0)
+    rows, columns = ca.Sparsity.dense(2 * n, 2 * n).get_triplet()
+    sweep = _sweep(n, (tuple(rows), tuple(columns)), STEPS, True, (), 0, False, 1)
+    half, result = half_length(n), np.empty(half_length(n) * STEPS)
+    sweep.eval_buffer((pack(E).data, None, None, None), (result.data,))
+    assert np.allclose(result.reshape(STEPS, half), pack(E), rtol=1e-15)
+    slopes = sweep.get_reverse(1, "slopes", ("",) * 6, ("",) * 4, {})
+    found = [np.full(size, np.nan) for size in (half, h1.size, h1.size, half * STEPS)]
+    slopes.eval_buffer((pack(E).data, None, None, None, result.data, None), tuple(values.data for values in found))
+    assert all(not values.any() for values in found)
 
 
 def test_several_directions_at_once():

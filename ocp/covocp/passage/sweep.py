@@ -229,7 +229,8 @@ class _Sweep(Node):
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         library = needed()
-        given = self.padded(library["addresses"](arguments))
+        whole = tuple(self.filled(arguments))  # which live as long as the call
+        given = self.padded(library["addresses"](whole))
         memory = _WORKSPACES.take(self)
         library["passage_forward"](memory, *given, *library["addresses"](results))
         _WORKSPACES.give(self, memory)
@@ -273,7 +274,8 @@ class _Slopes(Node):
     def eval_buffer(self, arguments: Buffers, results: Buffers) -> int:
         """Of CasADi."""
         sweep, count, library = self._sweep, self._sweep.get_n_in(), needed()
-        places, slopes = library["addresses"](arguments), library["addresses"](results)
+        whole = tuple(self.filled(arguments))  # which live as long as the call
+        places, slopes = library["addresses"](whole), library["addresses"](results)
         given, seeds = sweep.padded(places[:count]), places[count + 1]
         memory, failed = _WORKSPACES.take(sweep), 0
         for k in range(self._directions):
