@@ -36,6 +36,9 @@ def test_rest_is_found_without_a_word(method, intervals):
     assert found.cost < 1e-20
     assert np.abs(found["u"]).max() < 1e-10
     assert found.stats["iterations"] < 200
+    assert "LARGE" not in str(found)
+    assert found.optimality.stationarity < 1e-9
+    assert found.optimality.control_error < 1e-9
 
 
 @pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # of a cost of 1e-12, which is nothing
@@ -45,3 +48,17 @@ def test_in_any_unit_and_beside_a_filter(method, unit):
     for dense in (False, True):
         found = co.solve(regulator(unit=unit, dense=dense), method, intervals=40, progress=False)
         assert found.cost < 1e-12
+
+
+def test_phases_at_rest_meet():
+    """Costates of 1e-150 on both sides of a link differ by nothing."""
+    parts = []
+    for k in range(2):
+        ocp = co.Problem(2.0, name=f"part {k}")
+        x, u = ocp.state("x", initial=0.0 if k == 0 else None, final=0.0 if k == 1 else None), ocp.control("u")
+        ocp.dynamics(x, u - x)
+        ocp.minimize(running=x**2 + u**2)
+        parts.append(ocp)
+    found = co.solve(co.Phases(parts), intervals=10, progress=False)
+    assert found.cost < 1e-20
+    assert "LARGE" not in str(found)

@@ -20,6 +20,8 @@ from covocp.statement.interval import repeated
 # A truth value for each control of each interval.
 Mask = NDArray[np.bool_]
 
+# What no cost is in any unit, but what is left of zero: of a plant that is at rest.
+ZERO_COST = 1e-30
 # Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
 QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
 # Weights of the integral over [0, 1] of a value at 0, 1/2 and 1.

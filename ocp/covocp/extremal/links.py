@@ -14,7 +14,7 @@ from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.residuals import VANISHING
 from covocp.base.short_repr import short_repr
-from covocp.extremal.control_error import absolute_cost
+from covocp.extremal.control_error import ZERO_COST, absolute_cost
 from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
 from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
@@ -241,7 +241,7 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     size = max(float(np.abs(passed.costates.state).max(initial=0.0)) for passed in (before, after))
     tiny = float(np.finfo(float).tiny)
     cost = VANISHING * (absolute_cost(first) + before.within.size)
-    return min(float(missed.max(initial=0.0)) / max(size, tiny), changed / max(cost, tiny))
+    return min(float(missed.max(initial=0.0)) / max(size, tiny), changed / max(cost, ZERO_COST))
 
 
 def _loose(extremal: Extremal, node: int) -> Any:

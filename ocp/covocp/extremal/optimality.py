@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -13,7 +13,7 @@ from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.closed_loop import ClosedLoop
-from covocp.extremal.control_error import absolute_cost, estimate_control_error
+from covocp.extremal.control_error import ZERO_COST, absolute_cost, estimate_control_error
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.decisions import decision_slopes
@@ -155,7 +155,7 @@ def assess(
         whole = free[:-1] & free[1:]
         bounded = ~whole & ~(beside[:-1] | beside[1:])
         control_error = estimate_control_error(extremal, (whole, bounded), others)
-    return Optimality(
+    found = Optimality(
         stationarity=_stationarity(extremal, left, scale, others) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
@@ -171,6 +171,8 @@ def assess(
         cost_identity=cost_identity,
         **_loop_identities(loop),
     )
+    nothing = max(absolute_cost(extremal) + others, float(values[:, 1].max())) <= ZERO_COST  # costs may cancel
+    return _of_nothing(found) if nothing else found
 
 
 def _stationarity(extremal: Extremal, slopes: Array, scale: float, others: float) -> float:
@@ -299,6 +301,12 @@ def _costate_difference(extremal: Extremal, costates: Costates) -> float | None:
         differences = [np.abs(one - two)[first:].max() / np.abs(one).max() for one, two in both if one.any()]
     largest = float(np.max(differences, initial=0.0))
     return largest if np.isfinite(largest) else None
+
+
+def _of_nothing(found: Optimality) -> Optimality:
+    """The conditions where nothing costs anything: what is left of their slopes is roundoff, and met."""
+    named = ("stationarity", "control_slope", "hamiltonian_variation", "transversality", "control_error", "decisions")
+    return replace(found, **{name: 0.0 for name in named if getattr(found, name) is not None})
 
 
 def _variation(extremal: Extremal, values: Array) -> float:
