@@ -225,6 +225,18 @@ def beside_a_bound():
     return ocp
 
 
+def counted_products(monkeypatch):
+    """A list that has one more entry with each product of a Hessian and a direction."""
+    products, applied = [], curvature._applied
+
+    def counted(product, given):
+        once = applied(product, given)
+        return lambda direction: products.append(1) or once(direction)
+
+    monkeypatch.setattr(curvature, "_applied", counted)
+    return products
+
+
 def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch):
     """Of directions that bounds allow the descending one is found after some steps: without them nothing is known."""
     extremal = at_rest(beside_a_bound(), 40)
@@ -236,14 +248,7 @@ def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch
     a, b, c = (np.trapezoid(v * w, fine) for w in (np.cos(turn), 1 - 0.6 * np.cos(2 * turn), np.cos(3 * turn)))
     assert v.min() >= -1e-9
     assert np.trapezoid(v**2, fine) - 2.5 * a**2 - b**2 + 30 * c**2 < 0  # so it is a saddle
-    products = []
-    applied = curvature._applied
-
-    def counted(product, given):
-        once = applied(product, given)
-        return lambda direction: products.append(1) or once(direction)
-
-    monkeypatch.setattr(curvature, "_applied", counted)
+    products = counted_products(monkeypatch)
     monkeypatch.setattr(curvature, "_seconds", lambda *_: 1.0)
     for most in (9.01, 10.0, 12.0, 20.0, 40.0, 80.0):
         products.clear()
@@ -253,14 +258,7 @@ def test_a_saddle_is_no_minimum_where_few_products_can_be_waited_for(monkeypatch
 
 def test_the_look_at_where_a_run_ended_takes_no_longer_than_it_may(monkeypatch):
     """A run that ends where it began is looked at, but not for as long as it takes."""
-    products = []
-    applied = curvature._applied
-
-    def counted(product, given):
-        once = applied(product, given)
-        return lambda direction: products.append(1) or once(direction)
-
-    monkeypatch.setattr(curvature, "_applied", counted)
+    products = counted_products(monkeypatch)
     counts = []
     for each, options in ((0.0, {}), (1.1, {}), (1.1, {"time_limit": 5.0}), (1e9, {})):
         monkeypatch.setattr(curvature, "_seconds", lambda *_, each=each: max(each, 1e-9))

@@ -34,7 +34,7 @@ EXPORT void passage_free(Kept *k) {
 }
 
 /* Tells a passage its shape, and what is kept of its steps. */
-static void told_apart(Passage *p, const int *shape, int lean) {
+static void described_for(Passage *p, const int *shape, int lean) {
     described(p, shape);
     p->lean = lean, p->lanes = MOST_LANES, p->brief = !lean && p->order;
 }
@@ -44,14 +44,14 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean) {
     Kept *k = calloc(1, sizeof *k);
     if (!k) return NULL;
     Passage *p = &k->p;
-    told_apart(p, shape, lean);
+    described_for(p, shape, lean);
     k->whole = room((size_t)length + counts(p, NULL), sizeof(int));
     if (!k->whole || made(k, &k->reals, stages(p, NULL) + keeps(p, NULL) + works(p, NULL) + numbers(p))) {
         passage_free(k);
         return NULL;
     }
     memcpy(k->whole, shape, sizeof(int) * length);
-    told_apart(p, k->whole, lean);
+    described_for(p, k->whole, lean);
     counts(p, k->whole + length);
     const size_t half = (size_t)p->n * (p->n + 1) / 2, entries = (size_t)p->nnz * p->moves;
     double *at = k->reals + stages(p, k->reals); /* where `keep_stages` finds them */
@@ -70,7 +70,7 @@ EXPORT Kept *passage_new(const int *shape, int length, int lean) {
 /* Bytes of such a passage before slopes or tangents ask for more. */
 EXPORT size_t passage_bytes(const int *shape, int lean) {
     Passage p;
-    told_apart(&p, shape, lean);
+    described_for(&p, shape, lean);
     p.full = !lean && !p.brief;
     return sizeof(double) * (stages(&p, NULL) + keeps(&p, NULL) + works(&p, NULL) + numbers(&p));
 }

@@ -65,6 +65,13 @@ class Problem(Declared):
         self._statement = self._expanded = None
         self.doubts_told = self.duration_read = False
 
+    @classmethod
+    def of(cls, declarations: Declarations) -> Problem:
+        """A problem with these declarations."""
+        result = cls(declarations.free_duration or declarations.duration, declarations.name)
+        result._declarations = declarations
+        return result
+
     @checked(unit=text)
     def state(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 
@@ -11,7 +11,7 @@ from covocp.base.pages import as_html, as_text
 from covocp.base.threads import methods_one_at_a_time
 from covocp.problem.chances import with_chance_conditions
 from covocp.problem.checks import check_name, check_size
-from covocp.problem.declarations import Chance, Declarations, Free
+from covocp.problem.declarations import Chance, Declarations
 from covocp.problem.description import sections
 from covocp.problem.expected_cost import statement_of
 from covocp.statement.statement import Statement
@@ -31,17 +31,6 @@ class Declared:
     _expanded: Declarations | None
     doubts_told: bool
     duration_read: bool
-
-    def __init__(self, duration: float | Free, name: str = "") -> None:
-        """Of `Problem`, which begins without declarations."""
-        raise NotImplementedError
-
-    @classmethod
-    def of(cls, declarations: Declarations) -> Self:
-        """A problem with these declarations."""
-        result = cls(declarations.free_duration or declarations.duration, declarations.name)
-        result._declarations = declarations
-        return result
 
     @property
     def declarations(self) -> Declarations:
