@@ -102,12 +102,13 @@ def test_import_loads_neither_scipy_nor_the_laws(tmp_path):
 
 
 def test_a_solve_loads_nothing_that_takes_as_long(tmp_path):
-    """With necessary conditions, on a mesh that refines itself, with and without covariances."""
+    """With necessary conditions, on a mesh that refines itself, with and without covariances, under feedback."""
     found = run_python(
         "import sys, covocp as co\n"
-        "from covocp.models import bryson_denham, mass_chain\n"
+        "from covocp.models import bryson_denham, mass_chain, unknown_lag\n"
         "co.solve(mass_chain.problem(masses=1), progress=False, intervals=30).optimality\n"
         "co.solve(bryson_denham.problem(), progress=False, refine=1e-3).optimality\n"
+        "co.solve(unknown_lag.steering(), progress=False).optimality\n"
         "print(sorted({'scipy', 'numpy.ma', 'numpy.random', 'matplotlib'} & set(sys.modules)))",
         tmp_path,
     )

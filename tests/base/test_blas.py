@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
+
+import casadi as ca
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_info, threadpool_limits
 
 import covocp as co
+from covocp.base.blas import BlasController
 from covocp.base.threads import TURN
 
 
 def counts() -> dict[str, int]:
     """Threads of each library that is loaded."""
     return {one["filepath"]: one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_every_library_of_linear_algebra_is_found_among_all_that_are_loaded():
+    ca.has_linsol("lapacklu")
+    every = [one for one in ThreadpoolController().info() if one["user_api"] == "blas"]
+    assert any("casadi" in one["filepath"] for one in every)
+    key = itemgetter("filepath")
+    assert sorted(BlasController().info(), key=key) == sorted(every, key=key)
 
 
 def test_linear_algebra_has_one_thread_for_as_long_as_a_call_lasts():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from covocp.base.buffered import Buffered
-from covocp.base.expressions import minus, plus, slopes_by, times
+from covocp.base.expressions import minus, plus, slopes_by, times, trial_values
 
 
 @pytest.mark.parametrize("symbolic", [ca.SX, ca.MX])
@@ -60,3 +60,15 @@ def test_operations_by_name_are_those_of_the_operators(symbolic, combined):
     assert combined(3.0, 4) == OPERATIONS[combined](3.0, 4)
     with pytest.raises(RuntimeError, match="imension"):
         combined(a, symbolic.sym("d", 3, 2))
+
+
+def test_no_small_multiples_of_trial_values_add_up_to_another():
+    """Else matrices and rates that differ could be taken for the same where values of their symbols happen to meet."""
+    values = trial_values(40)
+    assert ((values >= 0.5) & (values <= 1.5)).all()
+    np.testing.assert_array_equal(trial_values(7, 5), values[5:12])
+    multiples = np.array([-2, -1, 1, 2])
+    sums = (multiples[:, None] * values)[:, None, :, None] + (multiples[:, None] * values)[None, :, None, :]
+    i, j = np.triu_indices(values.size, 1)
+    pairs = np.sort(np.append(sums[:, :, i, j].ravel(), values))
+    assert np.diff(pairs).min() > 1e-9

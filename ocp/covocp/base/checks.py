@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import accumulate
 from typing import Any
 
 import casadi as ca
@@ -11,7 +12,7 @@ import numpy as np
 
 from covocp.base.arguments import is_whole as is_whole
 from covocp.base.errors import ProblemError, kind_and_name, shown
-from covocp.base.expressions import Given
+from covocp.base.expressions import Given, trial_values
 from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers
 
 # Share of its largest entry by which a matrix may differ from its transpose.
@@ -214,10 +215,10 @@ def check_symmetric_numbers(name: str, what: str, numbers: Array) -> None:
 
 
 def check_symmetric(name: str, what: str, expression: ca.MX) -> None:
-    """A matrix expression must be symmetric: seen at random values of its symbols."""
+    """A matrix expression must be symmetric: seen at some values of its symbols."""
     symbols = ca.symvar(expression)
-    generator = np.random.default_rng(0)
-    values = [generator.uniform(0.5, 1.5, symbol.shape) for symbol in symbols]
+    before = accumulate((symbol.numel() for symbol in symbols), initial=0)
+    values = [trial_values(s.numel(), k).reshape(s.shape) for s, k in zip(symbols, before, strict=False)]
     numbers = np.asarray(ca.Function("matrix", symbols, [ca.densify(expression)]).call(values)[0].full())
     difference = np.abs(numbers - numbers.T)
     if np.isfinite(numbers).all() and (difference > SYMMETRIC * np.abs(numbers).max(initial=0.0)).any():

@@ -48,6 +48,19 @@ minus = _operation(ca.OP_SUB, operator.sub)
 times = _operation(ca.OP_MUL, operator.mul)
 
 
+def trial_values(count: int, after: int = 0) -> Any:
+    """Numbers (count,) between 0.5 and 1.5 at which expressions are compared: no formula of a model relates them.
+
+    The squares grow too unevenly for sums and multiples of what is here to meet again. They are not drawn: random
+    numbers would be the one thing for which a solve loads their library.
+
+    Args:
+        count: how many.
+        after: so many of them are passed over.
+    """
+    return 1.0 + 0.5 * np.sin(np.arange(after + 1.0, after + count + 1.0) ** 2)
+
+
 def symbol_of(key: Given) -> Any:
     """The symbol of what stands for a state that is no vector, such as an attitude; anything else as it is."""
     return getattr(key, "quaternion", key)
