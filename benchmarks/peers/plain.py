@@ -8,7 +8,9 @@ left out: on an idle machine what a user waits, all run on one thread. covocp an
 accuracy that is asked for. The other tools have equal meshes. Who uses them does not know the optimum, and so solves on
 one after the other until the cost settles: "until it settles". "To 1e-6" is the coarsest mesh that is exact enough,
 found in another process by the optimum itself, and nothing else is timed: what a user cannot have, and the hardest to
-compare with. rockit, whose mesh is changed by building anew, has 100 intervals. What is not installed is left out.
+compare with. rockit, whose mesh is changed by building anew, has 100 intervals. "By hand" and the scripts of
+casadi.Opti, whose steps are mapped or in a loop, have 100 as well: on these the error is that of covocp's 100
+intervals, and the last line compares their times. What is not installed is left out.
 """
 
 from __future__ import annotations
@@ -24,11 +26,14 @@ from plain_problems import PLAIN
 
 REFINE, INTERVALS, REPEATS = 1e-6, 100, 5
 OWN = "covocp, refined"
+PLAIN_MESH = "covocp, 100 intervals"
 OTHERS = ("rockit", "maptor", "yapss")
+# Codes that have covocp's steps on its equal mesh.
+ALIKE = ("Opti", "Opti, loop", "by hand")
 CODES = (
     OWN,
-    "covocp, 100 intervals",
-    "by hand",
+    PLAIN_MESH,
+    *ALIKE,
     "by hand, to 1e-6",
     "by hand, until it settles",
     "rockit",
@@ -42,7 +47,9 @@ def cases() -> list[Case]:
     """Every tool that is there, on every problem."""
     own = {
         OWN: {"function": "plain_codes.covocp_solve", "refine": REFINE},
-        "covocp, 100 intervals": {"function": "plain_codes.covocp_solve"},
+        PLAIN_MESH: {"function": "plain_codes.covocp_solve"},
+        "Opti": {"function": "plain_codes.opti", "intervals": INTERVALS, "mapped": True},
+        "Opti, loop": {"function": "plain_codes.opti", "intervals": INTERVALS, "mapped": False},
         "by hand": {"function": "plain_codes.hand", "intervals": INTERVALS},
         "by hand, to 1e-6": {"function": "plain_codes.hand_to_accuracy", "refine": REFINE},
         "by hand, until it settles": {"function": "plain_codes.hand_until_settled", "refine": REFINE},
@@ -79,7 +86,16 @@ def table(measured: Sequence[Case]) -> str:
     medians = [statistics.median([_ratio(measured, name, code) for name in PLAIN]) for code in codes[1:]]
     times = " | ".join("alone" if math.isinf(ratio) else f"{ratio:.1f} times" for ratio in medians)
     lines.append(f"| {OWN}, is faster, median | - | {times} |")
+    slower = " | ".join(f"{_longer(measured, code):.2f} times" if code in ALIKE else "-" for code in codes[1:])
+    lines.append(f"| {PLAIN_MESH} take as long, median | - | {slower} |")
     return "\n".join(lines)
+
+
+def _longer(measured: Sequence[Case], code: str) -> float:
+    """How many times as long covocp takes as another code on the same mesh; median of the problems that both solve."""
+    seconds = {(case.part, case.code): case.median() for case in measured}
+    pairs = [(seconds[name, PLAIN_MESH], seconds[name, code]) for name in PLAIN]
+    return statistics.median([own / other for own, other in pairs if own is not None and other is not None])
 
 
 def _ratio(measured: Sequence[Case], name: str, code: str) -> float:

@@ -88,6 +88,67 @@ def hand(case: dict[str, Any]) -> dict[str, Any]:
     return _result(case, start, built, float(found["f"]), n, str(solver.stats()["return_status"]))
 
 
+def opti(case: dict[str, Any]) -> dict[str, Any]:
+    """A script of casadi.Opti: the same transcription, its Runge-Kutta steps mapped, or written in a loop."""
+    import casadi as ca
+
+    own, n = PLAIN[case["problem"]], case["intervals"]
+    start = time.process_time()
+    nx, nu = len(own.initial), len(own.lower)
+    problem = ca.Opti()
+    X, U = problem.variable(nx, n + 1), problem.variable(nu, n + 1)
+    T = problem.variable() if own.duration is FREE else own.duration
+
+    def rate(x: Any, u: Any) -> tuple[Any, Any]:
+        states, controls = ca.vertsplit(x), ca.vertsplit(u)
+        return ca.vertcat(*own.rates(states, controls)), own.running(states, controls)
+
+    def step(x: Any, a: Any, b: Any, h: Any) -> tuple[Any, Any]:
+        k1, l1 = rate(x, a)
+        k2, l2 = rate(x + h / 2 * k1, (a + b) / 2)
+        k3, l3 = rate(x + h / 2 * k2, (a + b) / 2)
+        k4, l4 = rate(x + h * k3, b)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), h / 6 * (l1 + 2 * l2 + 2 * l3 + l4)
+
+    if case["mapped"]:
+        symbols = [ca.MX.sym("x", nx), ca.MX.sym("a", nu), ca.MX.sym("b", nu), ca.MX.sym("h")]
+        every = ca.Function("step", symbols, list(step(*symbols))).map(n)
+        ends, costs = every(X[:, :-1], U[:, :-1], U[:, 1:], ca.repmat(ca.MX(T / n), 1, n))
+        problem.subject_to(X[:, 1:] == ends)
+        cost = ca.sum2(costs)
+    else:
+        cost = 0
+        for k in range(n):
+            end, part = step(X[:, k], U[:, k], U[:, k + 1], T / n)
+            problem.subject_to(X[:, k + 1] == end)
+            cost += part
+    problem.minimize(T if own.fastest else cost)
+    _opti_limits(problem, own, X, U, T)
+    problem.solver("ipopt", {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 500})
+    built = time.process_time()
+    found = problem.solve()
+    status = str(problem.stats()["return_status"])
+    return _result(case, start, built, float(found.value(problem.f)), n, status)
+
+
+def _opti_limits(problem: Any, own: Plain, X: Any, U: Any, T: Any) -> None:
+    """Bounds, values at the ends, and the guess."""
+    for i, (low, high) in enumerate(zip(own.lower, own.upper, strict=True)):
+        if np.isfinite(low):
+            problem.subject_to(problem.bounded(low, U[i, :], high))
+    for i, high in enumerate(own.highest):
+        if np.isfinite(high):
+            problem.subject_to(X[i, :] <= high)
+    problem.subject_to(X[:, 0] == np.array(own.initial))
+    problem.subject_to(X[:, -1] == np.array(own.final))
+    if own.duration is FREE:
+        problem.subject_to(T >= 1e-3)
+        problem.set_initial(T, own.guess)
+    line, control = _guesses(own, np.linspace(0.0, 1.0, X.shape[1]))
+    problem.set_initial(X, line)
+    problem.set_initial(U, np.tile(control[:, None], X.shape[1]))
+
+
 def hand_to_accuracy(case: dict[str, Any]) -> dict[str, Any]:
     """By hand, on the coarsest of some equal meshes whose error is what was asked for; only that one is timed."""
     return hand({**case, "intervals": _coarsest("hand", MESHES, case)})
