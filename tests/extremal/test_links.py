@@ -59,8 +59,8 @@ def test_a_decision_at_its_bound_counts_once() -> None:
         assert phase.optimality.decisions < 1e-6
 
 
-def _at_rest() -> co.Phases:
-    """An integrator that begins and ends at zero: no costates, and a cost that is the variance at the end."""
+def _at_rest(constant: float) -> co.Phases:
+    """An integrator that begins and ends at zero: no costates; the variance at the end and a constant are the cost."""
     parts = []
     for name in ("A", "B"):
         first = name == "A"
@@ -72,17 +72,18 @@ def _at_rest() -> co.Phases:
         ocp.dynamics(x, u, noise=0.01)
         ocp.measurement("m", x, noise=0.1)
         E = ocp.estimation_covariance()
-        ocp.minimize(running=u**2, terminal=0.0 if first else E[x, x])
+        ocp.minimize(running=u**2, terminal=constant if first else E[x, x])
         parts.append(ocp)
     return co.Phases(parts)
 
 
-def test_costates_that_vanish_meet(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("constant", [0.0, 1e3])
+def test_costates_that_vanish_meet(monkeypatch: pytest.MonkeyPatch, constant: float) -> None:
     """What roundoff differs by is nothing of the cost, though 1 % of itself; a jump of the costate is told."""
     seen: list[Any] = []
     residual = phases_outcome.link_residual
     monkeypatch.setattr(phases_outcome, "link_residual", lambda *args: seen.append(args) or residual(*args))
-    solution = co.solve(_at_rest(), intervals=20, progress=False)
+    solution = co.solve(_at_rest(constant), intervals=20, progress=False)
     assert solution.link_residuals[0] < 1e-7
     assert "LARGE" not in str(solution)
     before, after, link = seen[0]
@@ -90,7 +91,7 @@ def test_costates_that_vanish_meet(monkeypatch: pytest.MonkeyPatch) -> None:
     for jump in (1e-2, 1e-4):
         broken = replace(before, within=replace(before.within, end=before.within.end + jump))
         told = residual(broken, after, link)
-        assert told == pytest.approx(min(1.0, jump * deviation / (0.1 * solution.cost)), rel=1e-2)
+        assert told == pytest.approx(min(1.0, jump * deviation / (0.1 * (solution.cost - constant))), rel=1e-2)
         assert told > 1e-4
 
 

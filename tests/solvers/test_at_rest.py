@@ -10,14 +10,14 @@ import pytest
 import covocp as co
 
 
-def regulator(*, unit: float = 1.0, dense: bool = False) -> co.Problem:
-    """A damped mass at rest, kept there; `unit`: of lengths, in metres."""
+def regulator(*, unit: float = 1.0, dense: bool = False, constant: float = 0.0) -> co.Problem:
+    """A damped mass at rest, kept there; `unit`: of lengths, in metres; `constant`: added to the running cost."""
     ocp = co.Problem(duration=10.0, name="at rest")
     x, v = (ocp.state(name, initial=0.0, variance=0.01 * unit**2 if dense else None) for name in "xv")
     u = ocp.control("u")
     ocp.dynamics(x, v)
     ocp.dynamics(v, u - 0.1 * v, noise=1e-4 * unit**2 if dense else None)
-    cost = (x**2 + v**2 + u**2) / unit**2
+    cost = (x**2 + v**2 + u**2) / unit**2 + constant
     if dense:
         ocp.measurement("y", x, noise=1e-3 * unit**2)
         E = ocp.estimation_covariance()
@@ -50,15 +50,25 @@ def test_in_any_unit_and_beside_a_filter(method, unit):
         assert found.cost < 1e-12
 
 
-def test_phases_at_rest_meet():
+@pytest.mark.parametrize("constant", [1.0, 1e6])
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_beside_a_constant(method, constant):
+    """What of the cost can change is nothing there but by its second derivatives."""
+    found = co.solve(regulator(constant=constant), method, intervals=40, progress=False)
+    assert found.cost == pytest.approx(10.0 * constant)
+    assert "LARGE" not in str(found)
+
+
+@pytest.mark.parametrize("constant", [0.0, 1e6])
+def test_phases_at_rest_meet(constant):
     """Costates of 1e-150 on both sides of a link differ by nothing."""
     parts = []
     for k in range(2):
         ocp = co.Problem(2.0, name=f"part {k}")
         x, u = ocp.state("x", initial=0.0 if k == 0 else None, final=0.0 if k == 1 else None), ocp.control("u")
         ocp.dynamics(x, u - x)
-        ocp.minimize(running=x**2 + u**2)
+        ocp.minimize(running=x**2 + u**2 + constant)
         parts.append(ocp)
     found = co.solve(co.Phases(parts), intervals=10, progress=False)
-    assert found.cost < 1e-20
+    assert found.cost == pytest.approx(4.0 * constant, abs=1e-20)
     assert "LARGE" not in str(found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,18 +9,16 @@ from numpy.typing import NDArray
 
 from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array, stacked
+from covocp.extremal.cost_sizes import absolute_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import halved, refined
 from covocp.extremal.hamiltonian import by_controls
-from covocp.extremal.nodes import mapped
 from covocp.statement.interval import repeated
 
 # A truth value for each control of each interval.
 Mask = NDArray[np.bool_]
 
-# What no cost is in any unit, but what is left of zero: of a plant that is at rest.
-ZERO_COST = 1e-30
 # Integrals over [0, 1] of the products of the quadratic polynomials that are 1 at one of 0, 1/2, 1 and 0 at the others.
 QUADRATIC_PRODUCTS = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30.0
 # Weights of the integral over [0, 1] of a value at 0, 1/2 and 1.
@@ -142,12 +139,3 @@ def _fall(u: Array, slope: Array, curvature: Array, lower: Array, upper: Array) 
     bend = np.where(bend > 0, bend, 1.0)
     move = np.clip(u - slope / bend, lower, upper) - u
     return np.asarray(np.maximum(-(slope * move + bend / 2 * move**2), 0.0))
-
-
-@lru_cache(maxsize=4)
-def absolute_cost(extremal: Extremal) -> float:
-    """Sum of the sizes of terminal and running cost (trapezoidal, for a scale)."""
-    st, t = extremal.statement, extremal.trajectory
-    terminal = float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    running = mapped(st, "rates", extremal.mesh.intervals + 1).evaluated(*extremal.columns())[2]
-    return abs(terminal) + abs(float(np.trapezoid(running.ravel(), extremal.time)))

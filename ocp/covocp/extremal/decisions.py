@@ -11,7 +11,7 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.base.residuals import VANISHING
 from covocp.base.short_repr import short_repr
-from covocp.extremal.control_error import absolute_cost
+from covocp.extremal.cost_sizes import variable_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
@@ -30,8 +30,8 @@ class DecisionSlopes:
     Attributes:
         total: int H_d dt and all end terms, with the multipliers of the bounds.
         size: sum of the absolute terms.
-        floor: a tenth of the cost by the magnitude of the decision: what has no terms, as in a phase that does not use
-            the decision, leaves a slope of roundoff, which is the whole of its size.
+        floor: a tenth of what of the cost is variable by the magnitude of the decision: what has no terms, as in a
+            phase that does not use the decision, leaves a slope of roundoff, which is the whole of its size.
     """
 
     total: Array
@@ -56,7 +56,7 @@ def decision_slopes(
         extremal: the solution.
         costates: of its multipliers, at the nodes.
         given: multipliers of initial states that an earlier statement of a chain gives, (nx,).
-        others: size of the cost of the rest of a chain.
+        others: what of the cost of the rest of a chain is variable.
     """
     if extremal.mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
@@ -65,7 +65,7 @@ def decision_slopes(
     at_start = start_slopes(extremal, costates)[rows]
     total = at_start + _mismatches(extremal, costates)[rows]
     total = total if given is None else total + given[rows]
-    cost = VANISHING * (absolute_cost(extremal) + others)
+    cost = VANISHING * (variable_cost(extremal) + others)
     return DecisionSlopes(total=total, size=_sizes(extremal, costates), floor=cost / _magnitudes(extremal))
 
 

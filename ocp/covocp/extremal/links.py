@@ -14,7 +14,7 @@ from covocp.base.expressions import slopes_by
 from covocp.base.matrices import Array
 from covocp.base.residuals import VANISHING
 from covocp.base.short_repr import short_repr
-from covocp.extremal.control_error import ZERO_COST, absolute_cost
+from covocp.extremal.cost_sizes import ZERO_COST, variable_cost
 from covocp.extremal.costates import discrete_costates, passage_end, terminal_costates, without_passage
 from covocp.extremal.decisions import start_slopes
 from covocp.extremal.extremal import Extremal
@@ -70,6 +70,7 @@ class Within:
     Attributes:
         others: cost of the others.
         size: sum of the sizes of the cost terms of the others.
+        variable: what of it is variable (`variable_cost`).
         start: multipliers of the initial states that the statement before gives, (nx,), zero elsewhere.
         by_duration: slope of what the later statements cost by the duration, through the link.
         end: slopes of what the later ones cost by the state at the end, (nx,).
@@ -80,6 +81,7 @@ class Within:
 
     others: float
     size: float
+    variable: float
     start: Annotated[Array, "x"]
     by_duration: float
     end: Annotated[Array, "x"]
@@ -121,6 +123,7 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         links: of the chain.
     """
     sizes = [sum(abs(value) for value in terms.values()) for terms in outcome.cost_terms]
+    variable = [variable_cost(extremal) for extremal in outcome.extremals]
     extremals = _with_weights(outcome.extremals, links)
     result: list[Passed] = []
     for i in range(len(extremals) - 1, -1, -1):
@@ -146,6 +149,7 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
         within = Within(
             others=others,
             size=float(sum(sizes) - sizes[i]),
+            variable=float(sum(variable[:i]) + sum(variable[i + 1 :])),
             start=start,
             by_duration=slopes.duration,
             end=slopes.state,
@@ -217,8 +221,8 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
 
     mu and mu+ are the multipliers of bounds that act there, which may hold a state on either side of the link. Of
     states that are not prescribed; relative to the largest costate on both sides or, where that is less, as a change of
-    the cost if all of these states moved by their magnitudes, relative to a tenth of it: costates that vanish are
-    roundoff, and so is what they differ by.
+    the cost if all of these states moved by their magnitudes, relative to a tenth of what of it is variable: costates
+    that vanish are roundoff, and so is what they differ by.
 
     Args:
         before: what ends there.
@@ -240,7 +244,7 @@ def link_residual(before: Passed, after: Passed, link: Link) -> float:
     changed = float((missed * np.concatenate([units[loose], later[free], later[passing]])).sum())
     size = max(float(np.abs(passed.costates.state).max(initial=0.0)) for passed in (before, after))
     tiny = float(np.finfo(float).tiny)
-    cost = VANISHING * (absolute_cost(first) + before.within.size)
+    cost = VANISHING * (variable_cost(first) + before.within.variable)
     return min(float(missed.max(initial=0.0)) / max(size, tiny), changed / max(cost, ZERO_COST))
 
 

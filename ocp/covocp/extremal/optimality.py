@@ -13,7 +13,8 @@ from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
 from covocp.extremal.closed_loop import ClosedLoop
-from covocp.extremal.control_error import ZERO_COST, absolute_cost, estimate_control_error
+from covocp.extremal.control_error import estimate_control_error
+from covocp.extremal.cost_sizes import ZERO_COST, absolute_cost, variable_cost
 from covocp.extremal.costates import discrete_costates, integrated_costates, passage_end
 from covocp.extremal.curvature import smallest_curvature
 from covocp.extremal.decisions import decision_slopes
@@ -48,7 +49,8 @@ class Optimality:
         stationarity: largest slope of the Lagrangian by a control value, per unit of time (H_u in the mean over the
             neighbourhood of a node, at least the mean one), bounds' multipliers included; relative to the largest sum
             of the absolute terms of H_u (or |H_uu| |u|, where more); or, where that is less, the change of the cost if
-            all controls change by their magnitudes, relative to a tenth of it: what is zero has no terms.
+            all controls change by their magnitudes, relative to a tenth of what of it is variable, no constants
+            (`cost_sizes.variable_cost`): what is zero has no terms.
         complementarity: sum of |multiplier| times distance from the bound over all inequalities, relative to the
             cost: a multiplier of a bound that is not active makes a slope look like none.
         control_slope: root mean square of H_u at the nodes with free controls, None where a condition along the path or
@@ -73,7 +75,7 @@ class Optimality:
             had; nan where it would take too long. Negative: the solution is a saddle.
         decisions: largest slope of the Lagrangian by a decision: int H_d dt, the slopes of all end terms, and the
             multipliers of its bounds; relative to the sum of the absolute terms or, where that is less, to a tenth of
-            the cost by the magnitude of the decision; None without decisions.
+            what of the cost is variable by the magnitude of the decision; None without decisions.
         cost_identity: relative difference of the cost that was optimised, integrated from E and S, and the expected
             cost (E-1) from the covariances of the loop; None without a closed loop.
         cross_covariance: largest correlation of the estimate and its error, zero for the gains of the filter; None
@@ -156,7 +158,7 @@ def assess(
         bounded = ~whole & ~(beside[:-1] | beside[1:])
         control_error = estimate_control_error(extremal, (whole, bounded), others)
     found = Optimality(
-        stationarity=_stationarity(extremal, left, scale, others) if st.nu else 0.0,
+        stationarity=_stationarity(extremal, left, scale, within) if st.nu else 0.0,
         control_slope=control_slope,
         costate_difference=_costate_difference(extremal, costates),
         hamiltonian_variation=_variation(extremal, values) if st.autonomous else None,
@@ -175,7 +177,7 @@ def assess(
     return _of_nothing(found) if nothing else found
 
 
-def _stationarity(extremal: Extremal, slopes: Array, scale: float, others: float) -> float:
+def _stationarity(extremal: Extremal, slopes: Array, scale: float, within: Within | None) -> float:
     """The largest slope of the Lagrangian per unit of time in units of the terms of H_u, or all of them in the cost."""
     shares = quadrature_weights(extremal.mesh)[:, None]
     times = np.maximum(shares, shares.mean()) * extremal.trajectory.duration  # what acts for less time is not seen
@@ -184,7 +186,8 @@ def _stationarity(extremal: Extremal, slopes: Array, scale: float, others: float
         return value
     units = choose_scales(extremal.statement, extremal.mesh, extremal.trajectory, extremal.parameters).u
     changed = float((np.abs(slopes) * units).sum())
-    return min(value, changed / max(VANISHING * (absolute_cost(extremal) + others), np.finfo(float).tiny))
+    cost = variable_cost(extremal) + (0.0 if within is None else within.variable)
+    return min(value, changed / max(VANISHING * cost, np.finfo(float).tiny))
 
 
 def complementarity(extremal: Extremal, others: float = 0.0) -> float:
@@ -360,7 +363,7 @@ def _decisions(extremal: Extremal, costates: Costates, within: Within | None) ->
         return None
     if within is None:
         return decision_slopes(extremal, costates).relative
-    return decision_slopes(extremal, costates, within.start, within.size).relative
+    return decision_slopes(extremal, costates, within.start, within.variable).relative
 
 
 def _curvature(extremal: Extremal, seconds: float) -> float | None:

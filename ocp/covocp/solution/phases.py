@@ -85,8 +85,9 @@ class PhasesSolution:
         message: how the method ended.
         phases: their solutions in order.
         link_residuals: where each phase meets the next, the largest difference of p and k_x + J' p+, relative to p or,
-            where that is less, as a change of the cost; see `covocp.extremal.links.link_residual`; nan
-            along controls that were given, where p+ is had from the later phase alone.
+            where that is less, as a change of the cost by what of it is variable; see
+            `covocp.extremal.links.link_residual`; nan along controls that were given, where p+ is had from the later
+            phase alone.
         violations: of constraints, by name with that of the phase.
         stats: iterations, times, what the method counts.
         links: what passes from each phase to the next; none where it was read from a file without its phases.
