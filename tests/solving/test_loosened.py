@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,12 @@ def brisk(limit=1.2):
     ocp.minimize_expected(running=u**2, terminal_weight={x: 10.0, v: 1.0})
     ocp.chance(v, upper=limit, probability=0.98, name="speed")
     return ocp
+
+
+def passed(solution):
+    """By how much v + z sqrt(E_vv + Xhat_vv), z the quantile of 98 %, passes 1.2 at the nodes."""
+    deviation = np.sqrt(solution["E"][:, 1, 1] + solution["Xhat"][:, 1, 1])
+    return float((np.ravel(solution["v"]) + 2.0537489 * deviation).max()) - 1.2
 
 
 def test_a_run_that_gives_up_finds_its_way_by_loosened_limits(monkeypatch):
@@ -62,3 +70,51 @@ def test_other_plugins_and_methods_keep_their_own_iterations():
     problem = brisk(1.4)  # which do not bind
     by_other = co.solve(problem, intervals=10, plugin="sqpmethod", progress=False)
     assert by_other.cost == pytest.approx(co.solve(problem, intervals=10, progress=False).cost, rel=1e-6)
+
+
+def test_at_a_limit_inside_a_loosened_run_the_best_point_counts(monkeypatch):
+    """With what it violates of the limit itself."""
+    monkeypatch.setattr(solver, "PATIENCE", 2)  # the first run ends early, and far away
+    first, later = (
+        co.Solver(brisk(), intervals=30).solve(iteration_limit=limit, progress=False) for limit in (31, 100)
+    )
+    assert not later.converged
+    assert later.message == "stopped at the limit of 100 iterations"
+    assert later.stats["iterations"] > first.stats["iterations"] + 50  # of all runs
+    assert max(later.violations.values()) < 0.3 * max(first.violations.values())
+    assert later.violations["speed"] == pytest.approx(passed(later), rel=1e-5)
+
+
+def test_a_solution_under_wider_limits_is_not_one_of_the_problem(monkeypatch):
+    """Where the user interrupts after it, and the first run ended worse: it is told with what it violates."""
+    monkeypatch.setattr(solver, "PATIENCE", 2)
+    made_ready, tightened = solver.made_ready, solver.tightened
+    reached = []
+
+    class Last:
+        def __init__(self, prepared):
+            self.mesh, self._prepared = prepared.mesh, prepared
+
+        def solve(self, parameters, start, reporter):
+            found = self._prepared.solve(parameters, start, reporter)
+            reporter.asked = found.converged
+            reached.append(found)
+            return found
+
+    def ready(*given, **own):
+        prepared = made_ready(*given, **own)
+        return Last(prepared) if own.get("max_iterations") == PATIENCE_OF_STEPS else prepared
+
+    def after_worse(statement, failed, *rest):
+        return tightened(statement, replace(failed, violations={"speed": np.inf}), *rest)
+
+    monkeypatch.setattr(solver, "made_ready", ready)
+    monkeypatch.setattr(solver, "tightened", after_worse)
+    with pytest.raises(co.Interrupted) as told:
+        co.solve(brisk(), intervals=30, progress=False)
+    found = told.value.solution
+    assert reached[-1].converged
+    assert reached[-1].violations == {}
+    assert not found.converged
+    assert passed(found) > 0.01
+    assert found.violations == pytest.approx({"speed": passed(found)}, rel=1e-5)

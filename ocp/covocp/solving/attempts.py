@@ -109,6 +109,13 @@ def cost_of(outcome: Outcome | ChainOutcome) -> float:
     return outcome.cost if isinstance(outcome, ChainOutcome) else float(sum(outcome.cost_terms.values()))
 
 
+def rank(outcome: Outcome) -> tuple[float, float]:
+    """Less is better: what meets the conditions by its cost, anything else by what it violates."""
+    numbers = max(outcome.violations.values(), default=0.0), cost_of(outcome)
+    violation, cost = (number if np.isfinite(number) else np.inf for number in numbers)
+    return violation, cost
+
+
 def counted(first: AnyOutcome | Solution, second: AnyOutcome) -> dict[str, Any]:
     """Iterations and times of two runs together."""
     names = ("iterations", "build_seconds", "solve_seconds")

@@ -16,8 +16,10 @@ from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
+from covocp.extremal.fine_mesh import refined
+from covocp.extremal.given_controls import missed
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import counted, with_stats
+from covocp.solving.attempts import counted, rank, with_stats
 from covocp.solving.warm_start import make_guess
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
@@ -31,6 +33,8 @@ PATIENCE, PATIENCE_OF_STEPS = 400, 150
 FIRST, SMALLEST, MOST = 0.5, 0.02, 20
 # What the start misses of a limit is allowed with so much more.
 ROOM = 1.1
+
+STOPPED = "stopped while its conditions were loosened"
 
 # Makes a statement ready, with so many iterations at most.
 Ready = Callable[[Statement, int], Prepared]
@@ -46,6 +50,8 @@ def can_be_loosened(statement: Statement) -> bool:
 def tightened(statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress) -> Outcome:
     """The outcome by way of problems whose limits are loosened less and less, the last one not at all; else as before.
 
+    Where a limit ends the way, or the user does, the best point until then counts, by what it violates of the problem.
+
     Args:
         statement: the problem.
         failed: its outcome before.
@@ -54,26 +60,27 @@ def tightened(statement: Statement, failed: Outcome, best: Solution, ready: Read
         reporter: of iterations.
     """
     found = _sequence(statement, failed, best, ready, reporter) if can_be_loosened(statement) else None
-    return failed if found is None else with_stats(found, **counted(failed, found))
+    if found is None:
+        return failed
+    chosen = found if found.converged else min(failed, found, key=rank)
+    return with_stats(chosen, **counted(failed, found))
 
 
 def _sequence(
     statement: Statement, failed: Outcome, best: Solution, ready: Ready, reporter: Progress
 ) -> Outcome | None:
-    """The outcome of the problem itself; None where the steps became too small before."""
+    """The outcome of the problem itself, or the best until a limit is reached; None where steps became too small."""
     mesh, parameters = failed.extremal.mesh, failed.extremal.parameters
     start = make_guess(statement, mesh, parameters, best)
-    missed = {
+    room = {
         name: _missed(getattr(statement, name), name, start.trajectory, mesh, parameters) for name in ("path", "end")
     }
-    if not any(np.any(own > 0) for own in missed.values()):
+    if not any(np.any(own > 0) for own in room.values()):
         return None
     share, step, last = 1.0, 0.0, None
     for _ in range(MOST):
-        if reporter.stop:
-            return None
         wanted = share - step if share - step > SMALLEST / 2 else 0.0
-        problem = statement if wanted == 0.0 else _loosened(statement, missed, wanted)
+        problem = statement if wanted == 0.0 else _loosened(statement, room, wanted)
         try:
             if last is not None:
                 start = make_guess(problem, mesh, parameters, Solution.of(last, best.method, assess=False))
@@ -82,9 +89,12 @@ def _sequence(
         except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: the run before it counts
             return None
         found = found if last is None else with_stats(found, **counted(last, found))
+        if found.converged and wanted == 0.0:
+            return found
+        if reporter.stop:
+            reached = [_of_problem(statement, one) for one in (last, found) if one is not None]
+            return replace(min(reached, key=rank), stats=found.stats)
         if found.converged:
-            if wanted == 0.0:
-                return found
             step = FIRST if last is None else min(1.5 * step, FIRST)
             share, last = wanted, found
         elif last is None or step <= SMALLEST:
@@ -92,6 +102,13 @@ def _sequence(
         else:
             step = 0.5 * step
     return None
+
+
+def _of_problem(statement: Statement, outcome: Outcome) -> Outcome:
+    """What was reached under wider limits, with what it violates of the problem: no solution of that."""
+    extremal = replace(outcome.extremal, stated=statement)
+    violations = {**outcome.violations, **missed(refined(extremal))}  # limits act at all its nodes
+    return replace(outcome, extremal=extremal, violations=violations, converged=False, message=STOPPED)
 
 
 def _missed(rows: Conditions, name: str, start: Trajectory, mesh: Mesh, parameters: Array) -> Array:
@@ -108,10 +125,10 @@ def _missed(rows: Conditions, name: str, start: Trajectory, mesh: Mesh, paramete
     return np.where(np.isfinite(over) & ~rows.equations, ROOM * np.maximum(over, 0.0), 0.0)
 
 
-def _loosened(statement: Statement, missed: dict[str, Array], share: float) -> Statement:
+def _loosened(statement: Statement, room: dict[str, Array], share: float) -> Statement:
     """The statement with limits that are wider by a share of what the start missed of them."""
     wider: dict[str, Any] = {}
-    for name, by in missed.items():
+    for name, by in room.items():
         rows: Conditions = getattr(statement, name)
         wider[name] = replace(rows, lower=rows.lower - share * by, upper=rows.upper + share * by)
     return replace(statement, **wider)

@@ -12,14 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from covocp.base.errors import CovocpError
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Outcome, Prepared
 from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
-from covocp.solving.attempts import cost_of, counted, with_stats
+from covocp.solving.attempts import counted, rank, with_stats
 from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh, Options
@@ -90,18 +88,11 @@ def by_other_ways(
         if found.converged:
             return with_stats(found, **both, **{OTHERWISE: way.words}), (way, prepared)
         if reporter.stop:
-            failed = with_stats(min(failed, found, key=_rank), **both)
+            failed = with_stats(min(failed, found, key=rank), **both)
             break
         tried.append(way.words)
         failed = with_stats(failed, **counted(failed, found))
     return (with_stats(failed, **{OTHERWISE: " and ".join(tried)}) if tried else failed), None
-
-
-def _rank(outcome: Outcome) -> tuple[float, float]:
-    """Less is better: what meets the conditions by its cost, anything else by what it violates."""
-    numbers = max(outcome.violations.values(), default=0.0), cost_of(outcome)
-    violation, cost = (number if np.isfinite(number) else np.inf for number in numbers)
-    return violation, cost
 
 
 def told_ways(tried: str, left: Iterable[Way]) -> str:
