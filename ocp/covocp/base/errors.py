@@ -142,6 +142,11 @@ def without_warnings() -> Iterator[None]:
         _HELD_BACK.reset(token)
 
 
+def last_line(error: BaseException) -> str:
+    """What an error of CasADi's says at last: before that stand the functions that called each other."""
+    return " ".join(str(error).strip().splitlines()[-1:])[:200]
+
+
 @contextmanager
 def evaluating(name: str) -> Iterator[None]:
     """What CasADi raises where a model has no value (a singular factorisation, a number too large), as an own error.
@@ -157,11 +162,10 @@ def evaluating(name: str) -> Iterator[None]:
     except RuntimeError as error:
         if isinstance(error, CovocpError):
             raise
-        reason = " ".join(str(error).strip().splitlines()[-1:])
         raise SolveError(
             f"'{name or 'The problem'}' has no value somewhere between its guess and its end: a solve of linear "
-            f"equations inside it fails, or a number is too large ({reason[:200]}). Give another guess, bounds that "
-            "keep the model in its domain, or other units."
+            f"equations inside it fails, or a number is too large ({last_line(error)}). Give another guess, bounds "
+            "that keep the model in its domain, or other units."
         ) from error
 
 

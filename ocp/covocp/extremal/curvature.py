@@ -97,11 +97,16 @@ def smallest_curvature(extremal: Extremal, seconds: float = np.inf) -> Curvature
     if not extremal.statement.nu:
         return None
     try:
-        reduced = _Reduced.of(extremal, seconds)
+        return _smallest(extremal, seconds)
     except _TooLongError:
         return _unknown(extremal)
     except (RuntimeError, ArithmeticError, np.linalg.LinAlgError):  # a step that cannot be differentiated or solved
         return None
+
+
+def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
+    """What `smallest_curvature` returns where nothing fails."""
+    reduced = _Reduced.of(extremal, seconds)
     if reduced is None:
         return None
     strict = reduced.null_space(reduced.strict)

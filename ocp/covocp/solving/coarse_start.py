@@ -73,6 +73,6 @@ def from_coarser(
     try:
         prepared = run(fewer)
         outcome, _ = from_starts(prepared, values, make_guesses(statement, prepared.mesh, values, guess), reporter)
-    except CovocpError:
+    except (CovocpError, RuntimeError):  # CasADi's, of a step that cannot be solved: it is a start like others
         return None
     return outcome if outcome.converged else None

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from covocp.base.errors import warn_user
+from covocp.base.errors import CovocpError, last_line, warn_user
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
+from covocp.extremal.links import ChainOutcome
 from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
@@ -36,11 +39,17 @@ CHEAPER = 1e-9
 # at a node, where the cost is concave in it.
 HARDLY = 1e-5
 
+# What is looked for.
+SADDLE, TURNS = "the run ended at a saddle", "angles turn full circle between its nodes"
+
+Looked = TypeVar("Looked", Outcome, ChainOutcome)
+
 
 def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
     """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it; leave a saddle along it.
 
-    The look takes no longer than what else is looked at after a run, nor than a limit of the time leaves.
+    The look takes no longer than what else is looked at after a run, nor than a limit of the time leaves. Where it
+    fails the run counts as it ended, with a warning.
 
     Args:
         prepared: what ran.
@@ -49,6 +58,29 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
         reporter: of iterations.
         start: of the run.
     """
+    return unless_it_fails(outcome, SADDLE, lambda: _off_saddle(prepared, outcome, values, reporter, start))
+
+
+def unless_it_fails(outcome: Looked, what: str, look: Callable[[], Looked]) -> Looked:
+    """What a look at an outcome finds; where it fails, the outcome: what is solved is not lost for a look at it.
+
+    Args:
+        outcome: of one problem or of several phases.
+        what: is looked for, a clause.
+        look: at the outcome; returns it, or a better one.
+    """
+    try:
+        return look()
+    except (CovocpError, RuntimeError) as error:  # CasADi's, of a step that cannot be solved
+        warn_user(
+            f"The look whether {what} failed ({last_line(error)}). The solution is that of before it; compare it with "
+            "one from another guess."
+        )
+        return outcome
+
+
+def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
+    """What `away_from_saddle` returns."""
     iterations = outcome.stats.get("iterations", -1)
     exact = outcome.stats.get("hessian") == "exact"
     few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
@@ -64,7 +96,13 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
     for sign in ESCAPES:
         moved = _displaced(outcome.extremal, curvature, sign)
         displaced = make_guess(outcome.extremal.statement, prepared.mesh, values, moved)
-        candidates.append(prepared.solve(values, displaced, reporter))
+        with suppress(CovocpError, RuntimeError):  # outside of the domain of the model; the other side may be within
+            candidates.append(prepared.solve(values, displaced, reporter))
+    if not candidates:
+        warn_user(
+            "The run ended at a saddle (negative curvature of the reduced Hessian), and runs from beside it fail: the "
+            "model has no values there. Start from another guess."
+        )
     limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
     better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
@@ -106,7 +144,7 @@ def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Traject
 
 
 def without_turns(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-    """Solved again without the turns that angles make between nodes, where that is cheaper.
+    """Solved again without the turns that angles make between nodes, where that works and is cheaper.
 
     Args:
         prepared: what ran.
@@ -114,6 +152,11 @@ def without_turns(prepared: Prepared, outcome: Outcome, values: Array, reporter:
         values: of the parameters.
         reporter: of iterations.
     """
+    return unless_it_fails(outcome, TURNS, lambda: _unwound(prepared, outcome, values, reporter))
+
+
+def _unwound(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
+    """What `without_turns` returns."""
     straight = unwound(outcome.extremal) if outcome.converged and not reporter.stop else None
     if straight is None:
         return outcome

@@ -18,6 +18,7 @@ from covocp.extremal.extremal import Guess
 from covocp.extremal.links import ChainOutcome, completed
 from covocp.extremal.mesh_error import OPTIMISED, finer_steps
 from covocp.solving.attempts import TRIED, best_of, counted
+from covocp.solving.other_minima import TURNS, unless_it_fails
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.random_starts import drawn_guess, phase_seed
 from covocp.solving.refined_meshes import Measured, remade
@@ -188,7 +189,11 @@ class ChainRuns:
         return self._measured(begun.options, prepared, self._unwound(begun, prepared, outcome))
 
     def _unwound(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
-        """Solved again without the turns that angles make between nodes, where that is cheaper."""
+        """Solved again without the turns that angles make between nodes, where that works and is cheaper."""
+        return unless_it_fails(outcome, TURNS, lambda: self._straightened(begun, prepared, outcome))
+
+    def _straightened(self, begun: Begun, prepared: Any, outcome: ChainOutcome) -> ChainOutcome:
+        """What `_unwound` returns where nothing fails."""
         straight = [unwound(extremal) if outcome.converged else None for extremal in outcome.extremals]
         if self._reporter.stop or not any(straight):
             return outcome

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
-from covocp.base.errors import CovocpError, Interrupted, ProblemError, evaluating
+from covocp.base.errors import CovocpError, Interrupted, evaluating
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
@@ -395,21 +395,21 @@ class Solver:
         tolerance = self._own.get("tolerance") or method_options(self.method).get("tolerance") or TOLERANCE
         try:
             prepared = self._ready(self._options, tolerance=CONTINUED * tolerance)
-        except ProblemError:  # a plugin that has no tolerance
+            with Progress("", show=False) as reporter:
+                start = make_guess(self._solved, prepared.mesh, values, solution)
+                outcome = prepared.solve(values, start, reporter)
+        except (CovocpError, RuntimeError):  # a plugin that has no tolerance; CasADi's, of a step that cannot be solved
             return solution
-        with Progress("", show=False) as reporter:
-            start = make_guess(self._solved, prepared.mesh, values, solution)
-            outcome = prepared.solve(values, start, reporter)
-            if reporter.stop:
-                message = "Interrupted while the solution was made more exact. On this error (.solution): a solution."
-                raise Interrupted(message, solution=solution)
+        if reporter.stop:
+            message = "Interrupted while the solution was made more exact. On this error (.solution): a solution."
+            raise Interrupted(message, solution=solution)
         if not outcome.converged or not sum(outcome.cost_terms.values()) < solution.cost:
             return solution
         return with_stats(Solution.of(outcome, self._by), **{**solution.stats, **counted(solution, outcome)})
 
     def _cost_of_values(self, values: Array) -> tuple[float, str]:
         """Cost of the classical design for stacked parameters, and why there is none."""
-        with Progress("", show=False) as reporter:
+        with evaluating(self.statement.name), Progress("", show=False) as reporter:
             self._suit(values, nodes=False)
             guesses = make_guesses(self._solved, self._prepared.mesh, values, None)
             outcome, _ = from_starts(self._prepared, values, guesses, reporter)
