@@ -12,6 +12,7 @@ from covocp.base.errors import ProblemError, SolveError, evaluating, no_option
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
 from covocp.extremal.densities import impossible_in_phases
+from covocp.extremal.links import ChainOutcome
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
@@ -65,14 +66,7 @@ def solve_phases(
         SolveError: the method did not converge (carries the last iterate).
         Interrupted: after Ctrl-C (carries the last iterate, or the best of several starts).
     """
-    prepare = getattr(importlib.import_module(module), "prepare_chain", None)
-    if prepare is None or nominal != "combined":
-        raise ProblemError(
-            "Phases are not solved that way.",
-            expected="nominal='combined', and a method that takes phases",
-            received=f"method='{method}'" if prepare is None else f"nominal='{nominal}'",
-            remedy="leave the option out",
-        )
+    prepare = _preparing(method, module, nominal)
     random = multistart(guess, options)
     chain = phases.chain()
     for statement in chain.statements:
@@ -82,10 +76,7 @@ def solve_phases(
     if asked[0].refine is not None:
         own = adapted(method_options(method), own, asked[0].refine)
     guesses = of_each(chain, None if random is not None else guess)
-    for statement, mesh_of_phase, entry in zip(chain.statements, asked, guesses, strict=True):
-        if isinstance(entry, Mapping):
-            mention_lengths({str(key): value for key, value in entry.items()}, mesh_of_phase, statement)
-    mention_idle_in(phases)
+    _mention(phases, chain, asked, guesses)
     values = values_of(chain, {} if parameters is None else parameters)
     run = {"guess": guess, "parameters": parameters, **{name: v for name, v in given.items() if name != "refine"}}
     starts = [guesses]
@@ -96,13 +87,45 @@ def solve_phases(
         starts = [list(near), list(best)] if near is not best else [list(best)]
     with evaluating(chain.name), Progress(chain.name or "solving", progress) as reporter:
         outcome = ChainRuns(chain, method, prepare, own, reporter, values, starts).solve(asked, random)
-        if outcome.converged and (impossible := impossible_in_phases(outcome.extremals, chain.links)):
-            message = f"the solution found means nothing: {impossible}"
-            outcome = replace(outcome, converged=False, message=message)
+        outcome = _if_possible(chain, outcome)
         solution = told(phases, phases_solution(chain, outcome, method), best)
         if reporter.stop:
             raise interrupted(solution)
     return _finished(solution, allow_failure)
+
+
+def _preparing(method: str, module: str, nominal: str) -> Callable[..., Any]:
+    """What makes phases ready for a method.
+
+    Raises:
+        ProblemError: the method takes none, or no such nominal.
+    """
+    prepare = getattr(importlib.import_module(module), "prepare_chain", None)
+    if prepare is None or nominal != "combined":
+        raise ProblemError(
+            "Phases are not solved that way.",
+            expected="nominal='combined', and a method that takes phases",
+            received=f"method='{method}'" if prepare is None else f"nominal='{nominal}'",
+            remedy="leave the option out",
+        )
+    made_ready: Callable[..., Any] = prepare
+    return made_ready
+
+
+def _mention(phases: Phases, chain: Chain, asked: Sequence[Options], guesses: Sequence[Given]) -> None:
+    """Warn of guesses that are of another length than the mesh of their phase, and of what nothing depends on."""
+    for statement, options, guess in zip(chain.statements, asked, guesses, strict=True):
+        if isinstance(guess, Mapping):
+            mention_lengths({str(key): value for key, value in guess.items()}, options, statement)
+    mention_idle_in(phases)
+
+
+def _if_possible(chain: Chain, outcome: ChainOutcome) -> ChainOutcome:
+    """The outcome; one whose densities are none has not converged to anything that means something."""
+    impossible = impossible_in_phases(outcome.extremals, chain.links) if outcome.converged else ""
+    if not impossible:
+        return outcome
+    return replace(outcome, converged=False, message=f"the solution found means nothing: {impossible}")
 
 
 def _divided(method: str, of_method: Sequence[str], options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
