@@ -280,9 +280,9 @@ def test_a_phase_that_has_changed_is_looked_at_again():
     ids=["rate", "noise of a reading", "condition", "chance", "integral"],
 )
 def test_a_control_that_is_used_in_its_phase_is_meant(use):
-    from covocp.solving.unused import mention_idle_in
+    from covocp.solving.unused import mention_forgotten_in
 
-    mention_idle_in(two_parts(use))  # warnings are errors
+    mention_forgotten_in(two_parts(use))  # warnings are errors
 
 
 @pytest.mark.parametrize(

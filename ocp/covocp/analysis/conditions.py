@@ -12,9 +12,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.analysis.kinks import kinked
 from covocp.analysis.reduction import Parts, parts
 from covocp.base.expressions import Given
+from covocp.base.kinks import kinked
 from covocp.base.matrices import Array, is_semidefinite, standard_deviations, unpack, unpack_costate
 from covocp.statement.statement import Conditions, Statement
 

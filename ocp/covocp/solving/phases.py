@@ -26,7 +26,7 @@ from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.phases_runs import ChainRuns
 from covocp.solving.random_starts import multistart
 from covocp.solving.refining import FIRST, adapted, first_options
-from covocp.solving.unused import mention_idle_in, mention_lengths
+from covocp.solving.unused import mention_forgotten_in, mention_lengths
 from covocp.statement.chain import Chain
 from covocp.transcription.mesh import INTERVALS, Options
 
@@ -117,7 +117,7 @@ def _mention(phases: Phases, chain: Chain, asked: Sequence[Options], guesses: Se
     for statement, options, guess in zip(chain.statements, asked, guesses, strict=True):
         if isinstance(guess, Mapping):
             mention_lengths({str(key): value for key, value in guess.items()}, options, statement)
-    mention_idle_in(phases)
+    mention_forgotten_in(phases)
 
 
 def _if_possible(chain: Chain, outcome: ChainOutcome) -> ChainOutcome:

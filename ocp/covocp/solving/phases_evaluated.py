@@ -40,7 +40,7 @@ from covocp.solving.evaluation import (
 from covocp.solving.missed import check_has_loop, missed_by_loop, with_missed
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
-from covocp.solving.unused import mention_idle_in
+from covocp.solving.unused import mention_forgotten_in
 from covocp.statement.chain import Chain
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
@@ -77,7 +77,7 @@ def evaluate_phases(
     else:
         with evaluating(phases.name):
             solution = _along(phases.chain(), nominal, intervals, parameters, options)
-        mention_idle_in(phases)
+        mention_forgotten_in(phases)
     return solution if truth is None else _under(solution, truth)
 
 

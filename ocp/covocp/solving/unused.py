@@ -11,6 +11,7 @@ import numpy as np
 from covocp.base.errors import warn_user
 from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
+from covocp.solving.kinked_costs import mention_kinks
 from covocp.statement.names import chosen_entry
 from covocp.statement.statement import Block, Statement
 from covocp.transcription.mesh import Options
@@ -31,16 +32,18 @@ def mention_forgotten(problem: Problem) -> None:
     problem.doubts_told = True
     for mention in (_mention_nothing_learnt, _mention_unused_measurements, _mention_spread_noise, _mention_idle):
         mention(problem.declarations)
+    mention_kinks(problem.declarations)
 
 
-def mention_idle_in(phases: Phases) -> None:
-    """Warn of controls on which nothing depends in their phase; once for each statement of the phases."""
+def mention_forgotten_in(phases: Phases) -> None:
+    """Warn of controls on which nothing depends in their phase, and of kinks; once for each statement of the phases."""
     chain = phases.chain()
     if phases.doubts_told is chain:
         return
     phases.doubts_told = chain
     for name, problem in zip(phases.names, phases.problems, strict=True):
         _mention_idle(problem.stated, f" of the phase '{name}'")
+        mention_kinks(problem.stated, name)
 
 
 def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Statement) -> None:
