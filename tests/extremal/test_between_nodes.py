@@ -190,8 +190,14 @@ def test_a_rate_that_jumps_at_a_node_is_integrated_from_its_own_side(comparison,
 
 
 def test_a_jump_inside_an_interval_is_told_by_the_mesh_error():
+    """One that nothing can see: a table of CasADi's own with a steep piece."""
+    ocp = co.Problem(3.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    rate = ca.interpolant("rate", "linear", [[0.0, 0.9 - 1e-9, 0.9, 3.0]], [1.0, 1.0, 0.0, 0.0])
+    ocp.dynamics(x, rate(ocp.time) + u)
+    ocp.minimize(running=u**2)
     with pytest.warns(co.CovocpWarning, match="node where a rate jumps"):
-        solution = solve(phases(lambda t, at: t < at), intervals=8, substeps=1)
+        solution = solve(ocp, intervals=8, substeps=1)
     wrong = abs(solution["x"][-1] - 0.9) / 0.9
     assert wrong > 0.01
     assert wrong / 5 < solution.mesh_error < 5 * wrong

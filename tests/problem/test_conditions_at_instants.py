@@ -110,7 +110,7 @@ def test_nodes_are_there_as_often_as_they_are_needed() -> None:
     ocp.subject_to(x, at=5.0, upper=1.0, name="of a state")
     ocp.subject_to(u, at=6.0, upper=1.0, name="of a control")
     ocp.subject_to(u, at=7.0, upper=1.0, name="of a control before", side="before")
-    nodes = completed(ocp.statement(), np.linspace(0.0, 1.0, 4))
+    nodes = completed(ocp.statement(), np.linspace(0.0, 1.0, 4), ocp.statement().values)
     often = {float(place): int(count) for place, count in zip(*np.unique(nodes, return_counts=True), strict=True)}
     assert often == {0.0: 1, 0.1: 3, 1 / 3: 2, 0.5: 2, 0.6: 3, 2 / 3: 1, 0.7: 2, 1.0: 1}
 

@@ -124,7 +124,7 @@ def test_a_kinked_reference_is_tracked_as_the_boundary_value_problem_says(method
 def test_a_free_duration_is_covered_up_to_its_bound():
     times = np.linspace(0.0, 6.0, 7)
     ocp, _, x = drifting(times, np.ones(7) + times, duration=co.Free(2.0, 0.5, 6.0))
-    assert ocp.statement().kinks == ()
+    assert ocp.statement().kinks(ocp.statement().values) == ()
     assert drift(ocp, x, intervals=10) == pytest.approx(4.0, rel=1e-12)  # the integral of 1 + t up to 2
     for upper, words in ((6.1, "6.1 s, the upper bound"), (np.inf, "upper=6")):
         refused(lambda upper=upper: drifting(times, times, duration=co.Free(2.0, 0.5, upper)), "'wind'", words)

@@ -120,10 +120,10 @@ def test_without_a_coarse_start_there_are_others():
     X = ocp.closed_loop_covariance()
     ocp.subject_to(x + X.deviation(x), upper=2.0, name="wall")
     ocp.minimize_expected(u**2 - x, terminal_weight={x: 1.0})
-    statement, options = ocp.statement(), with_instants(ocp.statement(), Options(intervals=96))
+    statement, options = ocp.statement(), with_instants(ocp.statement(), Options(intervals=96), ocp.statement().values)
     mesh = resolve_mesh(statement, options, statement.values)
     given = (statement.values, None, Progress("", False))
-    assert coarser(statement, options, mesh) is not None
+    assert coarser(statement, options, mesh, statement.values) is not None
     assert from_coarser(statement, options, mesh, singular, given) is None
 
 

@@ -100,7 +100,7 @@ def test_later_solves_begin_the_way_that_found_a_solution(best, method, options)
     first, second = again.solve(progress=False), again.solve(progress=False)
     assert first.cost == pytest.approx(best, rel=1e-5)
     assert second.cost == pytest.approx(best, rel=1e-5)
-    assert second.stats["iterations"] < 0.3 * first.stats["iterations"]
+    assert second.stats["iterations"] < first.stats["iterations"] - 350  # the first run ended in vain after 400
     assert "other_ways" not in second.stats
 
 

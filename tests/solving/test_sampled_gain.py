@@ -179,8 +179,8 @@ def test_an_unstable_plant_keeps_clear_of_a_wall():
 
 def test_a_fine_mesh_starts_from_a_coarse_one_with_its_instants(solution):
     statement, mesh = solution.statement, solution.mesh
-    assert coarser(statement, Options(intervals=24), mesh) is None
-    fewer = coarser(statement, Options(intervals=96), mesh.divided(4))
+    assert coarser(statement, Options(intervals=24), mesh, statement.values) is None
+    fewer = coarser(statement, Options(intervals=96), mesh.divided(4), statement.values)
     assert fewer is not None
     nodes = fewer.nodes()
     assert 18 <= np.unique(nodes).size - 1 <= 36

@@ -295,7 +295,7 @@ def test_a_limit_that_is_passed_at_its_points(tolerance, where):
 
 def test_a_gradient_that_is_not_that_of_its_cost_is_told():
     """A noise that grows with the square of the control makes a cost of many minima."""
-    ocp = co.Problem(5.0)
+    ocp = co.Problem(4.0)
     x, v = ocp.state("x", initial=0.0, final=1.0, variance=1.0), ocp.state("v", initial=0.0, variance=0.5)
     u = ocp.control("u", lower=-3, upper=3)
     ocp.dynamics(x, v)

@@ -28,6 +28,8 @@ SEMIDEFINITE_TOLERANCE = 1e-9
 ROUNDINGS = 1e-13
 # Entries below so many units of the machine's precision times the size, relative to the largest, hold nothing else.
 RUBBLE = 8.0
+# Share of a whole within which two places of it are one.
+SAME = 1e-9
 
 
 def real_numbers(value: Given) -> Array:
@@ -71,6 +73,15 @@ def distinct(*values: Any) -> Array:
     """The different numbers among some, sorted: `np.unique` would import numpy.ma, which takes as long as a solve."""
     together = np.sort(np.concatenate([np.ravel(own) for own in values]))
     return np.asarray(together[np.append(True, together[1:] != together[:-1])[: together.size]])
+
+
+def near(values: Array, places: Array) -> Any:
+    """Which values are, but for rounding, one of some rising places; they are shares of one whole."""
+    if not places.size:
+        return np.zeros(values.shape, dtype=bool)
+    k = np.clip(np.searchsorted(places, values), 1, places.size) - 1
+    distance = np.minimum(np.abs(values - places[k]), np.abs(values - places[np.minimum(k + 1, places.size - 1)]))
+    return distance <= SAME
 
 
 def half_length(size: int) -> int:

@@ -31,7 +31,7 @@ def absolute_cost(extremal: Extremal) -> float:
     return abs(terminal) + abs(float(np.trapezoid(running.ravel(), extremal.time)))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=KEPT)
 def variable_cost(extremal: Extremal) -> float:
     """The part of the size of the cost that changes, to second order, if all that is in it changes by its magnitude.
 

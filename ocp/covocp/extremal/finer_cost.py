@@ -116,7 +116,7 @@ def _change(extremal: Extremal, size: float, within: Within | None) -> float | N
 def _finer(extremal: Extremal) -> tuple[Mesh, Trajectory]:
     """The mesh with more nodes, each a segment of its own, its steps no longer than before; the solution there."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    nodes = completed(st, divided(mesh.nodes, t.u, mesh.control == "constant"))
+    nodes = completed(st, divided(mesh.nodes, t.u, mesh.control == "constant"), extremal.parameters)
     unit = step_unit(st, mesh)
     finer = replace(
         mesh,

@@ -25,7 +25,7 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.readings import Readings, readings_along
 from covocp.passage.library import functions
 from covocp.passage.sweep import passed_by
-from covocp.statement.interval import Interval, repeated
+from covocp.statement.interval import Interval, one_sided, repeated
 from covocp.statement.statement import Loop, Statement
 from covocp.transcription.covariance_steps import KEPT, moving_step
 
@@ -83,19 +83,30 @@ def joint_covariances(extremal: Extremal, fine: Array, statistics: Statistics, s
 
 def _fast_intervals(extremal: Extremal) -> list[tuple[int, float]]:
     """Intervals within which the filter is far faster at the start than at the end, and its time constants in each."""
-    st, count = extremal.statement, extremal.mesh.intervals + 1
+    st = extremal.statement
     if st.measurement is None or st.coupled or st.riccati[st.matrices.index(st.estimation)] is None:
         return []
-    x, u, e, t, duration, p = extremal.columns()
-    _, M, U = (stacked(v, count) for v in st.measurement.map(count)(x, u, t, duration, p))
-    E = unpack(extremal.trajectory.e[:, st.estimation.span], len(st.augmented))
-    falling = kalman_gain(E, M, U) @ M
-    h = np.diff(extremal.time)
-    bound = np.trace(falling, axis1=1, axis2=2)
-    looked = np.flatnonzero(h * bound[:-1] > FAST)
-    first, last = (h[looked] * np.abs(np.linalg.eigvals(falling[looked + j])).max(axis=1, initial=0.0) for j in (0, 1))
+    falling, h = _gains_inside(extremal), np.diff(extremal.time)
+    looked = np.flatnonzero(h * np.trace(falling[0], axis1=1, axis2=2) > FAST)
+    first, last = (h[looked] * np.abs(np.linalg.eigvals(own[looked])).max(axis=1, initial=0.0) for own in falling)
     fast = (first > FAST) & (first > SLOWED * last)
     return list(zip(looked[fast].tolist(), first[fast].tolist(), strict=True))
+
+
+def _gains_inside(extremal: Extremal) -> tuple[Array, Array]:
+    """K M of the filter where the intervals start and where they end, each as its limit from inside: (N, n, n)."""
+    st, n = extremal.statement, extremal.mesh.intervals
+    t, k = extremal.trajectory, np.arange(n)
+    found = []
+    for c in (0.0, 1.0):
+        node, places = k + int(c), np.full(n, one_sided(c))
+        time = extremal.time[:-1] + places * np.diff(extremal.time)
+        fixed = repeated(t.duration, extremal.parameters, n)
+        assert st.measurement is not None
+        rows = st.measurement.map(n)(t.x[node].T, extremal.control(k, places).T, time[None], *fixed)
+        _, M, U = (stacked(v, n) for v in rows)
+        found.append(kalman_gain(unpack(t.e[node][:, st.estimation.span], len(st.augmented)), M, U) @ M)
+    return found[0], found[1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

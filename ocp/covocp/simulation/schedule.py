@@ -21,6 +21,7 @@ from covocp.blocks.arithmetic import apply
 from covocp.blocks.updates import definite_gain
 from covocp.simulation.actual import System
 from covocp.solution.solution import Solution
+from covocp.statement.interval import one_sided
 from covocp.statement.statement import Statement
 
 FilterKind = Literal["perturbation", "extended"]
@@ -130,12 +131,17 @@ def indices(grid: Grid, times: Array) -> Any:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Nominal:
-    """What the functions of a statement need at some times: x (K, nx), u (K, nu), e (K, ne), t (K,)."""
+    """What the functions of a statement need at some times t (K,): x (K, nx), u (K, nu), e (K, ne).
+
+    told: the times that a model is told, (K,). At the ends of an interval they are the limits from inside it, as while
+        solving: what compares the time may jump there.
+    """
 
     x: Array
     u: Array
     e: Array
     t: Array
+    told: Array
 
     __repr__ = short_repr
 
@@ -143,13 +149,20 @@ class Nominal:
         """Arguments (state, control, matrices, time, duration, parameters), a column for each time."""
         count = self.t.size
         fixed = np.full((1, count), duration), np.tile(parameters[:, None], (1, count))
-        return (self.x.T, self.u.T, self.e.T, self.t[None, :], *fixed)
+        return (self.x.T, self.u.T, self.e.T, self.told[None, :], *fixed)
 
 
 def nominal_at(solution: Solution, t: Array, interval: Given) -> Nominal:
-    """The nominal at some times, its control that of the given interval, which matters where it jumps."""
+    """The nominal at some times, control and model those of the given interval, which matters where they jump."""
     x, e = _states_at(solution, t)
-    return Nominal(x=x, u=_controls_at(solution, t, interval), e=e, t=t)
+    return Nominal(x=x, u=_controls_at(solution, t, interval), e=e, t=t, told=_inside(solution, t, interval))
+
+
+def _inside(solution: Solution, t: Array, interval: Given) -> Array:
+    """Times, (K,), the ends of their intervals as the limits from inside."""
+    start, end = solution.t[interval], solution.t[np.asarray(interval) + 1]
+    low, high = (start + one_sided(c) * (end - start) for c in (0.0, 1.0))
+    return np.asarray(np.clip(t, low, high))
 
 
 def _states_at(solution: Solution, t: Array) -> tuple[Array, Array]:
@@ -280,7 +293,8 @@ def table(solution: Solution, grid: Grid, chosen: Coefficients) -> tuple[Array, 
     sides = []
     for part in (slice(0, -1), slice(1, None)):
         t = grid.t[part]
-        at = Nominal(x=x[part], u=_controls_at(solution, t, grid.interval), e=e[part], t=t)
+        u = _controls_at(solution, t, grid.interval)
+        at = Nominal(x=x[part], u=u, e=e[part], t=t, told=_inside(solution, t, grid.interval))
         columns = at.columns(solution.duration, solution.parameters)
         values = chosen.function.map(grid.steps)(*columns, grid.h[None, :], read)
         sides.append(np.ascontiguousarray(values.full().T))

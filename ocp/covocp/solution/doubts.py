@@ -57,9 +57,10 @@ def mention_doubts(solution: Solution) -> None:
     _mention_slopes(solution, fine)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
+        other = "" if solution.mesh.step in ("gauss", "rodas") else "covariance_step='gauss' or "
         warn_user(
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
-            "covariance_step='gauss' or more intervals."
+            f"{other}more intervals."
         )
 
 

@@ -21,9 +21,9 @@ import numpy as np
 
 from covocp.base.digests import sha256
 from covocp.base.matrices import Array
+from covocp.base.pieces import operands_of
 from covocp.base.short_repr import short_repr
 from covocp.solution.meaning import ADDED, MAIN, Aspect, constants, declared
-from covocp.solution.pieces import operands_of
 from covocp.solution.points import ALONG, apart, evaluated, one_number, same_columns, shown, spread_points
 from covocp.statement.statement import INPUTS, Statement
 from covocp.transcription.trajectory import Trajectory

@@ -11,8 +11,8 @@ import numpy as np
 
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
+from covocp.base.pieces import expanded, operands_of
 from covocp.base.short_repr import short_repr
-from covocp.solution.pieces import expanded, operands_of
 from covocp.solution.points import ALONG, apart, evaluated, one_number, same_columns, spread_points
 from covocp.solution.solution import Solution
 from covocp.statement.chain import Link

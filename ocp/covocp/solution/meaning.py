@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.pieces import expanded, operands_of
 from covocp.base.short_repr import short_repr
-from covocp.solution.pieces import expanded, operands_of
 from covocp.statement.chances import ChanceLimits
 from covocp.statement.statement import Block, Statement
 

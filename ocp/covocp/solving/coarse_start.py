@@ -29,13 +29,14 @@ from covocp.transcription.mesh import Mesh, Options
 INTERVALS, BETWEEN, TIMES = 24, 3, 1.5
 
 
-def coarser(statement: Statement, options: Options, mesh: Mesh) -> Options | None:
+def coarser(statement: Statement, options: Options, mesh: Mesh, parameters: Array) -> Options | None:
     """The options with a coarser mesh to start from; None where none is needed, or it would hardly be coarser.
 
     Args:
         statement: the problem.
         options: those of the mesh.
         mesh: with its instants.
+        parameters: of the statement.
     """
     if not waits(statement):
         return None
@@ -47,7 +48,7 @@ def coarser(statement: Statement, options: Options, mesh: Mesh) -> Options | Non
     step = int(np.ceil((nodes.size - 1) / enough))
     kept = [nodes[(nodes >= a) & (nodes < b)] for a, b in pairwise(places)]
     chosen = [part[:: min(step, max(1, part.size // BETWEEN))] for part in kept]
-    return with_instants(statement, replace(options, grid=distinct(*chosen, [1.0])))
+    return with_instants(statement, replace(options, grid=distinct(*chosen, [1.0])), parameters)
 
 
 def from_coarser(
@@ -67,7 +68,7 @@ def from_coarser(
         given: values of the parameters, where to start, and who is told.
     """
     values, guess, reporter = given
-    fewer = coarser(statement, options, mesh)
+    fewer = coarser(statement, options, mesh, given[0])
     if fewer is None:
         return None
     try:

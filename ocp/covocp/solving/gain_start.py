@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.errors import CovocpError, without_warnings
+from covocp.base.errors import CovocpError, SolveError, without_warnings
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, distinct, pack
+from covocp.base.matrices import Array, distinct, pack, unpack
 from covocp.base.progress import Progress
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
@@ -47,6 +47,12 @@ WEIGHTS: dict[Place, str] = {"path": "weights of X on the way", "final": "weight
 ROUNDS, LARGEST_FACTOR = 16, 30.0
 # A condition counts as met up to this share of what feedback can take from it.
 MET = 0.05
+# Share by which a limit must be passed before a problem is refused: more than steps and tolerances explain.
+SURELY = 1e-5
+# Multiples of E up to which it is seen whether a condition rises with X, and how many of them.
+LARGEST_SPREAD, SPREADS = 1e4, 40
+# Eigenvalue of a slope, relative to the largest, that is zero but for rounding.
+ROUNDOFF = 1e-9
 
 
 def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
@@ -108,8 +114,14 @@ def ended(message: str, more: str) -> str:
     return message.rstrip(".") + more if more else message
 
 
-def beyond(own: Declarations, best: Solution | None) -> str:
-    """Which limits of X no gain may keep along the nominal of the best gain, as the end of a message; or nothing."""
+def beyond(own: Declarations, best: Solution | None, *, surely: bool = False) -> str:
+    """Which limits of X no gain may keep along the nominal of the best gain, as the end of a message; or nothing.
+
+    Args:
+        own: the problem.
+        best: solution with the best gain.
+        surely: only those that rise with X, and are passed by more than steps and tolerances explain.
+    """
     if best is None or best.loop is None or own.spread is None:
         return ""
     least = spread_halves(best.loop, fed=False)
@@ -117,11 +129,54 @@ def beyond(own: Declarations, best: Solution | None) -> str:
     for row in rows_of(own):
         floor = row.over(best, least)[0]
         k = int(np.argmax(floor))
-        if floor[k] > row.limit:
+        more = SURELY * max(abs(floor[k]), abs(row.limit)) if surely else 0.0
+        if floor[k] > row.limit + more and (not surely or _rises(row, best, least)):
             t = best.t[-floor.size :][k]
             told.append(f"'{row.name}' is {floor[k]:.4g} at {t:.4g} s with E for X, above its limit {row.limit:.4g}")
-    listed = "; ".join([*told, *chances_below(own, best)])
+    listed = "; ".join([*told, *([] if surely else chances_below(own, best))])
     return f"; no feedback takes X below E: along the nominal of the best gain {listed}" if listed else ""
+
+
+def _rises(row: Row, best: Solution, least: Array) -> bool:
+    """Whether a condition rises with X from E on: seen along multiples of E, which are all there is of one variance."""
+    slopes = [row.over(best, times * least)[1] for times in np.geomspace(1.0, LARGEST_SPREAD, SPREADS)]
+    constant = all(np.allclose(slope, slopes[0], rtol=ROUNDOFF, atol=0.0) for slope in slopes)
+    size = round((np.sqrt(8 * least.shape[1] + 1) - 1) / 2)
+    halves = 0.5 + 0.5 * np.eye(size)  # an entry beside the diagonal stands for two
+    matrices = np.array([[unpack(part, size) * halves for part in slope] for slope in slopes])
+    entries = np.abs(matrices).max(axis=(0, 1))
+    alone = np.count_nonzero(entries) == 1 and np.trace(entries) > 0
+    values = np.linalg.eigvalsh(matrices)
+    return (constant or alone) and bool((values[..., 0] >= -ROUNDOFF * np.abs(values).max()).all())
+
+
+def check_possible(own: Declarations, statement: Statement, best: Solution | None) -> None:
+    """Conditions that no feedback meets, where nothing that is chosen changes what the filter learns.
+
+    Args:
+        own: the problem.
+        statement: the same.
+        best: solution with the best gain, without these conditions.
+
+    Raises:
+        SolveError: names them, with their values for the error of the filter alone; `best` is on it.
+    """
+    impossible = "" if estimation_varies(statement) else beyond(own, best, surely=True)
+    if impossible:
+        raise SolveError(
+            f"'{statement.name or 'The problem'}' has no solution{impossible}. What the filter learns does not depend "
+            "on the nominal here: widen the limit, or measure more. On this error (.solution): the best without it.",
+            solution=best,
+        )
+
+
+def estimation_varies(statement: Statement) -> bool:
+    """Whether what the filter knows at the end depends on what is chosen: the nominal, the duration, its start."""
+    estimation = [i for i, block in enumerate(statement.matrices) if block.estimation]
+    read = None if statement.samples is None else statement.samples.measurement
+    if not estimation or statement.duration.free or statement.varies(estimation[0]) or statement.tied is not None:
+        return True
+    return read is not None and any(read.jac_sparsity(k, i).nnz() for k in (1, 2) for i in (0, 1))
 
 
 def free_gain_block(statement: Statement) -> Block | None:

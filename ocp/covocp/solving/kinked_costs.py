@@ -40,10 +40,13 @@ def mention_kinks(problem: Declarations, phase: str = "") -> None:
 def _scattering(problem: Declarations) -> list[Any]:
     """States and unknowns that are uncertain, or that something uncertain or the feedback moves."""
     noises = {name: entry.noise for name, entry in problem.rates.items() if entry.noise is not None}
-    scattered = {entry.symbol.__hash__() for entry in problem.controls}
-    for entry in problem.augmented:
-        if not (_is_zero(entry.variance) and _is_zero(noises.get(entry.name, ca.MX(0)))):
-            scattered.add(entry.symbol.__hash__())
+    scattered = {
+        entry.symbol.__hash__()
+        for entry in problem.augmented
+        if not (_is_zero(entry.variance) and _is_zero(noises.get(entry.name, ca.MX(0))))
+    }
+    if scattered:  # what is uncertain is fed back
+        scattered |= {entry.symbol.__hash__() for entry in problem.controls}
     size = 0
     while size < len(scattered):
         size = len(scattered)

@@ -62,7 +62,8 @@ def solve(
 
     Raises:
         ProblemError: the statement or an option is wrong.
-        SolveError: the method did not converge (carries the last iterate).
+        SolveError: the method did not converge (carries the last iterate), or no feedback can keep a limit of X
+            (carries the best solution without it).
         Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
     """
     if isinstance(problem, Phases):

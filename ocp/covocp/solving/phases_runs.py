@@ -158,7 +158,7 @@ class ChainRuns:
             try:
                 prepared = self._prepare(chain, finer, **self._own)
                 again = prepared.solve(tuple(x.parameters for x in extremals), guesses, self._reporter)
-            except CovocpError:  # what the steps are off is told with the solution that there is
+            except (CovocpError, RuntimeError):  # what the steps are off is told with the solution that there is
                 break
             if not again.converged:
                 break

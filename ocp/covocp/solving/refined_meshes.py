@@ -249,7 +249,7 @@ def _solved(
     """A solution on other nodes, not measured; None and the reason where there is none."""
     options = []
     for st, own, other, known in zip(runs.statements, start.options, nodes, start.extremals, strict=True):
-        whole = completed(st, other)
+        whole = completed(st, other, known.parameters)
         stiff = nominal_along(st, whole, known.columns(), known.mesh.nodes, known.trajectory.duration)
         options.append(replace(own, grid=Graded(nodes=whole, asked=whole.size - 1, nominal=stiff)))
     try:

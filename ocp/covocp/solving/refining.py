@@ -135,7 +135,7 @@ def with_layers(statement: Statement, options: Options, parameters: Array) -> Op
     nodes = options.nodes()
     longest = float(np.diff(nodes).max())
     layer = longest / fast * LAYER_RATIO ** np.arange(np.ceil(np.log(fast) / np.log(LAYER_RATIO)))
-    whole = completed(statement, distinct(nodes, layer, 1.0 - layer))
+    whole = completed(statement, distinct(nodes, layer, 1.0 - layer), parameters)
     known = options.grid.stiffness if isinstance(options.grid, Graded) else None
     return replace(options, grid=Graded(nodes=whole, asked=whole.size - 1, stiffness=known, layered=True))
 

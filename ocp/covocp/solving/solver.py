@@ -37,7 +37,14 @@ from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
-from covocp.solving.gain_start import best_gain, beyond, meeting_conditions, with_best_gain_problems, with_gain_told
+from covocp.solving.gain_start import (
+    best_gain,
+    beyond,
+    check_possible,
+    meeting_conditions,
+    with_best_gain_problems,
+    with_gain_told,
+)
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
@@ -119,7 +126,8 @@ class Solver:
         mesh = {field.name: getattr(asked, field.name) for field in fields(Options) if field.name != "refine"}
         self._best = tuple(Solver(one, "ipopt", **mesh) for one in best)
         self._ungraded = best[-1].statement() if best else self.statement, asked
-        self._asked = with_instants(self.statement, graded(*self._ungraded, self.statement.values))
+        values = self.statement.values
+        self._asked = with_instants(self.statement, graded(*self._ungraded, values), values)
         self._values = self.statement.values
         self._options = self._laid_out()
         self._classical = self._classical_design()
@@ -200,7 +208,8 @@ class Solver:
 
         Raises:
             ProblemError: a name or a guess is wrong.
-            SolveError: the method did not converge (carries the last iterate).
+            SolveError: the method did not converge (carries the last iterate), or no feedback can keep a limit of X
+            (carries the best solution without it).
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
         if not all(value is None for value in (initial, means, covariance, duration)):
@@ -233,6 +242,8 @@ class Solver:
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
                 first = best_gain(self._best, parameters, guess, reporter)
                 if first is not None:
+                    if not allow_failure:
+                        check_possible(self._problem.declarations, self._solved, first)
                     near = not reporter.stop
                     guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
                 if isinstance(guess, Later | Solution):
@@ -307,13 +318,17 @@ class Solver:
     def _suit(self, values: Array, *, nodes: bool) -> None:
         """Another mesh for other values of the parameters where this one is too coarse for them, kept for later runs.
 
-        Its steps are looked at always, its nodes where it takes no more time than what else is looked at.
+        Its steps are looked at always, its nodes where it takes no more time than what else is looked at, or where the
+        times at which the model jumps are others.
         """
         if np.array_equal(values, self._values):
             return
         mesh = self._prepared.mesh
         nodes = nodes or (mesh.step == "rk4" and bool(self.statement.matrices))  # of which the steps depend on them
         more = regraded(*self._ungraded, self._asked, values) if nodes else None
+        if self.statement.kinks(values) != self.statement.kinks(self._values):  # times that parameters say
+            whole = with_instants(self.statement, graded(*self._ungraded, values), values)
+            more = more if np.array_equal(whole.nodes(), self._asked.nodes()) else whole
         if self.nominal == "deterministic":
             suited = evaluation_mesh(self.statement, self._asked, values).substeps <= mesh.substeps
         else:
@@ -322,7 +337,8 @@ class Solver:
             return
         before = self._values, self._asked
         try:
-            self._values, self._asked = values, self._asked if more is None else with_instants(self.statement, more)
+            self._values = values
+            self._asked = self._asked if more is None else with_instants(self.statement, more, values)
             options = self._laid_out()
             self._keep(options, self._ready(options))
         except BaseException:
@@ -441,7 +457,10 @@ class Solver:
         self._classical = self._classical_design()
 
     def _with_finer_steps(self, outcome: Outcome, values: Array, reporter: Progress) -> Outcome:
-        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs."""
+        """Solved again from there where the default steps are too long for what is at the nodes; so are later runs.
+
+        What the longer steps do not see may make a saddle of where they end.
+        """
         while self._own_steps and outcome.converged and not reporter.stop:
             finer = finer_steps(outcome.extremal, self._options, OPTIMISED, outcome.cost_terms["running"])
             if finer is None:
@@ -455,6 +474,7 @@ class Solver:
                 break
             if not again.converged:
                 break
+            again = away_from_saddle(prepared, again, values, reporter, start)
             outcome = with_stats(again, **{**outcome.stats, **again.stats, **counted(outcome, again)})
             self._keep(finer, prepared)
         return outcome

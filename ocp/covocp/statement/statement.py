@@ -30,6 +30,7 @@ from covocp.statement.conditions import Columns as Columns
 from covocp.statement.conditions import Conditions as Conditions
 from covocp.statement.conditions import Inside
 from covocp.statement.entries import entries_of, entry_names
+from covocp.statement.switches import switch_times
 from covocp.statement.time_data import TimeData, kinks
 
 Kind = Literal["state", "control", "matrix", "unknown", "parameter", "measurement"]
@@ -39,6 +40,8 @@ Role = Literal["moving", "decision", "integral"]
 ROLES: tuple[Role, ...] = ("moving", "decision", "integral")
 
 INPUTS = ("state", "control", "matrices", "time", "duration", "parameters")
+# Jumps of what runs backward that are looked at one by one.
+FEW = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,10 +286,33 @@ class Statement:
         """All inequalities: along the path, at the start, at the end, at each of the instants."""
         return (self.path, self.start, self.end, *(part.conditions for part in self.inside.parts))
 
+    def kinks(self, parameters: Array) -> tuple[tuple[float, ...], ...]:
+        """Fractions of a fixed terminal time at which data have kinks, or rates jump or bend by comparing it; of each.
+
+        They are nodes where these are few. The times that are compared may depend on the parameters.
+        """
+        if self.duration.free:
+            return ()
+        duration = self.duration.guess
+        of_data = tuple(kinks(entry, duration) for entry in self.data)
+        if self.autonomous:
+            return of_data
+        return of_data + switch_times(self.rates, duration, parameters)
+
     @cached
-    def kinks(self) -> tuple[tuple[float, ...], ...]:
-        """Fractions of a fixed terminal time at which each of the data has kinks: nodes where these are few."""
-        return () if self.duration.free else tuple(kinks(entry, self.duration.guess) for entry in self.data)
+    def falls(self) -> tuple[float, ...]:
+        """Fractions of a fixed terminal time before which what runs backward is steep since its rate jumps; a few."""
+        if self.duration.free or self.autonomous:
+            return ()
+        functions = [function for i in self.behind if (function := self.riccati[i]) is not None]
+        jumps = [own for f in functions for own in switch_times(f, self.duration.guess, self.values)]
+        places = sorted({place for own in jumps for place in own})
+        return tuple(places) if len(places) <= FEW else ()
+
+    def varies(self, position: int) -> bool:
+        """Whether the rate of a matrix depends on the state or the control."""
+        function = self.riccati[position]
+        return function is None or any(function.jac_sparsity(k, i).nnz() for k in range(3) for i in range(2))
 
     @property
     def measurement_names(self) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ E falls like 1/t).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
     Returns:
         The options; with the uniform mesh where nothing is steep.
     """
-    plain = with_instants(statement, options)
+    plain = with_instants(statement, options, parameters)
     if options.grid is not None or not _needed(statement):
         return plain
     longest = statement.duration.guess
@@ -72,7 +71,9 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
         _steepness(statement, guess, parameters, longest / options.intervals, backward) for backward in (False, True)
     ]
     start, end = (_parts(entry, options.intervals, longest) / longest for entry in seen)
-    nodes = completed(statement, np.array(sorted({*plain.nodes(), *start, *(1.0 - end)})), options.intervals)
+    nodes = completed(
+        statement, np.array(sorted({*plain.nodes(), *start, *(1.0 - end)})), parameters, options.intervals
+    )
     lengths = longest * np.diff(nodes)
     stiff = float((lengths * np.interp(longest * nodes[:-1], seen[0].times, seen[0].poles)).max())
     return replace(
@@ -119,9 +120,9 @@ def _guess(statement: Statement, options: Options, parameters: Array) -> Traject
 
 def _varies(statement: Statement) -> bool:
     """Whether what runs backward depends on state or control: then the end of the guess must be known."""
-    functions: list[Any] = [statement.riccati[i] for i in statement.behind]
-    dependent = any(f.jac_sparsity(k, i).nnz() for f in functions for k in range(3) for i in range(2))
-    return dependent or (statement.matrix_end is not None and bool(statement.matrix_end.jac_sparsity(0, 0).nnz()))
+    return any(map(statement.varies, statement.behind)) or (
+        statement.matrix_end is not None and bool(statement.matrix_end.jac_sparsity(0, 0).nnz())
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,6 +22,7 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import Passage, in_sequence
 from covocp.transcription.steps import (
+    early,
     full_interval,
     gathering_step,
     in_order,
@@ -239,17 +240,22 @@ def backward_at_start(statement: Statement, mesh: Mesh, variables: Expr) -> Any:
 
 
 def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> Any:
-    """Running cost of each interval where it depends on the matrices; of a closed loop by parts in the first half."""
+    """Running cost of each interval where it depends on the matrices; of a closed loop by parts but near the end."""
     n, m = mesh.intervals, mesh.substeps
-    half = int(np.sum(mesh.nodes[:-1] + np.diff(mesh.nodes) / 2 < 0.5)) if statement.behind else 0
-    costs = []
-    for span, by_parts in ((range(half), True), (range(half, n), False)):
-        if len(span):
-            function = simpson_interval(statement, m, by_parts).map(len(span))
-            widths = (1, 1, m, m) + (1,) * (len(columns) - 4)
-            chosen = [c[:, span.start * w : span.stop * w] for c, w in zip(columns, widths, strict=True)]
-            costs.append(function(*chosen))
-    return ca.horzcat(*costs)
+    parted = np.zeros(n, dtype=bool)
+    if statement.behind:
+        parted = np.asarray(early(statement, ca.DM(mesh.nodes[:-1]), ca.DM(np.diff(mesh.nodes))).full()).ravel() > 0
+    widths = (1, 1, m, m) + (1,) * (len(columns) - 4)
+    order, costs = [], []
+    for by_parts in (True, False):
+        span = np.flatnonzero(parted == by_parts)
+        if span.size:
+            function = simpson_interval(statement, m, by_parts).map(span.size)
+            places = [(span[:, None] * w + np.arange(w)).ravel().tolist() for w in widths]
+            costs.append(function(*(c[:, at] for c, at in zip(columns, places, strict=True))))
+            order += span.tolist()
+    found: Any = ca.horzcat(*costs)
+    return found if order == list(range(n)) else found[:, np.argsort(order).tolist()]
 
 
 def _of(kicks: Expr, statement: Statement, positions: tuple[int, ...]) -> Any:

@@ -31,6 +31,9 @@ from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, StepKind, moving_step, scalar_solver, slopes_wanted, state_slope
 from covocp.transcription.rosenbrock import between, implicit_interval
 
+# Intervals as long as one from it to the end within which what runs backward may be steep.
+NEAR_END = 10.0
+
 
 @lru_cache(maxsize=KEPT)
 def nominal_interval(statement: Statement, substeps: int, step: StepKind) -> ca.Function:
@@ -66,7 +69,7 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
     symbolic: Any = statement.symbolic
     nx = statement.nx
     z, interval = symbolic.sym("z", nx + statement.ne), Interval.symbols(statement)
-    first = early(interval)
+    first = early(statement, interval.s, interval.ds)
 
     def rate(part: Interval, value: Expr, c: float) -> Expr:
         point = part.at(c, value[:nx], value[nx:-1])
@@ -203,9 +206,17 @@ def _by_parts(statement: Statement) -> Callable[..., tuple[Any, Any]]:
     return lambda *six: tuple(function(*six))
 
 
-def early(interval: Interval) -> Expr:
-    """Whether an interval lies in the first half of the time, where the cost of a closed loop is taken by parts."""
-    return interval.s + interval.ds / 2 < 0.5
+def early(statement: Statement, s: Expr, ds: Expr) -> Any:
+    """Whether the cost of a closed loop is taken by parts over intervals [s, s + ds]: not where they are near the end.
+
+    There what runs backward may change within an interval, as before a jump of its rate; elsewhere the covariance of
+    the error may, where a sensor comes to see something.
+    """
+    middle = s + ds / 2
+    away = ca.logic_or(middle < 0.5, 1 - middle > NEAR_END * ds)
+    for place in statement.falls:
+        away = ca.logic_and(away, ca.logic_or(middle > place, place - middle > NEAR_END * ds))
+    return away
 
 
 @lru_cache(maxsize=KEPT)
@@ -252,7 +263,9 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
         arguments = (x, e, states, halves, *interval)
         cost = simpson_interval(statement, substeps)(*arguments)
         if statement.behind:
-            cost = ca.if_else(early(interval), simpson_interval(statement, substeps, True)(*arguments), cost)
+            cost = ca.if_else(
+                early(statement, interval.s, interval.ds), simpson_interval(statement, substeps, True)(*arguments), cost
+            )
     fine = ca.vertcat(states, halves)
     options = slopes_wanted(statement, 1)
     function = ca.Function("full_interval", [z, *interval], [fine[:, -1], fine, cost], options)

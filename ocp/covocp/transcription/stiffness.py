@@ -26,7 +26,7 @@ DAMPED = -0.5
 
 def resolve_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
     """The mesh of some options, its steps chosen by the stiffness of the problem at its start."""
-    options = with_instants(statement, options)
+    options = with_instants(statement, options, parameters)
     stiff = stiffness(statement, options, parameters)
     return choose_mesh(statement, options, choose_step(statement, options, stiff), stiff)
 

@@ -1,0 +1,100 @@
+"""Functions in pieces (`if_else`, `fmax`, |x|, `floor`): what they compare, round or choose between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+
+TWO_SIDED = ("OP_LT", "OP_LE", "OP_EQ", "OP_NE", "OP_FMAX", "OP_FMIN")
+ONE_SIDED = {
+    "OP_FABS": (0,), "OP_FLOOR": (0,), "OP_CEIL": (0,), "OP_SIGN": (0,), "OP_IF_ELSE_ZERO": (1,), "OP_COPYSIGN": (1,),
+    "OP_FMOD": (0, 1), "OP_REMAINDER": (0, 1),
+}  # fmt: skip
+# Operations with pieces that end where something is a whole number.
+WHOLE = ("OP_FLOOR", "OP_CEIL", "OP_FMOD", "OP_REMAINDER")
+# What a choice is made by: where its pieces end is known from these.
+LOGICAL = ("OP_LT", "OP_LE", "OP_EQ", "OP_NE", "OP_AND", "OP_OR", "OP_NOT")
+
+
+def operands_of(function: ca.Function) -> ca.Function | None:
+    """What a function compares, rounds or chooses, as a function; None where it does nothing of the kind."""
+    operands = []
+    for name, node in _pieces(function):
+        if name in TWO_SIDED:
+            operands.append(node.dep(0) - node.dep(1))
+        else:
+            operands += [node.dep(i) for i in ONE_SIDED[name]]
+    if not operands:
+        return None
+    arguments: Any = function.sx_in()
+    names = [function.name_in(i) for i in range(function.n_in())]
+    return ca.Function("operands", arguments, [ca.vertcat(*operands)], names, ["operands"])
+
+
+def sides_of(function: ca.Function, allowed: Sequence[int], moving: int) -> ca.Function | None:
+    """Where pieces end that depend on some arguments alone.
+
+    Args:
+        function: with scalar operations.
+        allowed: numbers of the arguments that pieces may depend on.
+        moving: number of that one of them, a scalar, which they must depend on.
+
+    Returns:
+        (the allowed arguments) -> for each piece that which is zero where it ends, or a whole number, and what changes
+        there: a sign, or the whole number below. None where no piece is so.
+    """
+    ends, sides = [], []
+    for name, node in _pieces(function):
+        if name != "OP_IF_ELSE_ZERO" or not any(node.dep(0).is_op(code) for code in _codes(LOGICAL)):
+            ends.append(_end(name, node))
+            sides.append(ca.floor(ends[-1]) if name in WHOLE else ca.sign(ends[-1]))
+    if not ends:
+        return None
+    arguments: Any = function.sx_in()
+    every = ca.Function("every", arguments, [ca.vertcat(*ends)])
+    by = [set(every.jac_sparsity(0, i).row()) if arguments[i].numel() else set() for i in range(len(arguments))]
+    chosen = sorted(by[moving].difference(*(rows for i, rows in enumerate(by) if i not in allowed)))
+    if not chosen:
+        return None
+    outputs = [ca.vertcat(*(values[k] for k in chosen)) for values in (ends, sides)]
+    return ca.Function("sides", [arguments[i] for i in allowed], outputs)
+
+
+def has_pieces(function: ca.Function) -> bool:
+    """Whether a function compares, rounds or chooses; one that calls others counts as one that does not."""
+    return bool(_pieces(function))
+
+
+def _end(name: str, node: Any) -> Any:
+    """What is zero where a piece ends, or a whole number."""
+    if name in TWO_SIDED:
+        return node.dep(0) - node.dep(1)
+    if name in ("OP_FMOD", "OP_REMAINDER"):
+        return node.dep(0) / node.dep(1) + (0.5 if name == "OP_REMAINDER" else 0.0)
+    return node.dep(1 if name == "OP_COPYSIGN" else 0)
+
+
+def _pieces(function: ca.Function) -> list[tuple[str, Any]]:
+    """The operations that have pieces, by name; none where the function does not consist of scalar operations."""
+    if not function.is_a("SXFunction"):
+        return []
+    names = _codes((*TWO_SIDED, *ONE_SIDED))
+    found = [(k, names.get(function.instruction_id(k), "")) for k in range(function.n_instructions())]
+    found = [(k, name) for k, name in found if name]
+    expressions: Any = function.instructions_sx() if found else []
+    return [(name, expressions[k]) for k, name in found]
+
+
+def _codes(names: Sequence[str]) -> dict[int, str]:
+    """Operations by their number: versions of CasADi differ in what they have."""
+    return {getattr(ca, name): name for name in names if hasattr(ca, name)}
+
+
+def expanded(function: ca.Function) -> ca.Function:
+    """The function as scalar expressions where it consists of such, else as it is."""
+    try:
+        return function.expand()
+    except RuntimeError:  # it calls a table, a linear solver or an external function
+        return function
