@@ -11,6 +11,7 @@ from covocp.statement.statement import Block, Statement
 from covocp.transcription.first_guess import simulate_states
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
+from covocp.transcription.resolution import estimated_rows, resolutions
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import Trajectory
 
@@ -45,23 +46,31 @@ def limit_units(lower: Array, upper: Array) -> Array:
     return np.where((largest > 0) & (largest < SMALL), largest, np.where(large, nearest, 1.0))
 
 
-def magnitudes(statement: Statement, guess: Trajectory, parameters: Array, *, reached: bool = False) -> Scales:
+def magnitudes(
+    statement: Statement, guess: Trajectory, parameters: Array, *, reached: bool = False, far: float = 1.0
+) -> Scales:
     """Magnitudes from the given scales, boundary values, standard deviations and the trajectory itself.
 
     The ranges of the bounds are an upper limit: bounds that are far away say nothing of what moves between them.
+    A small standard deviation of a state that starts at zero says how well it is known, not where it goes: where a
+    start does not move it further, it counts at least as much as the measurements resolve.
 
     Args:
         statement: the problem.
         guess: the trajectory.
         parameters: of the statement.
         reached: whether a solver found it: then it tells more than scales that were given.
+        far: so many times what the measurements resolve.
     """
     x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     ends = np.maximum(np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf)))
     most = (PRIOR_REACHED if reached else PRIOR_AT_START) * np.where(ends > 0, ends, 1.0)
-    deviations = np.minimum(_deviations(statement, e0), most)
-    found = np.max([np.abs(guess.x).max(axis=0, initial=0.0), ends, deviations], axis=0)
+    deviations, moved = np.minimum(_deviations(statement, e0), most), np.abs(guess.x).max(axis=0, initial=0.0)
+    found = np.max([moved, ends, deviations], axis=0)
+    if (untold := (ends <= NOTHING) & (moved <= deviations)).any() and not reached:
+        resolved = resolutions(statement, guess, parameters)
+        found = np.where(untold & np.isfinite(resolved), np.maximum(found, far * resolved), found)
     span = np.where(upper > lower, upper - lower, np.inf)
     limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
     alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
@@ -83,9 +92,9 @@ def _deviations(statement: Statement, e: Array) -> Array:
     deviations = np.zeros(statement.nx)
     for block in statement.matrices:
         if block.estimation:
-            diagonal = np.diagonal(unpack(np.nan_to_num(e[block.span]), block.size))
-            known = min(statement.nx, block.size)  # constants to be chosen are states that nothing estimates
-            deviations[:known] = np.sqrt(np.maximum(diagonal[:known], 0.0))
+            variances = np.diagonal(unpack(np.nan_to_num(e[block.span]), block.size))
+            for k, row in estimated_rows(statement).items():
+                deviations[k] = np.sqrt(max(variances[row], 0.0))
     return deviations
 
 

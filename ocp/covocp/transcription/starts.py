@@ -278,7 +278,8 @@ def reachable(run: Run, flat: Array, sizes: Array, reach: float = REACH, path: A
     x = x if np.isfinite(x).all() else run.start[None, :]
     x = x if path is None else np.vstack([x, path])
     t = Trajectory(x=x, u=flat, e=np.zeros((1, run.statement.ne)), duration=run.duration)
-    scale = magnitudes(run.statement, t, run.parameters).x  # that of the run counts wide bounds as well
+    # The scale of the run counts wide bounds as well; what measurements resolve is where excitation begins, not ends.
+    scale = magnitudes(run.statement, t, run.parameters, far=WIDE).x
     return _shares(run.statement, sizes, needed_controls(run.statement, run.mesh, t, scale, run.parameters), reach)
 
 

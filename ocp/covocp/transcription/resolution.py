@@ -1,0 +1,74 @@
+"""What the measurements tell of a state by themselves: a magnitude of states that are known well where they start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from covocp.base.matrices import Array
+from covocp.statement.statement import Statement
+from covocp.transcription.trajectory import Trajectory, at_nodes
+
+# Places of the horizon, after the first one, at which the information is looked at.
+PLACES = 16
+
+
+def estimated_rows(statement: Statement) -> dict[int, int]:
+    """Rows of the augmented state by entry of the state; constants to be chosen and what is known exactly have none."""
+    rows = {name: row for row, name in enumerate(statement.augmented)}
+    return {k: rows[name] for k, name in enumerate(statement.state_names) if name in rows}
+
+
+def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> Array:
+    """Standard deviations to which all measurements of the horizon tell each initial state, were it alone unknown.
+
+    1/sqrt(G_ii) of the observability Gramian, the integral of Phi' W Phi and the sum of Phi' H' R^-1 H Phi over the
+    instants, with the drift F of the start. A nominal that moves less tells no more than one that rests.
+
+    Returns:
+        Shape (nx,), inf where nothing sees a state or where that is not known.
+    """
+    result = np.full(statement.nx, np.inf)
+    forms = [f for b, f in zip(statement.matrices, statement.riccati, strict=True) if b.estimation and f is not None]
+    if not forms or statement.coupled or not np.isfinite(along.x).all():
+        return result
+    drift = np.asarray(forms[0](*_point(along, 0), parameters)[0].full())
+    if not np.isfinite(drift).all():
+        return result
+    from scipy.linalg import expm  # takes long to import
+
+    with np.errstate(all="ignore"):  # an unstable plant overflows: what grows so is seen
+        step = expm(drift * along.duration / PLACES)
+        moved = [np.eye(len(drift))]
+        for _ in range(PLACES):
+            moved.append(step @ moved[-1])
+        seen = np.zeros(len(drift))
+        for place in range(PLACES + 1):
+            information = np.asarray(forms[0](*_point(along, place), parameters)[2].full())
+            seen += np.einsum("ji,jk,ki->i", moved[place], information, moved[place]) * along.duration / PLACES
+        for place, rows, variance in _read(statement, along, parameters):
+            read = rows @ moved[place]
+            seen += np.sum(read * np.linalg.solve(variance, read), axis=0)
+        for k, row in estimated_rows(statement).items():
+            result[k] = seen[row] ** -0.5 if seen[row] > 0 else np.inf
+    return result
+
+
+def _read(statement: Statement, along: Trajectory, parameters: Array) -> Iterator[tuple[int, Array, Array]]:
+    """Of each measurement at each of its instants: the place, rows of the Jacobian H, and the variance R."""
+    samples = statement.samples
+    if samples is None:
+        return
+    for block, instants in zip(samples.blocks, samples.places, strict=True):
+        for instant in instants:
+            place = round(instant * PLACES)
+            _, jacobian, variance = (v.full() for v in samples.measurement(*_point(along, place), parameters))
+            yield place, jacobian[block.span], variance[block.span, block.span]
+
+
+def _point(along: Trajectory, place: int) -> tuple[Array, Array, float, float]:
+    """State, control, time and duration near one of the places of a trajectory."""
+    nodes = along.x.shape[0]
+    node, t = round(place / PLACES * (nodes - 1)), place / PLACES * along.duration
+    return along.x[node], at_nodes(along.u, nodes)[node], t, along.duration
