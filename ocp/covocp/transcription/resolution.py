@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
-from covocp.transcription.trajectory import Trajectory, at_nodes
+from covocp.transcription.trajectory import Trajectory
 
 # Places of the horizon, after the first one, at which the information is looked at.
 PLACES = 16
@@ -69,6 +69,6 @@ def _read(statement: Statement, along: Trajectory, parameters: Array) -> Iterato
 
 def _point(along: Trajectory, place: int) -> tuple[Array, Array, float, float]:
     """State, control, time and duration near one of the places of a trajectory."""
-    nodes = along.x.shape[0]
-    node, t = round(place / PLACES * (nodes - 1)), place / PLACES * along.duration
-    return along.x[node], at_nodes(along.u, nodes)[node], t, along.duration
+    share = place / PLACES
+    x, u = (values[round(share * (values.shape[0] - 1))] for values in (along.x, along.u))
+    return x, u, share * along.duration, along.duration
