@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from covocp.base.errors import Interrupted, OutsideDomainError
+from covocp.base.errors import Interrupted, OutsideDomainError, warn_user
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess, Outcome, Prepared
@@ -57,6 +57,12 @@ def from_starts(
     if len(tried) > 1:
         outcome = replace(outcome, stats={**outcome.stats, "tried": len(tried)})
     return outcome, guess
+
+
+def mention_left(error: OutsideDomainError) -> None:
+    """Warn that the solution given as a guess was left for the problem's own start."""
+    problem = str(error).splitlines()[0]
+    warn_user(f"The solution that was given is no guess for these values, so the own start was taken: {problem}")
 
 
 def best_of(prepared: Any, values: Any, guesses: Iterable[Any], count: int, reporter: Progress) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from covocp.base.arguments import checked, optional, positive, text, truth, whole
-from covocp.base.errors import CovocpError, Interrupted, evaluating
+from covocp.base.errors import CovocpError, Interrupted, OutsideDomainError, evaluating
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
@@ -28,7 +28,7 @@ from covocp.solution.report import OTHERWISE
 from covocp.solution.solution import Solution
 from covocp.solving import refining
 from covocp.solving.around_nominal import closed_around
-from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, with_stats
+from covocp.solving.attempts import best_of, cost_of, counted, from_starts, interrupted, mention_left, with_stats
 from covocp.solving.automatic import is_suited
 from covocp.solving.beside_classical import ClassicalDesign, Costs
 from covocp.solving.between_nodes import AT_NODES, check_between, watched
@@ -240,21 +240,13 @@ class Solver:
         title = self.statement.name or "solving"
         with evaluating(self.statement.name):
             with Progress(title, progress, seconds=time_limit, iterations=iteration_limit) as reporter:
-                first = best_gain(self._best, parameters, guess, reporter)
-                if first is not None:
-                    if not allow_failure:
-                        check_possible(self._problem.declarations, self._solved, first)
-                    near = not reporter.stop
-                    guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
-                if isinstance(guess, Later | Solution):
-                    self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
                 if isinstance(guess, str):
-                    outcome = self._multistart(guess, values, starts, seed, reporter)
+                    guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
+                    outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter), None
                 else:
-                    if assess and guess is None and first is None:
-                        self._look_at_steps(values)
-                    outcome, start = self._from_start(values, guess, first, reporter)
-                    outcome = away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome
+                    outcome, first = self._from_given(
+                        values, parameters, guess, reporter, assess=assess, allow_failure=allow_failure
+                    )
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
@@ -274,6 +266,36 @@ class Solver:
         waited, self._made_in = time.perf_counter() - begin + self._made_in, 0.0
         told = sum(float(solution.stats.get(name, 0.0)) for name in RUN_SECONDS)
         return with_stats(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
+
+    def _from_given(
+        self,
+        values: Array,
+        parameters: Mapping[str, Any] | None,
+        guess: Given,
+        reporter: Progress,
+        *,
+        assess: bool,
+        allow_failure: bool,
+    ) -> tuple[Outcome, Solution | None]:
+        """Solve from a guess, an unusable solution left for None; also the best gain's solution where one was made."""
+        first, given = best_gain(self._best, parameters, guess, reporter), guess
+        if first is not None:
+            if not allow_failure:
+                check_possible(self._problem.declarations, self._solved, first)
+            near = not reporter.stop
+            guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
+        if isinstance(guess, Later | Solution):
+            self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
+        if assess and guess is None and first is None:
+            self._look_at_steps(values)
+        try:
+            outcome, start = self._from_start(values, guess, first, reporter)
+        except OutsideDomainError as error:
+            if not isinstance(given, Later | Solution):
+                raise
+            mention_left(error)
+            return self._from_given(values, parameters, None, reporter, assess=assess, allow_failure=allow_failure)
+        return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(
         self, values: Array, guess: Given, best: Solution | None, reporter: Progress
@@ -435,12 +457,6 @@ class Solver:
         if outcome.converged:
             return cost_of(outcome), ""
         return np.nan, f"The problem without noise was not solved: {outcome.message}."
-
-    def _multistart(self, guess: str, values: Array, starts: int, seed: int, reporter: Progress) -> Outcome:
-        """The best of the problem's own start and several random ones."""
-        guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
-        outcome: Outcome = best_of(self._prepared, values, guesses, starts + 1, reporter)
-        return outcome
 
     def _take_steps(self, mesh: Mesh) -> None:
         """The integration steps of a solution to start from where they are shorter: on longer ones it is no optimum."""

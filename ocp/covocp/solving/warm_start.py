@@ -117,6 +117,12 @@ def _from_solution(
         trajectory = Trajectory(x=t.x.copy(), u=t.u.copy(), e=t.e.copy(), duration=duration)
     else:
         trajectory = _resampled(statement, mesh, parameters, solution, matched, elapsed)
+    carried = statement.matrices and not (mesh.eliminated or statement.coupled)
+    if carried and not np.array_equal(parameters, solution.extremal.parameters):
+        # of other values: from large covariances on, the steps may be too long for a better sensor
+        e0 = starts(statement, mesh, parameters)[1]
+        made = simulate_matrices(statement, mesh, trajectory.x, trajectory.u, e0, duration, parameters)
+        trajectory = replace(trajectory, e=made)
     if not statement.noise_varies:  # what parameters say has no better place to go on to
         check_measured(statement, trajectory.x[0], trajectory.u[0], duration, parameters)
     st = statement
