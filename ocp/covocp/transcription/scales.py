@@ -30,6 +30,8 @@ PRIOR_AT_START, PRIOR_REACHED = 1e3, 10.0
 GIVEN_SHARE = 1e-6
 # What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
 NOTHING = 1e-50
+# A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
+ROUNDOFF = 1e-24
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
 SMALL, LARGE = 0.1, 1e3
 
@@ -165,11 +167,13 @@ def needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: 
 
 
 def _matrix_scales(statement: Statement, e: Array) -> Array:
-    """sqrt(E_ii E_jj) from the largest diagonal entries along the guess; 1 where these are zero."""
+    """sqrt(E_ii E_jj) from the largest variances along the guess; 1 where these are zero or nothing but roundoff."""
     scales = np.ones(statement.ne)
     for block in statement.matrices:
         rows, columns = half_indices(block.size)
-        diagonal = np.abs(e[:, block.span][:, rows == columns]).max(axis=0, initial=0.0)
-        diagonal = np.where(diagonal > NOTHING, diagonal, 1.0)
+        along = np.abs(e[:, block.span][:, rows == columns])
+        diagonal = along.max(axis=0, initial=0.0)
+        roundoff = np.where(along[:1].any(axis=0), NOTHING, ROUNDOFF * diagonal.max(initial=0.0))
+        diagonal = np.where(diagonal > np.maximum(roundoff, NOTHING), diagonal, 1.0)
         scales[block.span] = np.sqrt(diagonal[rows]) * np.sqrt(diagonal[columns])
     return scales
