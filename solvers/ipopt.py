@@ -300,6 +300,7 @@ class ChainSolver:
             message=self._runs.message(last),
             violations=last.nlp.violations(last.where[1]["g"], parameters),
             stats=counts,
+            with_passages=True,
         )
 
 

@@ -142,3 +142,37 @@ def test_a_bound_holds_what_a_jump_gives_and_has_the_multiplier_of_shooting() ->
         assert solution.link_residuals[0] < 1e-6
         # p(T) of x is minus its control, and 2 (x - 2) + mu/2 + p+/2 of the jump; x is held at 0.8
         assert solution["one"].costate("x")[-1] == pytest.approx(-0.8, rel=1e-3)
+
+
+def bent_jump() -> co.Phases:
+    """The weight S of what deviates before the jump depends on the speed there, by its slope."""
+    first = co.Problem(2.0, name="before")
+    x, v = first.state("x", initial=0.0, variance=0.2), first.state("v", initial=0.5, variance=0.1)
+    drag = first.unknown("drag", mean=0.3, variance=0.02)
+    u = first.control("u")
+    first.dynamics(x, v)
+    first.dynamics(v, -drag * v + u, noise=0.03)
+    first.measurement("position", x, noise=0.1)
+    first.minimize_expected(running=0.5 * u**2 + 0.4 * (x - first.time) ** 2)
+    second = co.Problem(3.0, name="after")
+    y, w = second.state("x", initial=None), second.state("v", initial=None)
+    drag_after = second.unknown("drag", mean=0.3, variance=0.02)
+    push = second.control("u")
+    second.dynamics(y, w)
+    second.dynamics(w, -drag_after * w + push, noise=0.06)
+    second.measurement("position", y, noise=0.2)
+    second.minimize_expected(running=0.5 * push**2 + 0.4 * (y - 4) ** 2, terminal=2 * (y - 4) ** 2 + 0.5 * w**2)
+    phases = co.Phases([first, second])
+    phases.jump(w, v * (1 - 0.3 * drag) - 0.2 * v**2, noise=0.04)
+    return phases
+
+
+def test_costates_where_the_weight_of_a_phase_depends_on_where_it_ends():
+    """The slope through S(T) had been taken off multipliers that do not contain it: 2 % of the costate of the speed."""
+    shot, found = (co.solve(bent_jump(), method, intervals=20, progress=False) for method in ("ipopt", "gradient"))
+    along = co.evaluate(bent_jump(), nominal=shot, intervals=20)
+    for name in ("before", "after"):
+        assert found[name].optimality.stationarity < 1e-4
+        for other, tolerance in ((found, 1e-3), (along, 1e-5)):
+            known = shot[name].costates.state
+            np.testing.assert_allclose(other[name].costates.state, known, atol=tolerance * np.abs(known).max())

@@ -43,6 +43,8 @@ class ChainOutcome:
         stats: iterations, times, what the method counts.
         given: whether the controls were given, and nothing was chosen: then nothing is prescribed where statements end,
             and the multipliers contain nothing of what the later ones cost.
+        with_passages: whether the multipliers of final states contain the slope through matrices that start there, as
+            those of a transcription that eliminates these do.
     """
 
     extremals: tuple[Extremal, ...]
@@ -54,6 +56,7 @@ class ChainOutcome:
     violations: Mapping[str, float]
     stats: Mapping[str, Any]
     given: bool = False
+    with_passages: bool = False
 
     __repr__ = short_repr
 
@@ -124,7 +127,7 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
     """
     sizes = [sum(abs(value) for value in terms.values()) for terms in outcome.cost_terms]
     variable = [variable_cost(extremal) for extremal in outcome.extremals]
-    extremals = _with_weights(outcome.extremals, links)
+    extremals = _with_weights(outcome, links)
     result: list[Passed] = []
     for i in range(len(extremals) - 1, -1, -1):
         extremal = extremals[i]
@@ -159,17 +162,17 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
     return tuple(result[::-1])
 
 
-def _with_weights(extremals: tuple[Extremal, ...], links: tuple[Link, ...]) -> list[Extremal]:
+def _with_weights(outcome: ChainOutcome, links: tuple[Link, ...]) -> list[Extremal]:
     """The extremals with the slopes of what earlier ones cost by what runs backward, from the first to the last."""
     result: list[Extremal] = []
-    for i, extremal in enumerate(extremals):
+    for i, extremal in enumerate(outcome.extremals):
         if i and links[i - 1].weights:
             before, link = result[-1], links[i - 1]
             ended = discrete_costates(before)[0].matrices[-1, before.statement.entries(before.statement.behind)]
             matrices = extremal.multipliers.matrices.copy()
             matrices[0, list(link.behind)] = passage_end(before, ended)[2][list(link.weights)]
             extremal = replace(extremal, multipliers=replace(extremal.multipliers, matrices=matrices))
-        result.append(without_passage(extremal))
+        result.append(without_passage(extremal) if outcome.with_passages else extremal)
     return result
 
 
