@@ -33,6 +33,16 @@ def needs(weight: float):
 def anything(**parameters):
     return make(**parameters)
 
+def parts(final=1.0):
+    first, second = co.Problem(2.0, name="first"), co.Problem(3.0, name="second")
+    x, u = first.state("x", initial=0.0), first.control("u")
+    first.dynamics(x, u)
+    first.minimize(running=0.5 * u**2)
+    y, w = second.state("x", initial=None, final=final), second.control("w")
+    second.dynamics(y, w)
+    second.minimize(running=0.5 * w**2)
+    return co.Phases([first, second], name="parts")
+
 def number():
     return 3
 
@@ -559,3 +569,51 @@ def test_the_package_runs_as_a_module():
 def test_version(capsys, monkeypatch):
     monkeypatch.setitem(vars(co), "__version__", "1.2.3")
     assert run(capsys, "--version") == (0, "covocp 1.2.3\n", "")
+
+
+# --- several phases ---------------------------------------------------------------------------------------------------
+
+
+def test_phases_are_solved_drawn_saved_and_compared(capsys, script, tmp_path):
+    """x' = u from 0 to 3 within 5 s costs 3^2/(2 * 5)."""
+    of = f"{script}:parts"
+    saved, figure, drawn = tmp_path / "parts.npz", tmp_path / "parts.png", tmp_path / "drawn.png"
+    code, out, _ = run(capsys, "solve", of, "--set", "final=3", "--intervals", 5, "--save", saved, "--plot", figure)
+    assert code == 0
+    assert out.startswith("parts: solved (ipopt)")
+    assert "all phases" in out
+    assert figure.stat().st_size > 1000
+    spaces = {}
+    exec(SCRIPT, spaces)  # noqa: S102
+    assert co.load(saved, spaces["parts"](3.0)).cost == pytest.approx(0.9)
+    assert run(capsys, "plot", of, "--intervals", 5, "--plot", drawn) == (0, f"figure: {drawn}\n", "")
+    assert drawn.stat().st_size > 1000
+    code, out, _ = run(capsys, "compare", of, "--intervals", 5)
+    assert code == 0
+    assert "gradient" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("compare", "--plot", "figure.png"), "does not take phases"),
+        (("export", "folder", "--solver"), "does not take phases"),
+    ],
+)
+def test_options_that_mean_nothing_for_phases(capsys, script, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    command, *rest = arguments
+    assert_refused(run(capsys, command, f"{script}:parts", *rest), words)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("--set", "weight=2", "--set", "weight=3"), "'weight' is given twice"),
+        (("--option", "substeps=2", "--option", "substeps=3"), "'substeps' is given twice"),
+        (("--option", "ipopt.tolerance=1e-6", "--option", "ipopt.tolerance=1e-7"), "'tolerance' is given twice"),
+    ],
+)
+def test_a_value_that_is_given_twice(capsys, script, settings, words):
+    """The last one had been taken without a word."""
+    assert_refused(run(capsys, "solve", f"{script}:make", *settings), words)

@@ -17,6 +17,7 @@ from typing import Any
 
 from covocp.base.errors import CovocpError, ProblemError, kind_and_name, remedy_for_symbols, spelling
 from covocp.problem.builder import Problem
+from covocp.problem.phases import Phases
 
 MODELS = "covocp.models"
 WORDS = {"none": None, "true": True, "false": False}
@@ -26,7 +27,7 @@ KINDS: Mapping[str, Any] = {"float": 0.0, "int": 0, "str": "", "bool": False}
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A function that makes a problem.
+    """A function that makes a problem, or one of several phases.
 
     Attributes:
         name: for file names.
@@ -58,18 +59,19 @@ class Model:
         parameters = inspect.signature(self.make).parameters.values()
         return {p.name: "VALUE" if p.default is p.empty else str(p.default) for p in parameters}
 
-    def build(self, settings: Sequence[str] = ()) -> Problem:
+    def build(self, settings: Sequence[str] = ()) -> Problem | Phases:
         """The problem for some settings, each "name=value".
 
         Raises:
-            ProblemError: an unknown parameter, a value that does not fit, the function failed or returned no problem.
+            ProblemError: an unknown parameter, one that is set twice, a value that does not fit, the function failed or
+                returned no problem.
         """
         values = self._values(settings)
         problem = _called(self.label, self.script, lambda: self.make(**values))
-        if not isinstance(problem, Problem):
+        if not isinstance(problem, Problem | Phases):
             raise ProblemError(
                 f"'{self.label}' did not return a problem.",
-                expected="a covocp.Problem",
+                expected="a covocp.Problem, or covocp.Phases",
                 received=kind_and_name(problem),
                 remedy="end the function by returning the problem that it makes",
             )
@@ -95,6 +97,7 @@ class Model:
         values: dict[str, Any] = {}
         for setting in settings:
             name, text = split_setting("--set", setting)
+            check_once("--set", name, setting, values)
             if name not in named and not anything:
                 raise ProblemError(
                     f"'{self.label}' has no parameter '{name}'.",
@@ -203,7 +206,7 @@ def _from_script(path: Path, name: str) -> Model:
             f"'{path}' has no function '{name}'." if name else f"Which function of '{path}' makes the problem?",
             expected=f"{path}:function, the function one of " + (", ".join(own) or "none: the script has none"),
             received=f"{path}:{name}" if name else str(path),
-            remedy="name a function that returns a covocp.Problem",
+            remedy="name a function that returns a covocp.Problem, or covocp.Phases",
         )
     return Model(name=path.stem, label=f"{path}:{name}", make=make, module=module, script=path)
 
@@ -250,6 +253,21 @@ def split_setting(option: str, text: str) -> tuple[str, str]:
             remedy="write the name, an equals sign and the value without blanks",
         )
     return name.strip(), value.strip()
+
+
+def check_once(option: str, name: str, text: str, known: Mapping[str, Any]) -> None:
+    """Refuse a name that has a value already: which of them is meant is not known.
+
+    Raises:
+        ProblemError: it has one.
+    """
+    if name in known:
+        raise ProblemError(
+            f"'{name}' is given twice.",
+            expected=f"one {option} {name}=VALUE",
+            received=f"{option} {name}={known[name]}, then {option} {text}",
+            remedy="remove one of them",
+        )
 
 
 def parse_value(text: str) -> Any:

@@ -19,7 +19,7 @@ from covocp.base.expressions import Given
 from covocp.base.files import check_target
 from covocp.base.later import later
 from covocp.base.pages import WIDTH
-from covocp.cli.catalogue import find_model, models, parse_value, problems, split_setting
+from covocp.cli.catalogue import check_once, find_model, models, parse_value, problems, split_setting
 from covocp.plot.figure import SUFFIXES as FIGURES
 from covocp.solution.storage import SUFFIXES as FILES
 from covocp.solving.comparison import COMPARED, SOLVE_OPTIONS
@@ -220,6 +220,10 @@ def _compare(arguments: argparse.Namespace) -> int:
     """covocp compare MODEL."""
     _check_targets((arguments.plot, FIGURES))
     problem = find_model(arguments.model).build(arguments.set)
+    if arguments.plot and isinstance(problem, co.Phases):
+        raise _not_of_phases(
+            "compare", "--plot", "draw the figure of each method by `covocp plot MODEL --method METHOD`"
+        )
     methods = arguments.method or list(COMPARED)
     shared, own = _options(arguments.option, co.methods())
     _check_compared(methods, shared, own)
@@ -307,7 +311,10 @@ def _figure(title: str, figure: dict[str, Any], path: Path, arguments: argparse.
         if solution is not None:
             labels.append(label)
             solutions.append(solution)
-    if solutions:
+    if solutions and isinstance(solutions[0], co.PhasesSolution):  # alone: it has a figure of its own
+        solutions[0].plot(path=path)
+        _say(arguments, f"figure: {path}")
+    elif solutions:
         draw = later("plot.figure").plot_solutions
         draw(solutions, *figure.pop("names", ()), labels=labels, title=title or None, path=path, **figure)
         _say(arguments, f"figure: {path}" + (f": {title}" if title else ""))
@@ -322,6 +329,8 @@ def _export(arguments: argparse.Namespace) -> int:
     exporting.check_settings(arguments.directory, **settings)
     what = find_model(arguments.model).build(arguments.set)
     code = 0
+    if arguments.solver and isinstance(what, co.Phases):
+        raise _not_of_phases("export", "--solver", "export the solver of one problem, or the solution without --solver")
     if arguments.solver:
         shared, _ = _options(arguments.option, ())
         settings |= {**shared, "intervals": arguments.intervals or INTERVALS}
@@ -336,6 +345,16 @@ def _export(arguments: argparse.Namespace) -> int:
     check = package.check(samples=arguments.samples)
     _say(arguments, str(package))
     return 0 if check.ok else FAILED
+
+
+def _not_of_phases(command: str, option: str, remedy: str) -> ProblemError:
+    """The error of an option that has no meaning for several phases."""
+    return ProblemError(
+        f"`covocp {command} {option}` does not take phases.",
+        expected="a function that returns a covocp.Problem",
+        received="one that returns covocp.Phases",
+        remedy=remedy,
+    )
 
 
 def _solved(problem: Given, arguments: argparse.Namespace, nominal: Given = None) -> tuple[Any, int]:
@@ -377,7 +396,8 @@ def _options(given: list[str], methods: Sequence[str]) -> tuple[dict[str, Any], 
         name, value = split_setting("--option", entry)
         method, dot, rest = name.partition(".")
         if dot and method in methods:
-            own.setdefault(method, {})[rest] = parse_value(value)
+            check_once("--option", rest, entry, own.setdefault(method, {}))
+            own[method][rest] = parse_value(value)
         elif name in TAKEN:
             raise ProblemError(
                 f"'{name}' is not an option of the solver.",
@@ -386,6 +406,7 @@ def _options(given: list[str], methods: Sequence[str]) -> tuple[dict[str, Any], 
                 remedy=f"use --{name}" if name in ("method", "intervals") else "remove it",
             )
         else:
+            check_once("--option", name, entry, shared)
             shared[name] = parse_value(value)
     return shared, own
 
