@@ -584,7 +584,7 @@ def test_phases_are_solved_drawn_saved_and_compared(capsys, script, tmp_path):
     assert "all phases" in out
     assert figure.stat().st_size > 1000
     spaces = {}
-    exec(SCRIPT, spaces)  # noqa: S102
+    exec(SCRIPT, spaces)
     assert co.load(saved, spaces["parts"](3.0)).cost == pytest.approx(0.9)
     assert run(capsys, "plot", of, "--intervals", 5, "--plot", drawn) == (0, f"figure: {drawn}\n", "")
     assert drawn.stat().st_size > 1000
