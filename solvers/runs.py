@@ -303,6 +303,8 @@ class Runs:
             return f"{STALE}: {last.residuals}; {REMEDY}"
         if not last.point.evaluable:
             return status
+        if known is Status.NO_STEP and not self._limited:  # what may find a way was given
+            return Status.NO_STEP.words
         return f"{self._plugin} ended with the status '{status}'" if known is None else str(known)
 
     def _build(

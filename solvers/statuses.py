@@ -35,7 +35,7 @@ class Status(Ending):
     NO_STEP = (
         "Error_In_Step_Computation",
         "no step from there leads on at this accuracy",
-        "method='reduced' or hessian='exact' may find a way",
+        "method='ipopt' with hessian='exact' may find a way",
     )
     NO_NUMBER = (
         "Invalid_Number_Detected",

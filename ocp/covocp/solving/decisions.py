@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import casadi as ca
 import numpy as np
 
+from covocp.base.kinks import MOSTLY_SMOOTH, kinks
 from covocp.base.matrices import Array
 from covocp.solution.solution import Solution
 from covocp.statement.entries import entry_names
+from covocp.statement.interval import model_symbols
 
 # A decision or a control (in any unit) that is so many times its magnitude where no bound stops it has no end in sight.
 FAR, FAR_CONTROL = 1e6, 1e12
@@ -46,4 +51,25 @@ def bent_data(solution: Solution) -> str:
     return (
         f"\n  The data {bent} have kinks: where T is free its slope jumps whenever one of them passes a node. "
         "kind='cubic' is smooth; or solve for some fixed durations and compare."
+    )
+
+
+def bent_cost(solution: Solution) -> str:
+    """A line on a running cost with kinks in a control; "" where there are none, or something is violated."""
+    statement = solution.statement
+    if statement is None or not statement.nu or solution.violations:
+        return ""
+    kind: Any = statement.symbolic
+    symbols = model_symbols(statement)
+    controls = [kind.sym(block.name, block.size) for block in statement.controls]
+    running = statement.rates(symbols[0], ca.vertcat(*controls), *symbols[2:])[2]
+    bends = [kinks(running, [control]) - MOSTLY_SMOOTH for control in controls]
+    if not any(bends):
+        return ""
+    names = " and ".join(f"'{block.name}'" for block, own in zip(statement.controls, bends, strict=True) if own)
+    words = ", ".join(sorted(set().union(*bends)))
+    return (
+        f"\n  The running cost has kinks or jumps in {names} ({words}), where its slope may jump: a likely reason. "
+        "Smooth it, sqrt(u**2 + s**2) for abs(u) with a small s; or split the control, u = p - n with p, n >= 0 and "
+        "p + n for abs(u)."
     )

@@ -9,8 +9,9 @@ import numpy as np
 from covocp.base.errors import SolveError
 from covocp.extremal.densities import impossible_density, impossible_in_phases
 from covocp.extremal.extremal import Extremal, Outcome
+from covocp.solution.report import stated_first
 from covocp.solution.solution import Solution
-from covocp.solving.decisions import bent_data, far_away
+from covocp.solving.decisions import bent_cost, bent_data, far_away
 
 # Violations that are named.
 NAMED = 10
@@ -26,12 +27,12 @@ def failure(name: str, method: str, outcome: Outcome, solution: Solution, other_
         solution: the last iterate.
         other_way: a line about another method; empty: none.
     """
-    lines = [f"  {row}: {value:.6g}" for row, value in list(outcome.violations.items())[:NAMED]]
+    lines = [f"  {row}: {value:.6g}" for row, value in stated_first(outcome.violations)[:NAMED]]
     violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
     noise = impossible_noises([outcome.extremal], outcome.message)
     return SolveError(
         f"'{name or 'The problem'}' was not solved by {method}: {outcome.message}."
-        f"{violated}{far_away(solution)}{bent_data(solution)}{noise}{other_way}"
+        f"{violated}{far_away(solution)}{bent_data(solution)}{bent_cost(solution)}{noise}{other_way}"
         "\n  The last iterate is on this error (.solution): plot it, save it, or use it as a guess.",
         solution=solution,
         violations=outcome.violations,

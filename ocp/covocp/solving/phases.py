@@ -16,6 +16,7 @@ from covocp.extremal.links import ChainOutcome
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
 from covocp.solution.phases import PhasesSolution
+from covocp.solution.report import stated_first
 from covocp.solving.attempts import interrupted
 from covocp.solving.between_nodes import AT_NODES, check_between
 from covocp.solving.failure import impossible_noises
@@ -172,7 +173,7 @@ def _finished(solution: PhasesSolution, allow_failure: bool) -> PhasesSolution:
     if not solution.converged:
         if allow_failure:
             return solution
-        lines = [f"  {name}: {value:.6g}" for name, value in list(solution.violations.items())[:10]]
+        lines = [f"  {name}: {value:.6g}" for name, value in stated_first(solution.violations)[:10]]
         violated = "\n  violated constraints, by their largest violation:\n" + "\n".join(lines) if lines else ""
         named = f" of '{solution.name}'" if solution.name else ""
         noise = impossible_noises([phase.extremal for phase in solution.phases], solution.message)

@@ -1,0 +1,79 @@
+"""What is said of a run that failed: the likely reason, ways that were not tried, and first what the user stated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import pytest
+
+import covocp as co
+from covocp.solution.report import stated_first
+
+FUEL = 2.0 * (2.0 - 3.0**0.5)  # of a mass moved by 1 within 4 s by at most 1, at rest at both ends
+
+
+def mass(cost: Any, *, split: bool = False) -> co.Problem:
+    ocp = co.Problem(4.0, name="fuel")
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u", 2, lower=0.0, upper=1.0) if split else ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u[0] - u[1] if split else u)
+    ocp.minimize(running=cost(u))
+    return ocp
+
+
+def said(ocp: co.Problem, **options: Any) -> str:
+    with pytest.raises(co.SolveError) as failed:
+        co.solve(ocp, progress=False, **options)
+    return str(failed.value)
+
+
+@pytest.mark.parametrize("options", [{}, {"hessian": "exact"}, {"hessian": "limited-memory"}])
+def test_a_kink_in_a_control_is_told_and_no_way_that_was_given(options):
+    """method='reduced' or hessian='exact' had been recommended to who had given the latter."""
+    words = said(mass(ca.fabs), **options)
+    assert "kinks or jumps in 'u' (abs)" in words
+    assert "method='reduced'" not in words
+    exact = options.get("hessian") != "limited-memory"  # that of plain problems is exact
+    assert ("hessian='exact'" in words) is (not exact and "no step from there" in words)
+
+
+def test_the_remedies_of_a_kink_are_remedies():
+    split = co.solve(mass(lambda u: u[0] + u[1], split=True), progress=False)
+    assert split.cost == pytest.approx(FUEL, rel=1e-3)
+    smooth = co.solve(mass(lambda u: ca.sqrt(u**2 + 1e-4)), progress=False)
+    assert FUEL < smooth.cost < FUEL + 4.0 * 1e-2
+
+
+def test_no_kink_is_told_where_there_is_none_or_a_limit_is_passed():
+    assert "kinks" not in said(mass(lambda u: u**2), max_iterations=1)
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=5.0), ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=ca.fabs(u))
+    assert "kinks" not in said(ocp)
+
+
+def test_conditions_of_the_user_come_before_gaps():
+    """E[b, b] <= 1e-4 was named after the continuity of x, whose gap has another unit."""
+    ocp = co.Problem(5.0, name="accurate")
+    x = ocp.state("x", initial=0.0, variance=0.1)
+    b = ocp.unknown("b", mean=1.0, variance=1.0)
+    u = ocp.control("u", lower=-1.0, upper=1.0)
+    ocp.dynamics(x, -b * x + u, noise=0.01)
+    ocp.measurement("m", x, noise=0.01)
+    E = ocp.estimation_covariance()
+    ocp.subject_to(E[b, b], upper=1e-4, at="final", name="accuracy of b")
+    ocp.minimize(running=u**2)
+    with pytest.raises(co.SolveError) as failed:
+        co.solve(ocp, progress=False)
+    assert failed.value.solution is not None
+    for words in (str(failed.value), str(failed.value.solution)):
+        assert words.index("accuracy of b") < words.index("continuity of x")
+
+
+def test_order_of_violations():
+    violations = {"one: continuity of x": 9.0, "two: limit": 1.0, "continuity of y": 8.0, "one: final value of x": 2.0}
+    ordered = [name for name, _ in stated_first(violations)]
+    assert ordered == ["one: final value of x", "two: limit", "one: continuity of x", "continuity of y"]
