@@ -39,6 +39,8 @@ from covocp.transcription.separable import FOR_OWN, slopes
 MAX_ITERATIONS = 1000
 # Runs from one start, each in the scales of the point that the last one reached.
 LARGEST_ROUNDS = 6
+# Runs beside these that ended where they began: the tolerance is still to be tightened until they move.
+MOST_IDLE = 6
 # So many of them are in the scales that the user gave; where these do not do, the point tells better.
 GIVEN_ROUNDS = 3
 # A run that met its tolerance, but not the limit, in scales that stay: the next one has so much less of it, as a share
@@ -149,7 +151,8 @@ class Runs:
         """
         done = [self._judged(nlp, first, parameters)]
         begun: tuple[Any, ...] = ()
-        while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS:
+        idle = 0
+        while not done[-1].converged and not progress.stop and len(done) < LARGEST_ROUNDS + min(idle, MOST_IDLE):
             best = _best(done)
             if best.residuals is None or sum(entry.point.iterations for entry in done) >= self._most:
                 break
@@ -161,6 +164,7 @@ class Runs:
                 self._tighten(best.residuals)
             point = self._run(nlp, self._solver(start.lam_x is not None), start, parameters, progress)
             done.append(self._judged(nlp, point, parameters, again=True))
+            idle += point.iterations == 0
         if not done[-1].converged:
             done.append(done.pop(done.index(_best(done))))
         return done

@@ -189,3 +189,23 @@ def test_limits_of_small_variances_are_met_in_their_own_unit(limit: float) -> No
         return solution.cost
 
     assert cost(1.0) == pytest.approx(cost(limit), rel=1e-5)
+
+
+@pytest.mark.parametrize("prior", [1.0, 0.01])
+def test_rounds_that_move_nothing_do_not_use_up_those_that_would(prior):
+    """What is left of the cost is a millionth of that at rest, and so is the unit of the first round."""
+
+    def unstable() -> co.Problem:
+        ocp = co.Problem(10.0)
+        x = ocp.state("x", initial=0.0, variance=0.01)
+        b = ocp.unknown("b", mean=1.0, variance=prior)
+        u = ocp.control("u")
+        ocp.dynamics(x, b * x + u, noise=0.01)
+        ocp.measurement("m", x, noise=0.01)
+        E = ocp.estimation_covariance()
+        ocp.minimize(running=0.01 * u**2, terminal=E[b, b] / prior)
+        return ocp
+
+    found, other = (co.solve(unstable(), method, progress=False) for method in ("ipopt", "reduced"))
+    assert found.cost == pytest.approx(other.cost, rel=1e-6)
+    assert found.optimality.stationarity < 1e-5
