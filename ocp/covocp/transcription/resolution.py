@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from covocp.base.matrices import Array
+from covocp.base.matrices import Array, stacked
+from covocp.base.quadrature import gauss_transition
 from covocp.statement.statement import Statement
 from covocp.transcription.trajectory import Trajectory
 
@@ -33,20 +34,20 @@ def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> A
     forms = [f for b, f in zip(statement.matrices, statement.riccati, strict=True) if b.estimation and f is not None]
     if not forms or statement.coupled or not np.isfinite(along.x).all():
         return result
-    drift = np.asarray(forms[0](*_point(along, 0), parameters)[0].full())
+    count, points = PLACES + 1, [_point(along, place) for place in range(PLACES + 1)]
+    columns = [np.column_stack([np.atleast_1d(point[i]) for point in points]) for i in range(4)]
+    fixed = np.tile(parameters[:, None], (1, count))
+    drifts, _, informations = (stacked(v, count) for v in forms[0].map(count)(*columns, fixed))
+    drift = drifts[0]
     if not np.isfinite(drift).all():
         return result
-    from scipy.linalg import expm  # takes long to import
-
     with np.errstate(all="ignore"):  # an unstable plant overflows: what grows so is seen
-        step = expm(drift * along.duration / PLACES)
+        part = drift * along.duration / PLACES
+        step = gauss_transition([part, part], np.eye(len(drift)), np.linalg.solve)
         moved = [np.eye(len(drift))]
         for _ in range(PLACES):
             moved.append(step @ moved[-1])
-        seen = np.zeros(len(drift))
-        for place in range(PLACES + 1):
-            information = np.asarray(forms[0](*_point(along, place), parameters)[2].full())
-            seen += np.einsum("ji,jk,ki->i", moved[place], information, moved[place]) * along.duration / PLACES
+        seen = np.einsum("pji,pji->i", moved, informations @ np.array(moved)) * along.duration / PLACES
         for place, rows, variance in _read(statement, along, parameters):
             read = rows @ moved[place]
             seen += np.sum(read * np.linalg.solve(variance, read), axis=0)
