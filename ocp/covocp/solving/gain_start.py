@@ -9,7 +9,7 @@ and the nominal, is the solver's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +53,10 @@ SURELY = 1e-5
 LARGEST_SPREAD, SPREADS = 1e4, 40
 # Eigenvalue of a slope, relative to the largest, that is zero but for rounding.
 ROUNDOFF = 1e-9
+
+
+# What the user gave and who is told of iterations -> the solution with the best gain, and what a run starts from.
+GainStart = Callable[[Given, Progress], tuple["Solution | None", Given]]
 
 
 def with_best_gain_problems(problem: Problem) -> tuple[Problem, ...]:
@@ -148,6 +152,38 @@ def _rises(row: Row, best: Solution, least: Array) -> bool:
     alone = np.count_nonzero(entries) == 1 and np.trace(entries) > 0
     values = np.linalg.eigvalsh(matrices)
     return (constant or alone) and bool((values[..., 0] >= -ROUNDOFF * np.abs(values).max()).all())
+
+
+def gain_first(
+    solvers: tuple[Solver, ...],
+    problem: Problem,
+    statement: Statement,
+    parameters: Mapping[str, Any],
+    guess: Given,
+    reporter: Progress,
+    *,
+    allow_failure: bool,
+) -> tuple[Solution | None, Given]:
+    """The solution with the best gain where X asks for a gain, and what a run starts from.
+
+    Args:
+        solvers: of the problems with the best gain.
+        problem: with the conditions.
+        statement: the same.
+        parameters: values of parameters other than the declared ones, by name.
+        guess: that the user gave.
+        reporter: of iterations.
+        allow_failure: whether what is impossible is tried all the same.
+
+    Raises:
+        SolveError: no feedback can keep a limit of X.
+    """
+    first = best_gain(solvers, parameters, guess, reporter)
+    if first is None:
+        return None, guess
+    if not allow_failure:
+        check_possible(problem.declarations, statement, first)
+    return first, first if reporter.stop else meeting_conditions(problem, first, parameters)
 
 
 def check_possible(own: Declarations, statement: Statement, best: Solution | None) -> None:

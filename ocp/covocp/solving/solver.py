@@ -37,14 +37,7 @@ from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
-from covocp.solving.gain_start import (
-    best_gain,
-    beyond,
-    check_possible,
-    meeting_conditions,
-    with_best_gain_problems,
-    with_gain_told,
-)
+from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
 from covocp.solving.methods import check_problem as check_problem
@@ -244,9 +237,11 @@ class Solver:
                     guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
                     outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter), None
                 else:
-                    outcome, first = self._from_given(
-                        values, parameters, guess, reporter, assess=assess, allow_failure=allow_failure
+                    best, own = self._best, self._problem
+                    started = partial(
+                        gain_first, best, own, self._solved, parameters or {}, allow_failure=allow_failure
                     )
+                    outcome, first = self._from_given(values, started, guess, reporter, assess=assess)
                 outcome = without_turns(self._prepared, outcome, values, reporter) if assess else outcome
                 outcome = self._with_finer_steps(outcome, values, reporter) if assess else outcome
                 outcome = self._refined(outcome, values, reporter)
@@ -268,22 +263,11 @@ class Solver:
         return with_stats(solution, **{OTHER_SECONDS: max(waited - told, 0.0)})
 
     def _from_given(
-        self,
-        values: Array,
-        parameters: Mapping[str, Any] | None,
-        guess: Given,
-        reporter: Progress,
-        *,
-        assess: bool,
-        allow_failure: bool,
+        self, values: Array, gain_start: GainStart, guess: Given, reporter: Progress, *, assess: bool
     ) -> tuple[Outcome, Solution | None]:
         """Solve from a guess, an unusable solution left for None; also the best gain's solution where one was made."""
-        first, given = best_gain(self._best, parameters, guess, reporter), guess
-        if first is not None:
-            if not allow_failure:
-                check_possible(self._problem.declarations, self._solved, first)
-            near = not reporter.stop
-            guess = meeting_conditions(self._problem, first, parameters or {}) if near else first
+        given = guess
+        first, guess = gain_start(guess, reporter)
         if isinstance(guess, Later | Solution):
             self._take_steps((guess.plan if isinstance(guess, Later) else guess).mesh)
         if assess and guess is None and first is None:
@@ -294,7 +278,7 @@ class Solver:
             if not isinstance(given, Later | Solution):
                 raise
             mention_left(error)
-            return self._from_given(values, parameters, None, reporter, assess=assess, allow_failure=allow_failure)
+            return self._from_given(values, gain_start, None, reporter, assess=assess)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(
