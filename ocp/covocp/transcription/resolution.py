@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from covocp.transcription.trajectory import Trajectory
 
 # Places of the horizon, after the first one, at which the information is looked at.
 PLACES = 16
+# Size of a control that nothing tells, at most.
+LARGEST_UNIT = 1e7
 
 
 def estimated_rows(statement: Statement) -> dict[int, int]:
@@ -25,7 +28,8 @@ def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> A
     """Standard deviations to which all measurements of the horizon tell each initial state, were it alone unknown.
 
     1/sqrt(G_ii) of the observability Gramian, the integral of Phi' W Phi and the sum of Phi' H' R^-1 H Phi over the
-    instants, with the drift F of the start. A nominal that moves less tells no more than one that rests.
+    instants, with the drift F of the start. A nominal that moves less tells no more than one that rests. What is more
+    than controls of their own sizes move the state is not known: the sensor sees next to nothing from the start.
 
     Returns:
         Shape (nx,), inf where nothing sees a state or where that is not known.
@@ -51,9 +55,34 @@ def resolutions(statement: Statement, along: Trajectory, parameters: Array) -> A
         for place, rows, variance in _read(statement, along, parameters):
             read = rows @ moved[place]
             seen += np.sum(read * np.linalg.solve(variance, read), axis=0)
+        reached = _reached(statement, points[0], parameters, np.array(moved) * along.duration / PLACES)
         for k, row in estimated_rows(statement).items():
-            result[k] = seen[row] ** -0.5 if seen[row] > 0 else np.inf
+            resolved = seen[row] ** -0.5 if seen[row] > 0 else np.inf
+            result[k] = resolved if resolved <= reached[row] else np.inf
     return result
+
+
+def _reached(statement: Statement, start: tuple[Any, ...], parameters: Array, moved: Array) -> Array:
+    """How far controls of their own sizes move each row of the augmented state, by its slopes at the start.
+
+    Half the range between bounds, a scale that is given, or the guess; where nothing tells a size, the largest unit.
+    """
+    x, u, time, duration = start
+    lower, upper = statement.control_bounds
+    sizes = np.where(u == 0, LARGEST_UNIT, np.abs(u))
+    for block in statement.controls:
+        sizes[block.span] = statement.scales.get(block.name, sizes[block.span])
+    sizes = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), sizes)
+    assert statement.nominal is not None
+    rest = (time, duration, parameters)
+    rate, *others = (
+        np.asarray(statement.nominal(x, u + change, *rest)[0].full()).ravel()
+        for change in (np.zeros(u.size), *np.diag(sizes))
+    )
+    pushed = np.zeros((moved.shape[1], u.size))
+    for k, row in estimated_rows(statement).items():
+        pushed[row] = [other[k] - rate[k] for other in others]
+    return np.asarray(np.abs(moved @ pushed).sum(axis=(0, 2)))
 
 
 def _read(statement: Statement, along: Trajectory, parameters: Array) -> Iterator[tuple[int, Array, Array]]:

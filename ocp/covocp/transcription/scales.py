@@ -71,8 +71,10 @@ def magnitudes(
     deviations, moved = np.minimum(_deviations(statement, e0), most), np.abs(guess.x).max(axis=0, initial=0.0)
     found = np.max([moved, ends, deviations], axis=0)
     if (untold := (ends <= NOTHING) & (moved <= deviations)).any() and not reached:
-        resolved = resolutions(statement, guess, parameters)
-        found = np.where(untold & np.isfinite(resolved), np.maximum(found, far * resolved), found)
+        resolved = far * resolutions(statement, guess, parameters)
+        # of what nothing tells more than that it is known exactly an accurate sensor tells no more: 1 is left for it
+        untold &= np.isfinite(resolved) & ((found > NOTHING) | (resolved > 1.0))
+        found = np.where(untold, np.maximum(found, resolved), found)
     span = np.where(upper > lower, upper - lower, np.inf)
     limits = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0).max(axis=0)
     alone = np.where(limits > 0, np.minimum(limits, 1.0), 1.0)
