@@ -297,7 +297,11 @@ class Statement:
         of_data = tuple(kinks(entry, duration) for entry in self.data)
         if self.autonomous:
             return of_data
-        return of_data + switch_times(self.rates, duration, parameters)
+        parts = [self.nominal, *self.riccati]  # of fewer operations than what they make together
+        functions = [part for part in parts if part is not None]
+        if len(functions) < len(parts) or self.running_uses_matrices:
+            functions = [self.rates]
+        return of_data + tuple(own for f in functions for own in switch_times(f, duration, parameters))
 
     @cached
     def falls(self) -> tuple[float, ...]:
