@@ -16,7 +16,7 @@ tr(S X) may be integrated by parts (E-20), and once more with E in place of X, w
 On any part of the time the last two are equal but for the ends, d tr(S E) = tr(S Q + C'B C E - A E - S E W E) dt. The
 first is smooth where S is steep, near the end, the second where E is steep, at the start and where a sensor comes to
 see something: there S E W E is a spike of width U/E. So the integral is taken in the second form but near the end
-(`steps.early`).
+(`steps.taken_by_parts`).
 
 So the matrices are E, forward from E(0), and S, backward from S(T); Xhat is had afterwards. The costate of S is
 -Xhat/2. Where the gain is constrained (`Gain`), or where a condition or a nonlinear cost contains the covariance of the

@@ -54,7 +54,6 @@ LARGEST_SPREAD, SPREADS = 1e4, 40
 # Eigenvalue of a slope, relative to the largest, that is zero but for rounding.
 ROUNDOFF = 1e-9
 
-
 # What the user gave and who is told of iterations -> the solution with the best gain, and what a run starts from.
 GainStart = Callable[[Given, Progress], tuple["Solution | None", Given]]
 

@@ -22,13 +22,13 @@ from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.sequences import Passage, in_sequence
 from covocp.transcription.steps import (
-    early,
     full_interval,
     gathering_step,
     in_order,
     joint_interval,
     nominal_interval,
     simpson_interval,
+    taken_by_parts,
 )
 
 
@@ -244,7 +244,9 @@ def _matrix_cost(statement: Statement, mesh: Mesh, columns: tuple[Any, ...]) -> 
     n, m = mesh.intervals, mesh.substeps
     parted = np.zeros(n, dtype=bool)
     if statement.behind:
-        parted = np.asarray(early(statement, ca.DM(mesh.nodes[:-1]), ca.DM(np.diff(mesh.nodes))).full()).ravel() > 0
+        parted = (
+            np.asarray(taken_by_parts(statement, ca.DM(mesh.nodes[:-1]), ca.DM(np.diff(mesh.nodes))).full()).ravel() > 0
+        )
     widths = (1, 1, m, m) + (1,) * (len(columns) - 4)
     order, costs = [], []
     for by_parts in (True, False):

@@ -69,25 +69,25 @@ def joint_interval(statement: Statement, substeps: int) -> ca.Function:
     symbolic: Any = statement.symbolic
     nx = statement.nx
     z, interval = symbolic.sym("z", nx + statement.ne), Interval.symbols(statement)
-    first = early(statement, interval.s, interval.ds)
+    by_parts = taken_by_parts(statement, interval.s, interval.ds)
 
     def rate(part: Interval, value: Expr, c: float) -> Expr:
         point = part.at(c, value[:nx], value[nx:-1])
         moved, grown, cost = statement.rates(*point)
         if statement.behind:
-            cost = ca.if_else(first, _by_parts(statement)(*point)[0], cost)
+            cost = ca.if_else(by_parts, _by_parts(statement)(*point)[0], cost)
         return ca.vertcat(moved, grown, cost)
 
     def read(part: Interval, value: Expr) -> Expr:
         after, gained = read_at(statement, part, value[:nx], value[nx:-1])
-        return ca.vertcat(value[:nx], after, value[-1] + ca.if_else(first, 0, gained))
+        return ca.vertcat(value[:nx], after, value[-1] + ca.if_else(by_parts, 0, gained))
 
     start = ca.vertcat(z, 0)
     stacked, cost = _classical_steps(statement, rate, start, interval, substeps, read if statement.samples else None)
     if statement.behind:
         ends = ((0.0, z), (1.0, stacked[:, -1]))
         before, after = (_by_parts(statement)(*interval.at(c, v[:nx], v[nx:]))[1] for c, v in ends)
-        cost = cost + ca.if_else(first, before - after, 0)
+        cost = cost + ca.if_else(by_parts, before - after, 0)
     return ca.Function("joint_interval", [z, *interval], [stacked[:, -1], stacked, cost], slopes_wanted(statement, 1))
 
 
@@ -206,7 +206,7 @@ def _by_parts(statement: Statement) -> Callable[..., tuple[Any, Any]]:
     return lambda *six: tuple(function(*six))
 
 
-def early(statement: Statement, s: Expr, ds: Expr) -> Any:
+def taken_by_parts(statement: Statement, s: Expr, ds: Expr) -> Any:
     """Whether the cost of a closed loop is taken by parts over intervals [s, s + ds]: not where they are near the end.
 
     There what runs backward may change within an interval, as before a jump of its rate; elsewhere the covariance of
@@ -264,7 +264,9 @@ def full_interval(statement: Statement, substeps: int, step: StepKind, solver: s
         cost = simpson_interval(statement, substeps)(*arguments)
         if statement.behind:
             cost = ca.if_else(
-                early(statement, interval.s, interval.ds), simpson_interval(statement, substeps, True)(*arguments), cost
+                taken_by_parts(statement, interval.s, interval.ds),
+                simpson_interval(statement, substeps, True)(*arguments),
+                cost,
             )
     fine = ca.vertcat(states, halves)
     options = slopes_wanted(statement, 1)
