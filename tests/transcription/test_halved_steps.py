@@ -97,6 +97,19 @@ def test_without_the_compiled_passage_the_runs_are_the_same(monkeypatch: pytest.
     np.testing.assert_allclose(flat(without), flat(there), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.parametrize("expected", [False, True])
+def test_large_matrices_pass_in_short_runs_to_the_same_numbers(monkeypatch: pytest.MonkeyPatch, expected: bool) -> None:
+    problem = mass_chain.problem(masses=4) if not expected else unknown_lag.steering()
+    statement = problem.statement()
+    whole, short = (mesh_of(statement, substeps=3) for _ in range(2))
+    trajectory = own_start(statement, whole, statement.values).trajectory
+    at_once = refined_run(statement, whole, trajectory, statement.values)
+    monkeypatch.setattr("covocp.transcription.sequences.NUMERIC_ENTRIES", 1)
+    parted = refined_run(statement, short, trajectory, statement.values)
+    np.testing.assert_allclose(flat(parted), flat(at_once), rtol=1e-13, atol=1e-14)
+    assert np.ptp(parted.matrices, axis=0).max() > 1e-3  # they move
+
+
 @pytest.mark.skipif(library.functions() is None, reason=str(library.build_info()["library"]))
 def test_places_of_buffers() -> None:
     places = library.needed()["addresses"]

@@ -20,8 +20,8 @@ from covocp.transcription.covariance_steps import fed, gauss_points, moving_step
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.steps import read_by, read_step, runge_kutta_step, told_at
 
-# Steps that a sequence of numbers takes at a time.
-NUMERIC_RUN = 10
+# Steps that a sequence of numbers takes at a time; in compiled code as many as have so many entries of H.
+NUMERIC_RUN, NUMERIC_ENTRIES = 10, 2_000_000
 
 # How eliminated matrices pass: by CasADi's operations (None); where the steps allow it in compiled code (`passed_by`),
 # of which CasADi sees no sparsity (slopes along directions, no Jacobians); or by what has the same arguments.
@@ -59,6 +59,9 @@ def in_sequence(
         return _chosen(every, *_reading_passage(statement, mesh, passage, positions[0], first, columns, kicks))
     at_once = passage is not None and not reads and not (fed(statement, positions) and mesh.step != "rk4")
     own = every if at_once else 1
+    if at_once and kicks is None and all(isinstance(value, ca.DM) for value in (first, *columns)):
+        values = _in_runs(_steps(statement, mesh, passage, positions, False, own), first, columns, own)
+        return _chosen(every // own, values, values)
     moving = [k for k in range(count) if k not in set(reads)] if reads else slice(None)
     chosen = [column[:, moving] for column in columns] if reads else columns
     matrices, run = _steps(statement, mesh, passage, positions, kicks is not None, own)(chosen, count - len(reads))
@@ -134,6 +137,18 @@ def _compiled(
         parts.append(passing(first[i:j], arguments[2 * k : 2 * k + 2], size, own, every=every))
     passed = ca.vertcat(*parts) if len(parts) > 1 else parts[0]
     return [passed] if kicks is None else [passed, passed - kicks]
+
+
+def _in_runs(
+    make: Callable[[Any, int], tuple[list[Any], Run]], first: ca.DM, columns: tuple[Any, ...], every: int
+) -> Any:
+    """What `_compiled` gives of numbers, in short runs where the matrices are large: H of all steps takes memory."""
+    length = max(NUMERIC_ENTRIES // (8 * first.shape[0]), 1) * every
+    values = [first]
+    for own in zip(*(ca.horzsplit(column, length) for column in columns), strict=True):
+        matrices, run = make(own, own[0].shape[1])
+        values += run(values[-1][:, -1], matrices, own[0].shape[1])
+    return ca.horzcat(*values[1:])
 
 
 def _reading_passage(
