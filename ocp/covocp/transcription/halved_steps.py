@@ -28,9 +28,9 @@ from covocp.transcription.trajectory import Trajectory
 MESHES = 4
 # Runs before these are made.
 FEW = 2
-# What starts the segments, and what is wanted of them, by the names of `shoot`.
+# What starts the segments, and what is wanted of them, by the names of `shoot`: at the ends of the parts, at the nodes.
 _STARTS = ("x", "e", "u", "duration", "parameters")
-_GIVEN = ("gap_x", "gap_e", "x", "e", "cost")
+_GIVEN, _AT_NODES = ("gap_x", "gap_e", "cost"), ("x", "e")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,14 +69,14 @@ def refined_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parame
     starts, runs = list(mesh.starts), _runs(statement, mesh, parts)
     t, u = trajectory, _divided(mesh, trajectory.u, parts)
     values = runs.segments(t.x[starts].T, t.e[starts].T, u.T, np.array([[t.duration]]), parameters[:, None])
-    gap_x, gap_e, x, e, cost = values
+    gap_x, gap_e, cost, x, e = values
     costs = cost.reshape(mesh.intervals, parts).sum(axis=1)
     return Refined(
         jumps=np.hstack([gap_x.T, gap_e.T]),
         running=float(cost.sum()),
         costs=costs,
-        states=x[:, ::parts].T,
-        matrices=e[:, ::parts].T,
+        states=x.T,
+        matrices=e.T,
     )
 
 
@@ -104,12 +104,12 @@ class _Runs:
     """
 
     def __init__(self, statement: Statement, mesh: Mesh, parts: int) -> None:
-        self._statement, self._mesh = statement, mesh.divided(parts)
+        self._statement, self._mesh, self._parts = statement, mesh.divided(parts), parts
         self._made: Matrices | None = None
         self._asked: Counter[str] = Counter()
 
     def segments(self, *start: Array) -> list[Array]:
-        """Run all segments: `_GIVEN` from `_STARTS`."""
+        """Run all segments: `_GIVEN` and `_AT_NODES` from `_STARTS`."""
         st, mesh = self._statement, self._mesh
         kept = not st.matrices or compiled_steps(mesh)  # a long sequence of CasADi's steps takes memory for all of it
         if not kept or not self._often("segments"):
@@ -122,7 +122,7 @@ class _Runs:
     def _shot(self, start: list[Any]) -> list[Any]:
         variables = SimpleNamespace(**dict(zip(_STARTS, start, strict=True)))
         values = shoot(self._statement, self._mesh, variables, passage=values_by)
-        return [values[name] for name in _GIVEN]
+        return [*(values[name] for name in _GIVEN), *(values[name][:, :: self._parts] for name in _AT_NODES)]
 
     def _often(self, name: str) -> bool:
         self._asked[name] += 1
