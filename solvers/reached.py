@@ -80,11 +80,6 @@ class Round:
 
     __repr__ = short_repr
 
-    @property
-    def worst(self) -> float:
-        """The largest residual; inf where there are none."""
-        return np.inf if self.residuals is None else self.residuals.worst
-
 
 class FirstOrder:
     """Gradient of the cost and of the Lagrangian of an NLP, from the solver's own functions where they are known."""
@@ -239,7 +234,8 @@ def residuals(
         own = np.sum([_change_at_nodes(*entry, units) for entry, units in each])
         size = max(size, VANISHING * min(moved, float(own)))
     size = max(size, float(np.finfo(float).tiny))
-    return Residuals(slope=slope / size, complementarity=rest / size, infeasibility=missed / size, violation=worst)
+    changes = {"slope": slope / size, "complementarity": rest / size, "infeasibility": missed / size}
+    return Residuals(**changes, violation=worst, size=size)
 
 
 def _change(first: FirstOrder, w: Array, slope: Array, unit: Array, parameters: Arrays) -> float:

@@ -438,9 +438,12 @@ def share_for(times: float) -> float:
 
 
 def _best(rounds: list[Round]) -> Round:
-    """The round with the least residuals; the last one where it did not move but for rounding."""
-    least = min(rounds, key=lambda entry: entry.worst)
-    return rounds[-1] if rounds[-1].worst <= UNMOVED * least.worst else least
+    """The round with the least residuals in the smallest cost without violations; the last where it did not move."""
+    judged = [entry.residuals for entry in rounds]
+    size = min((found.size for found in judged if found and found.violation <= VIOLATION), default=np.inf)
+    worst = [np.inf if found is None else found.beside(size) for found in judged]
+    least = int(np.argmin(worst))
+    return rounds[-1] if worst[-1] <= UNMOVED * worst[least] else rounds[least]
 
 
 def extremals(last: Round, parameters: Arrays) -> tuple[Extremal, ...]:

@@ -39,17 +39,25 @@ class Residuals:
         complementarity: sum of |multiplier| times distance from the bound over all inequalities.
         infeasibility: sum of |multiplier| times violation over all constraints.
         violation: largest violation, in magnitudes of what is constrained.
+        size: of the cost, to which the others are relative.
     """
 
     slope: float
     complementarity: float
     infeasibility: float
     violation: float
+    size: float = 1.0
 
     @property
     def worst(self) -> float:
         """The largest of them, the violation in multiples of what it may be; inf where one is NaN."""
-        parts = [self.slope, self.complementarity, self.infeasibility, LIMIT * self.violation / VIOLATION]
+        return self.beside(self.size)
+
+    def beside(self, size: float) -> float:
+        """`worst` relative to this size where it is less: what a point of huge cost leaves is little of that alone."""
+        times = max(self.size / size, 1.0)
+        changes = [times * part for part in (self.slope, self.complementarity, self.infeasibility)]
+        parts = [*changes, LIMIT * self.violation / VIOLATION]
         return float(np.where(np.isnan(parts), np.inf, parts).max())
 
     def hold(self, limit: float) -> bool:

@@ -15,6 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
@@ -35,10 +36,11 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
+from covocp.transcription.held import Held, aim, excited, in_moving_units
 from covocp.transcription.mesh import Mesh, Options, control_places, explicit_substeps
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import Run, least_energy, resampled, steer, track
-from covocp.transcription.stiffness import stiffness
+from covocp.transcription.stiffness import state_jacobian, stiffness
 from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # A bend is halved until its second half moves the states as its first half does, up to this share, or until it moves
@@ -115,18 +117,24 @@ def _neutral(statement: Statement) -> Statement:
 
 
 def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
-    """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated."""
+    """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated.
+
+    Where the nominal is unstable a feedback holds it.
+    """
     duration = statement.duration.guess
     start, e0 = starts(statement, mesh, parameters)
     u = controls_guess(statement, mesh.nodes, mesh.control)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
     plain = True
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
+        flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+        run = _held(statement, mesh, parameters, start, e0, (flat, u))
+        if run is not None:
+            return First(trajectory=completed(statement, mesh, parameters, run.u, x=run.x), plain=True)
         followed = _followed(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)
         else:
-            flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
             units = untold_units(statement, mesh, parameters, flat)
             u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
     elif statement.nu and statement.coupled:
@@ -142,16 +150,19 @@ def completed(
     *,
     start: Array | None = None,
     duration: float | None = None,
+    x: Array | None = None,
 ) -> Trajectory:
     """The trajectory of some controls: guessed states as they are guessed, the others simulated, and the matrices.
 
-    Another initial state than the guessed one, or another duration, may be given.
+    Another initial state than the guessed one, or another duration, may be given; or the states, which then count.
     """
     own, e0 = starts(statement, mesh, parameters)
     start = own if start is None else start
     duration = statement.duration.guess if duration is None else duration
     guessed = [b for b in statement.states if statement.guesses[b.name] is not None]
-    if len(guessed) < len(statement.states):
+    if x is not None:
+        guessed = []
+    elif len(guessed) < len(statement.states):
         x = simulate_states(statement, mesh, start, e0, u, duration, parameters)
     else:
         x = np.zeros((mesh.intervals + 1, statement.nx))
@@ -162,7 +173,14 @@ def completed(
 
 
 def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, flat: Array) -> Run:
-    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give.
+    """The run of the nominal on a mesh, in the scales that boundary values, bounds and the unbent run give."""
+    run = _told_run(statement, mesh, parameters, start)
+    travelled = np.abs(run.states(flat)).max(axis=0)
+    return replace(run, scale=np.where(np.isfinite(travelled), np.maximum(run.scale, travelled), run.scale))
+
+
+def _told_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array) -> Run:
+    """The run of the nominal on a mesh, in the scales that boundary values and bounds give.
 
     Bounds that are far away say little: they count up to so many times what something else tells.
     """
@@ -177,7 +195,7 @@ def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, 
             scale[block.span] = given
         elif block.size > 1:  # components of one vector have one magnitude unless they are told apart
             scale[block.span] = np.where(scale[block.span] > 0, scale[block.span], scale[block.span].max())
-    run = Run(
+    return Run(
         statement=statement,
         mesh=mesh,
         start=start,
@@ -186,8 +204,30 @@ def base_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array, 
         scale=scale,
         units=np.ones(statement.nu),
     )
-    travelled = np.abs(run.states(flat)).max(axis=0)
-    return replace(run, scale=np.where(np.isfinite(travelled), np.maximum(scale, travelled), scale))
+
+
+def _held(
+    statement: Statement, mesh: Mesh, parameters: Array, start: Array, e0: Array, controls: tuple[Array, Array]
+) -> Held | None:
+    """A run that a feedback holds, from flat and bent controls, near what is guessed of the states.
+
+    None where the nominal is stable, none is found, or the guesses say how the states move.
+    """
+    flat, bent = controls
+    guesses = [(b, statement.guesses[b.name]) for b in statement.states if statement.guesses[b.name] is not None]
+    if not all(is_plain(guess) or np.shape(guess) == (block.size,) for block, guess in guesses):
+        return None
+    run, target = _told_run(statement, mesh, parameters, start), statement.boundary_values(parameters)[1]
+    line = start + mesh.nodes[:, None] * (np.where(np.isnan(target), start, target) - start)
+    for block, guess in guesses:
+        line[:, block.span] = evaluate_guess(block, guess, mesh.nodes)
+    slope = state_jacobian(statement)(start, flat[0], e0, 0.0, run.duration, parameters)
+    aimed = aim(run, np.asarray(slope.full()), line[-1], target)
+    if aimed is None:
+        return None
+    run = in_moving_units(run, line, flat)
+    bend = (bent - flat) * np.where(_untold(statement, flat), run.units, 1.0)
+    return excited(run, line, aimed, flat, bend)
 
 
 def _followed(statement: Statement) -> tuple[int, ...]:
@@ -233,11 +273,7 @@ def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, bool
 
 def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Array) -> Array:
     """Units of the controls (nu,) of which neither scale, bounds nor guess say any, by what they move; 1 of others."""
-    untold = np.zeros(statement.nu, dtype=bool)
-    for block in statement.controls:
-        lower, upper = (bound[block.span] for bound in statement.control_bounds)
-        silent = ~np.isfinite(upper - lower) & ~flat[:, block.span].any(axis=0)
-        untold[block.span] = silent if block.name not in statement.scales else False
+    untold = _untold(statement, flat)
     start, e0 = starts(statement, mesh, parameters)
     if not untold.any() or statement.coupled or not np.isfinite(start).all():
         return np.ones(statement.nu)
@@ -250,6 +286,16 @@ def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Arra
     units = moving_units(statement, mesh, still, parameters)
     far = (units > FAR_UNIT) | (units < 1.0 / FAR_UNIT)
     return np.where(untold & far, units, 1.0)
+
+
+def _untold(statement: Statement, flat: Array) -> NDArray[np.bool_]:
+    """Controls of which neither scale, bounds nor guess say a unit, (nu,)."""
+    untold = np.zeros(statement.nu, dtype=bool)
+    for block in statement.controls:
+        lower, upper = (bound[block.span] for bound in statement.control_bounds)
+        silent = ~np.isfinite(upper - lower) & ~flat[:, block.span].any(axis=0)
+        untold[block.span] = silent if block.name not in statement.scales else False
+    return untold
 
 
 def moving_units(statement: Statement, mesh: Mesh, along: Trajectory, parameters: Array) -> Array:
