@@ -15,9 +15,10 @@ from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.solution.origin import Classical
 from covocp.solution.solution import Solution
 from covocp.solving.attempts import with_stats
-from covocp.solving.warm_start import make_guess
 from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import matrices_function
 from covocp.transcription.mesh import Mesh, Options, with_substeps
+from covocp.transcription.starts import own_start
 from covocp.transcription.stiffness import stiffness
 
 # Share of the cost of the problem's own guess below which costs differ by the solver's tolerance only: one of slopes,
@@ -117,10 +118,18 @@ def left_open(solution: Solution, classical: float) -> bool:
 def is_roundoff(cost: float, statement: Statement, options: Options, parameters: Array) -> bool:
     """Whether a cost, or a difference of costs, is nothing beside the cost of the problem's own guess.
 
-    Without what that grows by where the nominal is unstable: beside e^(2 a T) everything would be nothing.
+    Without what that grows by where the nominal is unstable: beside e^(2 a T) everything would be nothing. That of a
+    guess which is held is the one along its nodes: a run along its controls does not stay there.
     """
     mesh = evaluation_mesh(statement, options, parameters)
-    start = make_guess(statement, mesh, parameters, None).trajectory
-    outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
-    grown = stiffness(statement, options, parameters).growing / float(np.diff(options.nodes()).max())
-    return bool(abs(cost) <= ROUNDOFF * np.exp(-2.0 * grown) * abs(sum(outcome.cost_terms.values())))
+    first = own_start(statement, mesh, parameters)
+    start = first.trajectory
+    if first.held:
+        at_ends = matrices_function(statement, mesh)(start.x.T, start.u.T, start.duration, parameters)
+        e, running = (np.asarray(value.full()) for value in at_ends)
+        beside = running.sum() + float(statement.terminal(start.x[-1], e[:, -1], start.duration, parameters))
+    else:
+        outcome = evaluate_controls(statement, mesh, start.u, start.duration, parameters, start.x[0])
+        grown = stiffness(statement, options, parameters).growing / float(np.diff(options.nodes()).max())
+        beside = np.exp(-2.0 * grown) * sum(outcome.cost_terms.values())
+    return bool(abs(cost) <= ROUNDOFF * abs(beside))

@@ -84,10 +84,11 @@ LARGEST_NUMBER = 4
 
 @dataclass(frozen=True, kw_only=True)
 class First:
-    """The problem's own start, and whether others are worth looking at."""
+    """The problem's own start, whether no others are worth looking at, and whether a feedback holds it."""
 
     trajectory: Trajectory
     plain: bool
+    held: bool = False
 
     __repr__ = short_repr
 
@@ -130,7 +131,7 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
         flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
         run = _held(statement, mesh, parameters, start, e0, (flat, u))
         if run is not None:
-            return First(trajectory=completed(statement, mesh, parameters, run.u, x=run.x), plain=True)
+            return First(trajectory=completed(statement, mesh, parameters, run.u, x=run.x), plain=True, held=True)
         followed = _followed(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)

@@ -1,0 +1,155 @@
+"""Unstable nominals start from a run that a feedback holds."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
+
+import covocp as co
+from covocp.transcription.held import aim, held, in_moving_units
+from covocp.transcription.mesh import Options
+from covocp.transcription.starts import own_start
+from covocp.transcription.steering import Run
+from covocp.transcription.stiffness import resolve_mesh
+
+GRAVITY, LENGTH, POLE, CART = 9.81, 1.0, 0.2, 1.0
+
+
+def growing(rate, duration, **control):
+    """x' = a x + u with noise, x measured: the cost of regulating it."""
+    ocp = co.Problem(duration, name="growing")
+    x, u = ocp.state("x", initial=1.0, variance=0.1), ocp.control("u", **control)
+    ocp.dynamics(x, rate * x + u, noise=0.1)
+    ocp.measurement("m", x, noise=0.01)
+    ocp.minimize_expected(running=0.5 * (x**2 + u**2))
+    return ocp
+
+
+def regulated(drift, start, variance, noise, measured, weight, price, duration):
+    """Expected cost of the best linear loop by scipy: S backward, E forward; one control, one reading of the place."""
+    size = drift.shape[0]
+    enters, seen = np.eye(size)[:, [-1]], np.eye(size)[[0]]
+    options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-14}
+
+    def back(_, values):
+        S = values.reshape(size, size)
+        return (drift.T @ S + S @ drift + weight - S @ enters @ enters.T @ S / price).ravel()
+
+    S = solve_ivp(back, (0.0, duration), np.zeros(size**2), dense_output=True, **options).sol
+
+    def ahead(t, values):
+        E, s = values[:-1].reshape(size, size), S(duration - t).reshape(size, size)
+        rate = drift @ E + E @ drift.T + noise - E @ seen.T @ seen @ E / measured
+        return np.append(rate.ravel(), np.trace(s @ noise) + np.trace(E @ s @ enters @ enters.T @ s) / price)
+
+    end = solve_ivp(ahead, (0.0, duration), np.append(variance.ravel(), 0.0), **options).y[-1, -1]
+    first = S(duration).reshape(size, size)
+    return 0.5 * (start @ first @ start + np.trace(first @ variance) + end)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "auto"])
+@pytest.mark.parametrize(("rate", "duration"), [(2.0, 12.0), (3.0, 7.0), (3.0, 8.0), (3.0, 9.0), (5.0, 6.0)])
+def test_a_growing_plant_is_regulated_however_long(method, rate, duration):
+    """Runs by themselves grow to e^24 and more, and the tolerance was met in the scales of that."""
+    solution = co.solve(growing(rate, duration), method, progress=False)
+    one = np.eye(1)
+    truth = regulated(rate * one, np.ones(1), 0.1 * one, 0.1 * one, 0.01, one, 1.0, duration)
+    assert solution.cost == pytest.approx(truth, rel=1e-4)
+
+
+def pendulum(frequency, duration, **options):
+    """An inverted pendulum, 0.2 rad off, balanced by a torque."""
+    ocp = co.Problem(duration, name="balanced")
+    x = ocp.state("x", 2, initial=[0.2, 0.0], variance=0.01 * np.eye(2), **options)
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], frequency**2 * ca.sin(x[0]) + u), noise=np.diag([0.0, 0.01]))
+    ocp.measurement("m", x[0], noise=1e-3)
+    ocp.minimize_expected(running=0.5 * (x[0] ** 2 + 0.1 * u**2))
+    return ocp
+
+
+@pytest.mark.parametrize("options", [{}, {"guess": [0.1, 0.0]}])
+@pytest.mark.parametrize(("frequency", "duration"), [(4.0, 5.0), (4.0, 10.0), (1.0, 20.0), (4.0, 20.0)])
+def test_a_pendulum_is_balanced_not_swung_round(frequency, duration, options):
+    """A start that falls round and round ended nowhere, or in a swing of twice the cost."""
+    solution = co.solve(pendulum(frequency, duration, **options), progress=False)
+    drift = np.array([[0.0, 1.0], [frequency**2, 0.0]])
+    start, weight = np.array([0.2, 0.0]), np.diag([1.0, 0.0])
+    linear = regulated(drift, start, 0.01 * np.eye(2), np.diag([0.0, 0.01]), 1e-3, weight, 0.1, duration)
+    assert solution.cost == pytest.approx(linear, rel=0.004)  # sin(0.2) = 0.2 - 0.7 %
+    assert np.abs(solution["x"]).max() < 1.0
+
+
+def balanced_cart(unit):
+    """A pole on a cart, held upright for 10 s by a force in some unit; the frictionless equations of motion."""
+    ocp = co.Problem(10.0, name="cart and pole")
+    x = ocp.state("x", 4, initial=[0.0, 0.1, 0.0, 0.0], variance=1e-3 * np.eye(4))
+    u = ocp.control("u")
+    force, sin, cos = unit * u, ca.sin(x[1]), ca.cos(x[1])
+    pushed = (force + POLE * LENGTH * x[3] ** 2 * sin - POLE * GRAVITY * sin * cos) / (CART + POLE * sin**2)
+    ocp.dynamics(
+        x, ca.vertcat(x[2], x[3], pushed, (GRAVITY * sin - pushed * cos) / LENGTH), noise=np.diag([0, 0, 1e-3, 1e-3])
+    )
+    ocp.measurement("m", x[:2], noise=1e-4 * np.eye(2))
+    ocp.minimize_expected(running=0.5 * (x[0] ** 2 + 10 * x[1] ** 2 + 0.1 * force**2))
+    return ocp
+
+
+def test_a_pole_is_balanced_in_any_unit_of_the_force():
+    costs = [co.solve(balanced_cart(unit), progress=False).cost for unit in (1e-3, 1.0, 1e3)]
+    np.testing.assert_allclose(costs, costs[1], rtol=1e-6)
+    rate = (CART + POLE) * GRAVITY / (CART * LENGTH)
+    drift = np.zeros((4, 4))
+    drift[[0, 1], [2, 3]], drift[2, 1], drift[3, 1] = 1.0, -POLE * GRAVITY / CART, rate
+    enters, weight = np.array([[0.0], [0.0], [1.0 / CART], [-1.0 / (CART * LENGTH)]]), np.diag([1.0, 10.0, 0.0, 0.0])
+    S = solve_continuous_are(drift, enters, weight, np.array([[0.1]]))
+    start = np.array([0.0, 0.1, 0.0, 0.0])
+    assert costs[1] > 0.5 * (start @ S @ start + 1e-3 * np.trace(S))  # of a state that is known, and no noise
+    assert costs[1] < 20.0 * 0.5 * (start @ S @ start + 1e-3 * np.trace(S))
+
+
+@pytest.mark.parametrize("control", ["linear", "constant"])
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e5])
+def test_the_feedback_of_least_energy_mirrors_what_grows(control, scale):
+    """x' = a x + b u: of all that bring x to nothing the least energy has u = -2 a x / b, so that x' = -a x."""
+    rate, duration = 2.0, 10.0
+    ocp = co.Problem(duration, name="mirrored")
+    x, u = ocp.state("x", initial=scale, guess=0.0), ocp.control("u", guess=0.0)
+    ocp.dynamics(x, rate * x + scale * u)
+    ocp.minimize(running=u**2)
+    statement = ocp.statement()
+    mesh = resolve_mesh(statement, Options(intervals=400, control=control), statement.values)
+    line, flat = np.zeros((401, 1)), np.zeros((mesh.control_nodes, 1))
+    told = Run(
+        statement=statement,
+        mesh=mesh,
+        start=np.array([scale]),
+        duration=duration,
+        parameters=statement.values,
+        scale=np.array([scale]),
+        units=np.ones(1),
+    )
+    run = in_moving_units(told, line, flat)
+    aimed = aim(run, rate * np.eye(1), line[-1], np.array([np.nan]))
+    found = held(run, line, aimed, flat)
+    t = duration * mesh.nodes
+    np.testing.assert_allclose(found.x[:, 0] / scale, np.exp(-rate * t), atol=2e-3)
+    if control == "linear":
+        later = slice(2, None)  # the first value, of half the weight, is off by the length of an interval
+        np.testing.assert_allclose(found.u[later, 0], -2 * rate * np.exp(-rate * t[later]), atol=2e-3 * rate)
+    assert own_start(statement, mesh, statement.values).held
+
+
+def test_what_is_stable_is_left_alone():
+    ocp = co.Problem(10.0, name="pushed")
+    x, v = ocp.state("x", initial=0.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u - 0.1 * x)
+    ocp.minimize(running=u**2)
+    statement = ocp.statement()
+    mesh = resolve_mesh(statement, Options(intervals=50), statement.values)
+    assert not own_start(statement, mesh, statement.values).held
