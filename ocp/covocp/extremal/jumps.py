@@ -2,7 +2,7 @@
 
 Where a trajectory crosses g(x, u, E) = 0 and H jumps there, the costates of an optimum jump by dH/g' times the slope of
 g. Derivatives of the rates have no such term, on whichever side: what is stationary by them is so by mistake unless
-H is the same on both sides. Comparisons of the time and of parameters move with nothing that is chosen.
+H is the same on both sides. Comparisons of the time, of parameters, and of states that nothing chosen moves, do without.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _crossings(extremal: Extremal, dense: Dense, borders: Borders, linked: bool)
     sizes = np.where(whole, np.ptp(values, axis=1), np.abs(values).max(axis=1))
     near = np.abs(values - border) <= NEAR * sizes[:, None]
     within: list[tuple[int, int]] = []
-    for row in np.flatnonzero(np.isfinite(values).all(axis=1)):
+    for row in np.flatnonzero(np.isfinite(values).all(axis=1) & _movable(extremal, borders, linked)):
         clear = np.flatnonzero(~near[row])
         ends = [-1, *clear.tolist(), s.size]
         apart = np.diff(ends) > 1
@@ -164,6 +164,31 @@ def _crossings(extremal: Extremal, dense: Dense, borders: Borders, linked: bool)
     if within:
         rows, points = (np.array(v) for v in zip(*within, strict=True))
         yield from _bisected(extremal, dense, borders, rows, (k[points], s[points], s[points + 1]))
+
+
+def _movable(extremal: Extremal, borders: Borders, linked: bool) -> NDArray[np.bool_]:
+    """Which borders are met at moments that depend on what is chosen; at others slopes are right."""
+    st = extremal.statement
+    sparsities = [borders.ends.jac_sparsity(0, i) for i in MOVING]
+    by_state, by_control, by_matrices = (_pattern(sparsity) for sparsity in sparsities)
+    if st.duration.free or linked:
+        return np.ones(len(borders.whole), dtype=bool)
+    slopes = [[_pattern(st.rates.jac_sparsity(row, i)) for i in MOVING] for row in (0, 1)]
+    moved = np.concatenate([np.isnan(st.boundary_values(extremal.parameters).initial), np.zeros(st.ne, dtype=bool)])
+    moved[st.decisions] = True
+    moved |= np.concatenate([own[1].any(axis=1) for own in slopes])
+    others = np.vstack([np.hstack([own[0], own[2]]) for own in slopes])
+    while True:
+        more = moved | others[:, moved].any(axis=1)
+        if np.array_equal(more, moved):
+            break
+        moved = more
+    return np.asarray(by_control.any(axis=1) | np.hstack([by_state, by_matrices])[:, moved].any(axis=1))
+
+
+def _pattern(sparsity: ca.Sparsity) -> NDArray[np.bool_]:
+    """Where a matrix may not be zero."""
+    return np.asarray(ca.DM(sparsity, 1.0).full(), dtype=bool)
 
 
 def _sides(values: Array, whole: Array) -> Array:
