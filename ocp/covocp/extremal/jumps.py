@@ -2,7 +2,7 @@
 
 Where a trajectory crosses g(x, u, E) = 0 and H jumps there, the costates of an optimum jump by dH/g' times the slope of
 g. Derivatives of the rates have no such term, on whichever side: what is stationary by them is so by mistake unless
-H is the same on both sides. Comparisons of the time, of parameters, and of states that nothing chosen moves, do without.
+H is the same on both sides. Comparisons of the time, of parameters and of states that nothing chosen moves need none.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Jump:
 
 
 class _Met(NamedTuple):
-    """A border that is met: its number (-1: not known), the interval, the time there, and the arguments on both sides."""
+    """A border that is met: its number (-1: not known), interval and normalised time, the arguments on both sides."""
 
     border: int
     interval: int
@@ -219,9 +219,7 @@ def _bisected(
         yield _Met(int(rows[j]), int(k[j]), float(high[j]), True, (sides[0], sides[1]))
 
 
-def _given(
-    extremal: Extremal, borders: Borders, row: int, run: tuple[int, int], s: Array, linked: bool
-) -> bool:
+def _given(extremal: Extremal, borders: Borders, row: int, run: tuple[int, int], s: Array, linked: bool) -> bool:
     """Whether a path is on a border since it begins or ends where that is given, and leaves it at once."""
     st, (a, b) = extremal.statement, run
     at_start, at_end = a < 0, b == s.size
@@ -371,7 +369,7 @@ def _told(statement: Statement, borders: Borders | None, row: int) -> tuple[str,
 
 def _parameters(statement: Statement) -> Any:
     """Known parameters and unknowns by their names, where they are all vectors; else by numbers."""
-    blocks = [b for kind in ("parameter", "unknown") for b in statement.of_kind(kind)]  # type: ignore[arg-type]
+    blocks = [b for kind in ("parameter", "unknown") for b in statement.of_kind(kind)]
     parts = [ca.SX.sym(b.name, b.length) for b in blocks]
     symbols = ca.vertcat(*parts) if parts else ca.SX(0, 1)
     return symbols if symbols.numel() == statement.np else ca.SX.sym("parameter", statement.np)

@@ -7,8 +7,8 @@ import numpy as np
 from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, node_error, unstable
-from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
+from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
 from covocp.transcription.scales import choose_scales

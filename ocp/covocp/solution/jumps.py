@@ -57,11 +57,12 @@ def _words(solution: Solution, jumps: list[Jump]) -> str:
     others = f" {many} other comparison{'s' if many > 1 else ''} too." if many else ""
     return (
         f"'{solution.name or 'The problem'}' jumps with the state: {place} the solution {met} the border of "
-        f"{_compared(first)}, where {what} jumps by {100 * first.share:.3g} % of the larger value.{others} Slopes do not see the moment of "
-        "crossing, so the point is no solution of the conditions of an optimum and may be far from a minimum, by any "
-        "method; more intervals do not help. State it as Phases, one for each side, each with its own formulas, a free "
-        "duration and the border as the final condition; or make the transition smooth, as (1 + tanh(d/w))/2 with "
-        "the distance d from the border and a width w that the mesh resolves."
+        f"{_compared(first)}, where {what} jumps by {100 * first.share:.3g} % of the larger value.{others} Slopes do "
+        "not see the moment of crossing, so the point is no solution of the conditions of an optimum and may be far "
+        "from a minimum, by any method; more intervals do not help. State it as Phases, one for each side, each with "
+        "its own formulas, a free duration and the border as the final condition; or make the transition smooth: "
+        "kind='cubic' of a table, else (1 + tanh(d/w))/2 with the distance d from the border and a width w that the "
+        "mesh resolves."
     )
 
 
