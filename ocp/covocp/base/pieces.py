@@ -146,8 +146,15 @@ def may_jump(function: ca.Function) -> bool:
         return False
     if function.is_a("SXFunction"):  # it does not say which function that is
         return True
-    calls = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
-    return any(may_jump(function.instruction_MX(k).which_function()) for k in calls)
+    places = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
+    return any(may_jump(function.instruction_MX(k).which_function()) for k in places)
+
+
+def calls(function: ca.Function) -> bool:
+    """Whether a function consists of more than scalar operations."""
+    if not function.is_a("SXFunction"):
+        return True
+    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
 
 
 def _bare(expression: Any) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
-from covocp.base.pieces import Borders, borders_of, expanded, may_jump
+from covocp.base.pieces import Borders, borders_of, calls, expanded, may_jump
 from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.dense_output import dense_output, mapped
@@ -99,7 +99,7 @@ def met_jumps(extremal: Extremal, *, linked: bool = False, optimised: bool = Tru
     if not compares(st) or not all(np.isfinite(v).all() for v in (extremal.trajectory.x, extremal.trajectory.e)):
         return ()
     function, borders = _read(st)
-    if borders is None and function.is_a("SXFunction"):
+    if borders is None and not calls(function):
         return ()
     try:
         dense = dense_output(extremal, matrices=borders is None or bool(borders.ends.jac_sparsity(0, 2).nnz()))

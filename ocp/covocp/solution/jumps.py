@@ -71,6 +71,6 @@ def _compared(jump: Jump) -> str:
     if jump.words:
         return f"{jump.words!r}"
     if not jump.names:
-        return "a comparison"
+        return "a comparison, or a knot of a table"
     listed = " and ".join(f"'{name}'" for name in jump.names[:NAMED])
     return f"a comparison of {listed}" + (" and others" if len(jump.names) > NAMED else "")
