@@ -33,7 +33,7 @@ def local_errors(coarse: Extremal, fine: Extremal) -> Array:
     """
     ends = distinct(fine.mesh.nodes)
     result = np.zeros(ends.size - 1)
-    for places, values in (_of_controls(coarse, fine), _of_limits(coarse, fine), _of_steps(coarse)):
+    for places, values in (_of_controls(coarse, fine), _of_limits(coarse, fine), errors_of_steps(coarse)):
         _spread(result, ends, places, np.nan_to_num(np.abs(values), nan=0.0, posinf=0.0))
     return result
 
@@ -73,7 +73,7 @@ def _of_limits(coarse: Extremal, fine: Extremal) -> tuple[Array, Array]:
     return nodes, change
 
 
-def _of_steps(coarse: Extremal) -> tuple[Array, Array]:
+def errors_of_steps(coarse: Extremal) -> tuple[Array, Array]:
     """Of the integration steps, at the middles of the intervals: the change of the Lagrangian by halving them."""
     mesh, t, st = coarse.mesh, coarse.trajectory, coarse.statement
     single = replace(mesh, segments=(1,) * mesh.intervals, points=1)

@@ -23,6 +23,7 @@ from covocp.extremal.fine_mesh import prolongation, refined
 from covocp.extremal.finer_cost import change_on_finer_mesh
 from covocp.extremal.hamiltonian import Costates, along, by_controls, duration_slope
 from covocp.extremal.inside import controlled_nodes, instant_control_slopes, instant_duration_slope
+from covocp.extremal.jumps import met_jumps
 from covocp.extremal.links import Within
 from covocp.extremal.mesh_error import node_error
 from covocp.extremal.nodes import mapped
@@ -367,6 +368,8 @@ def _decisions(extremal: Extremal, costates: Costates, within: Within | None) ->
 
 
 def _curvature(extremal: Extremal, seconds: float) -> float | None:
+    if met_jumps(extremal):  # whose moments no derivative sees
+        return np.nan
     result = smallest_curvature(extremal, seconds)
     if result is None or result.verdict == "flat":
         return None if result is None else 0.0

@@ -191,7 +191,7 @@ def _passed(
     worst, largest, held = np.zeros((2, len(names))), np.zeros(len(names)), np.zeros(len(names))
     limited_rows = np.isfinite(lower) | np.isfinite(upper)
     when = np.zeros((2, len(names)))
-    for k, s in _places(mesh, dense, points):
+    for k, s in places_along(mesh, dense, points):
         values = values_at(k, s)
         largest = np.maximum(largest, finite_sizes(values))
         unknown = ~np.isfinite(values) & limited_rows
@@ -222,7 +222,7 @@ def _passed(
     return tuple(sorted(result, key=lambda entry: -entry.share))
 
 
-def _places(mesh: Mesh, dense: Dense, points: int) -> Iterator[tuple[NDArray[np.intp], Array]]:
+def places_along(mesh: Mesh, dense: Dense, points: int) -> Iterator[tuple[NDArray[np.intp], Array]]:
     """Intervals, and normalised times in them: the ends of so many equal parts of each, and the knots."""
     nearest = np.clip(np.searchsorted(mesh.nodes, dense.knots), 0, mesh.intervals)
     inner = dense.knots[mesh.nodes[nearest] != dense.knots]
@@ -269,11 +269,15 @@ def _before(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> Array:
 
 def _conditions(extremal: Extremal, dense: Dense, rows: Conditions, k: Expr, s: Array) -> Array:
     """Conditions at normalised times s of the intervals k, (K, rows)."""
+    return np.asarray(mapped(rows.function, *columns_between(extremal, dense, k, s))[0].T)
+
+
+def columns_between(extremal: Extremal, dense: Dense, k: Expr, s: Array) -> tuple[Array, ...]:
+    """All six arguments of the model at normalised times s of the intervals k, a column each."""
     st, mesh = extremal.statement, extremal.mesh
     z = _before(extremal, dense, k, s)
     h = np.diff(mesh.nodes)[k]
     controls = extremal.control(k, (s - mesh.nodes[k]) / np.where(h > 0, h, 1.0))
     duration = extremal.trajectory.duration
     fixed = repeated(duration, extremal.parameters, s.size)
-    found = mapped(rows.function, z[:, : st.nx].T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed)[0]
-    return np.asarray(found.T)
+    return z[:, : st.nx].T, controls.T, z[:, st.nx :].T, duration * s[None, :], *fixed

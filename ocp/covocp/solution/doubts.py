@@ -8,6 +8,7 @@ from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
 from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, node_error, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
+from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.solution import Solution
 from covocp.solution.spread import mention_spread
 from covocp.transcription.scales import choose_scales
@@ -30,13 +31,15 @@ REMEDY = "Leave grid= out: the default mesh is graded where gains are steep; or 
 
 def mention_doubts(solution: Solution) -> None:
     """Warn of what is wrong with a solution that was found, or with a nominal that was evaluated."""
-    error, fine = solution.mesh_error, False
+    error, fine, jumps = solution.mesh_error, False, mention_jumps(solution)
     depends_on_time = solution.statement is not None and not solution.statement.autonomous
-    alone, by_steps = _flown_alone(solution) if np.isfinite(error) else ("", False)
+    alone, by_steps = _flown_alone(solution) if np.isfinite(error) and not jumps else ("", False)
     if alone:
         warn_user(alone)
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
+    elif jumps and not coarse_elsewhere(solution, jumps):
+        pass  # the steps are long where it jumps, and no others are right there
     elif not (error <= COARSE_MESH or by_steps):
         warn_user(
             f"The mesh is too coarse: halving the integration steps changes the cost by {error:.1e} (relative)"
@@ -54,7 +57,8 @@ def mention_doubts(solution: Solution) -> None:
         fine = True
         _mention_loop(solution)
     mention_spread(solution)
-    _mention_slopes(solution, fine)
+    if not jumps:
+        _mention_slopes(solution, fine)
     _mention_tables(solution)
     if solution.smallest_eigenvalue < 0 and not solution.semidefinite:
         other = "" if solution.mesh.step in ("gauss", "rodas") else "covariance_step='gauss' or "

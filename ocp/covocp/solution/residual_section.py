@@ -8,6 +8,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.pages import Section, Sentence, Table
+from covocp.extremal.jumps import met_jumps
 from covocp.extremal.path_limits import acting
 from covocp.solution.origin import Origin
 
@@ -102,13 +103,20 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
     if name == "control_error" and np.isnan(value) and solution.converged:
         return _not_known(solution)
     if name == "curvature" and np.isnan(value):
-        return "NOT KNOWN: it would take longer than the solution, solve again with fewer intervals"
+        return _unknown_curvature(solution)
     if name == "curvature" and solution.converged:
         return "minimum" if value > 0 else "NOT A MINIMUM" if value < 0 else "flat: its sign is below its error"
     if name == "cross_covariance" and solution.origin is Origin.OTHER_TRUTH:
         return "by other statistics than the design's"
     level, words = WORRIES.get(name, (np.inf, ""))
     return words if solution.converged and abs(value) > level else ""
+
+
+def _unknown_curvature(solution: Solution) -> str:
+    """Why it is not known whether a solution is a minimum."""
+    if solution.statement is not None and met_jumps(solution.extremal):
+        return "NOT KNOWN: the model jumps with the state, and slopes do not see when; see the warning"
+    return "NOT KNOWN: it would take longer than the solution, solve again with fewer intervals"
 
 
 def _not_known(solution: Solution) -> str:
