@@ -63,3 +63,11 @@ def test_knots_of_another_shape():
     assert co.table("map", (knots, knots), values)(0.5, 0.5) is not None
     with pytest.raises(co.ProblemError, match="'map' has knots that are not finite"):
         co.table("map", [0.0, np.nan, 2.0], values[0])
+
+
+def test_several_numbers_for_one_entry_may_mean_several_entries():
+    ocp = co.Problem(2.0)
+    with pytest.raises(co.ProblemError, match="initial value of 'x' has the wrong size") as caught:
+        ocp.state("x", initial=[0.2, 0.0])
+    assert "declare 'x' with 2 entries (shape=2)" in caught.value.remedy
+    assert ocp.state("x", shape=2, initial=[0.2, 0.0]).shape == (2, 1)

@@ -103,7 +103,8 @@ def column(name: str, what: str, value: Given, size: int, *, nan: bool = False, 
     if numbers.size == 1:
         numbers = np.full(size, float(numbers.reshape(())))
     if numbers.size != size or numbers.ndim > 2 or (numbers.ndim == 2 and 1 not in numbers.shape):
-        raise shape_error(name, what, _numbers(size), f"shape {numbers.shape}")
+        entries = numbers.size if numbers.ndim == 1 else 0
+        raise shape_error(name, what, _numbers(size), f"shape {numbers.shape}", entries)
     numbers = numbers.reshape(size)
     if (not nan and np.isnan(numbers).any()) or (not inf and np.isinf(numbers).any()):
         raise ProblemError(
@@ -348,11 +349,12 @@ def _numbers(size: int) -> str:
     return f"a number or {size} numbers" if size > 1 else "a number"
 
 
-def shape_error(name: str, what: str, expected: str, received: str) -> ProblemError:
-    """The error for a shape that does not fit."""
+def shape_error(name: str, what: str, expected: str, received: str, entries: int = 0) -> ProblemError:
+    """The error for a shape that does not fit; `entries`: of a vector that was received, which may be meant."""
+    meant = f", or declare '{name}' with {entries} entries (shape={entries})" if entries > 1 else ""
     return ProblemError(
         f"The {what} of '{name}' has the wrong size.",
         expected=expected,
         received=received,
-        remedy=f"give the {what} of '{name}' in that shape",
+        remedy=f"give the {what} of '{name}' in that shape{meant}",
     )
