@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from covocp.base.matrices import Array
 from covocp.statement.statement import Statement
+from covocp.transcription.choosing import against_elimination
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Mesh, Options
 from covocp.transcription.stiffness import fits, resolve_mesh
@@ -43,7 +44,7 @@ def suits(statement: Statement, options: Options, mesh: Mesh, parameters: Array)
     """
     if fits(statement, mesh, parameters):
         return True
-    if statement.matrices:
+    if statement.matrices and not (mesh.eliminated and against_elimination(statement)):  # that the method asks for
         options = replace(options, covariances="eliminated" if mesh.eliminated else "states")
     if mesh.step == "rodas":  # as many implicit steps as are needed, not as explicit ones would be
         options = replace(options, step="rodas")
