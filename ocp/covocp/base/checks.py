@@ -314,10 +314,15 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
             f"The {what} value of {entry} lies outside its bounds.",
-            expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
-            received=f"{values[i]:g}",
+            expected=f"a value in [{digits(lower[i])}, {digits(upper[i])}]",
+            received=digits(values[i]),
             remedy=f"move the {what} value or widen the bounds",
         )
+
+
+def digits(value: Any) -> str:
+    """A number with as many digits as tell it from every other."""
+    return repr(float(value)).removesuffix(".0")
 
 
 def check_positive(name: str, value: Given, unit: str = "") -> float:
