@@ -14,7 +14,6 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.residuals import onto_bounds
 
-
 # Size of a value that no scale tells: at a bound of zero it may be beyond by rounding alone.
 UNTOLD = 1e-7
 
@@ -39,7 +38,9 @@ def end_value(name: str, what: str, value: Given, lower: Array, upper: Array, sc
     if not is_symbolic(value):
         numbers = column(name, f"{what} value", value, lower.size, nan=True)
         if what == "initial":
-            value = numbers = onto_bounds(numbers, lower, upper, np.full(lower.size, UNTOLD if scale is None else scale))
+            value = numbers = onto_bounds(
+                numbers, lower, upper, np.full(lower.size, UNTOLD if scale is None else scale)
+            )
         check_inside(name, what, numbers, lower, upper)
     return data_column(name, f"{what} value", value, lower.size, nan=True)
 

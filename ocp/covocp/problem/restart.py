@@ -12,7 +12,7 @@ import numpy as np
 from covocp.base.checks import as_number, check_density, check_symmetric_numbers, digits
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
-from covocp.base.matrices import Array, pack, standard_deviations
+from covocp.base.matrices import Array, pack, standard_deviations, unpack, without_rounding
 from covocp.base.residuals import onto_bounds
 from covocp.base.short_repr import short_repr
 from covocp.problem.attitude import as_quaternion
@@ -276,6 +276,7 @@ def _matrix_value(start: Start, value: Given) -> Array:
         rows = ", ".join(start.of.labels)
         raise _wrong(name, f"a symmetric {size} x {size} matrix, rows {rows}", f"shape {numbers.shape}")
     if start.of.covariance:
+        numbers = without_rounding(numbers, np.diagonal(unpack(start.value, size)))
         check_density(name, "initial value", numbers, definite=False)
     else:
         check_symmetric_numbers(name, "initial value", numbers)
