@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -37,7 +39,7 @@ def integrated(solution: co.Solution, prior: float, noise: float = NOISE) -> flo
         return np.r_[y[1], now, rate.ravel(), 0.5 * now**2 + E[0, 0]]
 
     y = np.r_[0.0, 0.0, prior, 0.0, 0.0, prior, 0.0]
-    for begin, end in zip(t[:-1], t[1:], strict=True):
+    for begin, end in pairwise(t):
         y = solve_ivp(slope, (begin, end), y, method="LSODA", rtol=1e-9, atol=1e-12).y[:, -1]
     return float(y[-1])
 
