@@ -437,6 +437,8 @@ def _points(task: _Task, default: Array, random: np.random.Generator, count: int
     for entry in task.made.entries:
         size = entry.port.size
         rows[1:, offset : offset + size] += entry.deviation * random.uniform(-1.0, 1.0, (count - 1, size))
+        if entry.limits is not None:
+            rows[1:, offset : offset + size] = np.clip(rows[1:, offset : offset + size], *entry.limits)
         if entry.port.columns > 1:
             rows[1:, offset : offset + size] *= random.uniform(0.9, 1.1, (count - 1, 1))
         offset += size
