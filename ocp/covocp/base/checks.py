@@ -13,7 +13,7 @@ import numpy as np
 from covocp.base.arguments import is_whole as is_whole
 from covocp.base.errors import ProblemError, kind_and_name, shown
 from covocp.base.expressions import Given, trial_values
-from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers
+from covocp.base.matrices import Array, over_units, own_units, pack_symbolic, real_numbers, without_rounding
 
 # Share of its largest entry by which a matrix may differ from its transpose.
 SYMMETRIC = 1e-9
@@ -182,6 +182,7 @@ def symmetric_data(name: str, what: str, value: Given, size: int, *, semidefinit
         known = np.nan_to_num(matrix, nan=0.0, posinf=np.inf, neginf=-np.inf)
         if matrix.shape == (size, size):
             if semidefinite and not np.isnan(matrix).any():
+                matrix = known = without_rounding(known)
                 check_density(name, what, known, definite=False)
             else:
                 check_symmetric_numbers(name, what, known)
@@ -315,10 +316,15 @@ def check_inside(name: str, what: str, values: Array, lower: Array, upper: Array
         entry = f"component {i} of '{name}'" if lower.size > 1 else f"'{name}'"
         raise ProblemError(
             f"The {what} value of {entry} lies outside its bounds.",
-            expected=f"a value in [{lower[i]:g}, {upper[i]:g}]",
-            received=f"{values[i]:g}",
+            expected=f"a value in [{digits(lower[i])}, {digits(upper[i])}]",
+            received=digits(values[i]),
             remedy=f"move the {what} value or widen the bounds",
         )
+
+
+def digits(value: Any) -> str:
+    """A number with as many digits as tell it from every other."""
+    return repr(float(value)).removesuffix(".0")
 
 
 def check_positive(name: str, value: Given, unit: str = "") -> float:

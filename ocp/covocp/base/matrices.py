@@ -155,6 +155,38 @@ def semidefinite_part(matrix: Array) -> Array:
     return np.asarray(units[:, None] * ((vectors * np.maximum(values, 0.0)) @ vectors.T) * units)
 
 
+def without_rounding(matrix: Array, once: Array | None = None) -> Array:
+    """A matrix as the covariance that it is but for rounding; as it is where it is none.
+
+    A filter leaves E - K H E, whose entries are known to rounding of what the variances were before. Where nothing
+    tells how large these were, a variance that is not positive may be the rounding of the largest entry.
+
+    Args:
+        matrix: (n, n).
+        once: variances of the same rows that they may have had before, (n,); 0 where none is known.
+
+    Returns:
+        Symmetric and semidefinite where rounding alone keeps it from being so: rows of variances that are not positive
+        are zero.
+    """
+    if not np.isfinite(matrix).all():
+        return matrix
+    diagonal, size = np.diagonal(matrix), matrix.shape[0]
+    before = np.maximum(diagonal, 0.0 if once is None else once)
+    rubble = RUBBLE * size * np.finfo(float).eps * np.abs(matrix).max(initial=0.0)
+    margins = np.where(before > 0.0, ROUNDINGS * before, rubble)
+    deviations = np.sqrt(margins)
+    if not (np.abs(matrix - matrix.T) <= deviations[:, None] * deviations).all():
+        return matrix
+    even = 0.5 * (matrix + matrix.T)
+    widened = even + np.diag(margins)
+    known = (np.diagonal(widened) >= 0.0).all()
+    if not known or np.linalg.eigvalsh(over_units(widened, own_units(widened))).min(initial=0.0) < -ROUNDINGS:
+        return matrix
+    empty = diagonal <= 0.0
+    return semidefinite_part(np.where(empty[:, None] | empty, 0.0, even))
+
+
 def unpack_costate(half: ArrayLike, size: int) -> Array:
     """Matrix costate P from the costates of the half-vector: off-diagonal entries are halved."""
     half = np.asarray(half, dtype=float)

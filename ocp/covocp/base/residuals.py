@@ -26,6 +26,8 @@ LIMIT = 1e-5
 VIOLATION = 1e-6
 # Share of its unit by which a point may pass a limit and have met it: solvers do so by some 1e-8.
 PASSED = 1e-7
+# Share of its size to which a path is known between the nodes, and may pass a limit there without being said to.
+BETWEEN_NODES = 1e-5
 # A cost below this share of what the controls change of it (a tracking cost that vanishes) has no size of its own.
 VANISHING = 0.1
 
@@ -72,6 +74,25 @@ class Residuals:
             f"{self.infeasibility:.1e} (changes of the cost to first order, relative to it), largest violation "
             f"{self.violation:.1e}"
         )
+
+
+def onto_bounds(values: Array, lower: Array, upper: Array, sizes: Array) -> Array:
+    """Values, at a bound where they pass it by no more than a solution may that keeps it.
+
+    What a bound may be passed by is a share of it, of the width between both, of the least of them, as where a solution
+    is judged; of a bound that is zero it is a share of the size of the value.
+
+    Args:
+        values: what is bounded.
+        lower: bounds, -inf where there is none.
+        upper: bounds, inf where there is none.
+        sizes: of the values, 0 where nothing tells: 1.
+    """
+    limits = np.abs(np.array([lower, upper]))
+    margins = np.where(np.isfinite(limits) & (limits > 0), limits, np.where(sizes > 0, sizes, 1.0))
+    margins = BETWEEN_NODES * np.minimum(margins, np.where(upper > lower, upper - lower, np.inf))
+    held = np.clip(values, lower, upper)
+    return np.where((values >= lower - margins[0]) & (values <= upper + margins[1]), held, values)
 
 
 def complementary(multipliers: Array, values: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from covocp.base.buffered import Matrices
 from covocp.base.expressions import Expr
 from covocp.base.matrices import Array, half_indices, read_only
 from covocp.base.quadrature import hermite
+from covocp.base.residuals import BETWEEN_NODES
 from covocp.base.short_repr import short_repr
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.nodes import rates_along
@@ -32,7 +33,7 @@ from covocp.transcription.steps import joint_interval, matrices_step, nominal_in
 
 # Largest error of a step and of the polynomial over it, relative to the range of an entry along the solution, and, for
 # what is positive semidefinite, to the roots of the diagonal at this place.
-OF_RANGE, OF_DEVIATIONS = 1e-5, 1e-3
+OF_RANGE, OF_DEVIATIONS = BETWEEN_NODES, 1e-3
 # An entry that hardly varies is known to this share of its size; what is below the second share is roundoff.
 OF_SIZE, ROUNDOFF = 1e-6, 1e-11
 # A state that is no more than this share of its magnitude, such as its deviation, is zero but for roundoff.

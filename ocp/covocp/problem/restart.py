@@ -9,10 +9,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from covocp.base.checks import as_number, check_density, check_symmetric_numbers
+from covocp.base.checks import as_number, check_density, check_symmetric_numbers, digits
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
-from covocp.base.matrices import Array, pack
+from covocp.base.matrices import Array, pack, standard_deviations, unpack, without_rounding
+from covocp.base.residuals import onto_bounds
 from covocp.base.short_repr import short_repr
 from covocp.problem.attitude import as_quaternion
 from covocp.problem.checks import find_name
@@ -33,6 +34,7 @@ class Start:
         value: as declared, of the parameter.
         known: which entries of a state are no free ones; of a matrix all.
         lower, upper: bounds of these entries.
+        sizes: of these entries of a state, as far as its declaration tells; 0 where it does not.
     """
 
     of: State | Matrix
@@ -42,6 +44,7 @@ class Start:
     known: tuple[int, ...]
     lower: Array
     upper: Array
+    sizes: Array
 
     __repr__ = short_repr
 
@@ -66,14 +69,14 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
         declarations: of a problem.
         statement: of the same.
     """
-    start, _, matrices, _ = statement.boundary_values(statement.values)
+    start, end, matrices, _ = statement.boundary_values(statement.values)
     if declarations.expected is not None and not any(matrix.estimation for matrix in declarations.matrices):
         declarations = with_estimation(declarations)
     starts: list[Start] = []
     for position, state in enumerate(declarations.states):
         if state.role == "moving":
             span = next(b for b in statement.states if b.name == state.name).span
-            declarations = _with_start(declarations, position, span, start[span], starts)
+            declarations = _with_start(declarations, position, span, (start[span], end[span]), starts)
     estimated = next((position for position, matrix in enumerate(declarations.matrices) if matrix.estimation), None)
     spreads = {c.chance.spread for c in declarations.constraints if c.chance is not None} - {None}
     followers = [] if estimated is None else [i for i, m in enumerate(declarations.matrices) if m.name in spreads]
@@ -94,6 +97,7 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
                     known=tuple(range(half.size)),
                     lower=-limits,
                     upper=limits,
+                    sizes=np.zeros(half.size),
                 )
             )
             declarations = declarations.adding(parameters=own)
@@ -103,9 +107,10 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
 
 
 def _with_start(
-    declarations: Declarations, position: int, place: slice, start: Array, starts: list[Start]
+    declarations: Declarations, position: int, place: slice, ends: tuple[Array, Array], starts: list[Start]
 ) -> Declarations:
-    """The declarations with the known initial values of a state as a parameter."""
+    """The declarations with the known initial values of a state as a parameter; `ends`: its initial and final ones."""
+    start, end = ends
     state, known = declarations.states[position], np.flatnonzero(~np.isnan(start)).tolist()
     if not known:
         return declarations
@@ -120,9 +125,20 @@ def _with_start(
             known=tuple(known),
             lower=state.lower[known],
             upper=state.upper[known],
+            sizes=_sizes(state, start, end)[known],
         )
     )
     return _started(declarations.adding(parameters=own), "states", position, ca.vertcat(*rows))
+
+
+def _sizes(state: State, start: Array, end: Array) -> Array:
+    """The scale of a state, or the largest of its initial and final values and its standard deviations; 0: untold."""
+    if state.scale is not None:
+        return np.abs(np.broadcast_to(state.scale, start.shape))
+    sizes = np.maximum(np.abs(np.nan_to_num(start)), np.abs(np.nan_to_num(end)))
+    if state.chart is not None or not state.variance.is_constant():
+        return sizes
+    return np.maximum(sizes, standard_deviations(np.asarray(ca.evalf(state.variance).full())))
 
 
 def _parameter(declarations: Declarations, entry: State | Matrix, value: Array) -> Parameter:
@@ -234,11 +250,16 @@ def _state_value(start: Start, value: Given) -> Array:
         raise _wrong(name, f"finite numbers in the entries {known}", str(numbers))
     if len(known) < size and not np.isnan(np.delete(numbers, known)).all():
         raise _wrong(name, f"NaN in the entries that are free: all but {known}", str(numbers))
-    inside = (numbers[known] >= start.lower) & (numbers[known] <= start.upper)
-    if not inside.all():
-        limits = f"within the bounds {start.lower} to {start.upper}"
-        raise _wrong(name, f"numbers {limits} of the state", str(numbers[known]))
-    return numbers[known]
+    found = onto_bounds(numbers[known], start.lower, start.upper, start.sizes)
+    if not ((found >= start.lower) & (found <= start.upper)).all():
+        low, high, own = (_in_digits(values) for values in (start.lower, start.upper, numbers[known]))
+        raise _wrong(name, f"numbers within the bounds {low} to {high} of the state", own)
+    return found
+
+
+def _in_digits(values: Array) -> str:
+    """Numbers with all their digits: a value may be beyond its bound by little."""
+    return "[" + ", ".join(map(digits, values)) + "]"
 
 
 def _matrix_value(start: Start, value: Given) -> Array:
@@ -255,6 +276,7 @@ def _matrix_value(start: Start, value: Given) -> Array:
         rows = ", ".join(start.of.labels)
         raise _wrong(name, f"a symmetric {size} x {size} matrix, rows {rows}", f"shape {numbers.shape}")
     if start.of.covariance:
+        numbers = without_rounding(numbers, np.diagonal(unpack(start.value, size)))
         check_density(name, "initial value", numbers, definite=False)
     else:
         check_symmetric_numbers(name, "initial value", numbers)

@@ -39,14 +39,15 @@ def vector_state(
     """
     name, size = own["name"], own["size"]
     low, high = bound_columns(name, *bounds, size)
+    scale = scale_column(name, scale, size)
     return State(
         **own,
-        initial=end_value(name, "initial", ends[0], low, high),
+        initial=end_value(name, "initial", ends[0], low, high, scale),
         final=end_value(name, "final", ends[1], low, high),
         lower=low,
         upper=high,
         guess=guess,
-        scale=scale_column(name, scale, size),
+        scale=scale,
         variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
     )
 

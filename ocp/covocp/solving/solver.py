@@ -46,7 +46,7 @@ from covocp.solving.other_ways import Way, by_other_ways, other_ways, told_ways
 from covocp.solving.random_starts import STARTS, check_multistart, random_guesses
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
-from covocp.solving.suited_mesh import regraded, suits
+from covocp.solving.suited_mesh import Beginning, beginning, other_nodes, suits
 from covocp.solving.unused import mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.magnitudes import check_magnitudes
@@ -126,6 +126,7 @@ class Solver:
         self._classical = self._classical_design()
         self._own_steps = self._asked.substeps == "auto" and refine is None
         self._looked = False  # at the steps along the guess
+        self._borne: Beginning | None = None  # what the nodes are known to be graded for
         solved = self.statement if nominal == "combined" else statement_of(deterministic(problem.declarations))
         self._solved = solved
         self._own = own
@@ -324,33 +325,33 @@ class Solver:
     def _suit(self, values: Array, *, nodes: bool) -> None:
         """Another mesh for other values of the parameters where this one is too coarse for them, kept for later runs.
 
-        Its steps are looked at always, its nodes where it takes no more time than what else is looked at, or where the
-        times at which the model jumps are others.
+        Its steps are looked at always, its nodes where it takes no more time than what else is looked at, more is
+        uncertain at the start than before, or the times at which the model jumps are others.
         """
         if np.array_equal(values, self._values):
             return
-        mesh = self._prepared.mesh
-        nodes = nodes or (mesh.step == "rk4" and bool(self.statement.matrices))  # of which the steps depend on them
-        more = regraded(*self._ungraded, self._asked, values) if nodes else None
-        if self.statement.kinks(values) != self.statement.kinks(self._values):  # times that parameters say
-            whole = with_instants(self.statement, graded(*self._ungraded, values), values)
-            more = more if np.array_equal(whole.nodes(), self._asked.nodes()) else whole
+        mesh, begin = self._prepared.mesh, beginning(*self._ungraded, values)
+        borne = beginning(*self._ungraded, self._values) if self._borne is None else self._borne
+        on_nodes = mesh.step == "rk4" and bool(self.statement.matrices)  # the steps depend on them
+        nodes = nodes or on_nodes or begin.beyond(borne)
+        more = other_nodes(self.statement, self._ungraded, self._asked, (self._values, values), look=nodes)
         if self.nominal == "deterministic":
             suited = evaluation_mesh(self.statement, self._asked, values).substeps <= mesh.substeps
         else:
             suited = suits(self._solved, self._first[0], mesh, values)
+        borne = begin if more is not None else borne.beside(begin) if nodes else borne
         if suited and more is None:
+            self._borne = borne
             return
         before = self._values, self._asked
         try:
-            self._values = values
-            self._asked = self._asked if more is None else with_instants(self.statement, more, values)
+            self._values, self._asked = values, self._asked if more is None else more
             options = self._laid_out()
             self._keep(options, self._ready(options))
         except BaseException:
             self._values, self._asked = before
             raise
-        self._first = options, self._prepared
+        self._first, self._borne = (options, self._prepared), borne
 
     def _look_at_steps(self, values: Array) -> None:
         """Take shorter steps from the first run on where a large covariance needs them along the guess."""

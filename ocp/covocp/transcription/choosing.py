@@ -230,18 +230,7 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     """
     if not statement.matrices:
         return True
-    tied = () if statement.tied is None else statement.tied.matrices
-    own = sorted(set(statement.entries(statement.ahead)) - set(tied))
-    initial = statement.boundary_values(statement.values)[2][own]
-    obstacle = None
-    if statement.coupled:
-        obstacle = "the rate of a state depends on a matrix"
-    elif np.isnan(initial).any():
-        obstacle = "an initial value of a matrix is free"
-    elif statement.fed:
-        obstacle = "a gain is a control"
-    elif bounded := _bounded_matrices(statement):
-        obstacle = f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
+    obstacle = against_elimination(statement)
     if options.covariances == "eliminated" and obstacle:
         raise ProblemError(
             "The matrices cannot be eliminated.",
@@ -254,7 +243,26 @@ def _choose_eliminated(statement: Statement, options: Options) -> bool:
     if statement.integrals or waits(statement) or statement.fed:
         return False
     few = statement.loop is not None or statement.ne <= PATH_ENTRIES
-    return obstacle is None and not (statement.path.uses_matrices and few)
+    return not obstacle and not (statement.path.uses_matrices and few)
+
+
+def against_elimination(statement: Statement) -> str:
+    """Why the matrices of a shooting method cannot be eliminated; "" where they can.
+
+    A method that propagates them always, such as gradient steps, does so all the same.
+    """
+    tied = () if statement.tied is None else statement.tied.matrices
+    own = sorted(set(statement.entries(statement.ahead)) - set(tied))
+    initial = statement.boundary_values(statement.values)[2][own]
+    if statement.coupled:
+        return "the rate of a state depends on a matrix"
+    if np.isnan(initial).any():
+        return "an initial value of a matrix is free"
+    if statement.fed:
+        return "a gain is a control"
+    if bounded := _bounded_matrices(statement):
+        return f"the diagonal of {', '.join(bounded)} has a lower bound that its rate does not ensure"
+    return ""
 
 
 def _bounded_matrices(statement: Statement) -> list[str]:

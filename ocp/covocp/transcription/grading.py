@@ -61,7 +61,7 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
         The options; with the uniform mesh where nothing is steep.
     """
     plain = with_instants(statement, options, parameters)
-    if options.grid is not None or not _needed(statement):
+    if options.grid is not None or not needs_grading(statement):
         return plain
     longest = statement.duration.guess
     if statement.duration.free:
@@ -81,7 +81,7 @@ def graded(statement: Statement, options: Options, parameters: Array) -> Options
     )
 
 
-def _needed(statement: Statement) -> bool:
+def needs_grading(statement: Statement) -> bool:
     """Whether the cost sees what a matrix does on the way: only then does it matter how steep the ends are."""
     known = any(
         form is not None and (block.estimation or block.backward)

@@ -37,6 +37,8 @@ STATUSES = {
     "returned",
     "RESULT_NOT_FINITE": "a result would be NaN or infinite: the results were not written",
     "FAILED": "the evaluation failed: nothing was written, or (solver) the plan made at the export is returned",
+    "COARSE": "the conditions hold, but the mesh of the export is too coarse for so much uncertainty at the start: its "
+    "cost is off by more than about 1 %; export the solver for such a start",
 }
 CODES = {name: number for number, name in enumerate(STATUSES)}
 # Beyond this a number of a measurement, a time or an estimate counts as infinite, as the texts above and those of the

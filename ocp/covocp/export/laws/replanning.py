@@ -38,6 +38,7 @@ class Argument:
         deviation: how far it may be moved to try the solver, of the same shape.
         symmetric: whether the parameter is the half-vector of the matrix, not its columns one below the other.
         attitude: of the initial quaternion of an attitude, its rows among the initial states; None of all else.
+        limits: bounds of a state, (2, rows), within which a solver is tried.
     """
 
     port: Port
@@ -46,6 +47,7 @@ class Argument:
     deviation: Array
     symmetric: bool = False
     attitude: slice | None = None
+    limits: Array | None = None
 
     __repr__ = short_repr
 
@@ -174,7 +176,8 @@ def _argument(start: Start, taken: set[str], parameters: tuple[Parameter, ...]) 
     about += instead
     deviation = np.maximum(0.1 * _deviations(entry)[known], 0.005 * np.abs(start.value))
     port = Port(name=name, rows=len(known), unit=entry.unit, about=about)
-    return Argument(port=port, parameter=start.parameter, value=start.value, deviation=deviation)
+    limits = np.array([start.lower, start.upper])
+    return Argument(port=port, parameter=start.parameter, value=start.value, deviation=deviation, limits=limits)
 
 
 def _deviations(entry: State) -> Array:

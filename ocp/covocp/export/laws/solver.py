@@ -19,9 +19,10 @@ from covocp.base.linear_solve import COMPILED_SOLVER
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.export.compiled.linking import PLUGINS, Linking
-from covocp.export.laws.law import CODES, LARGEST, QUATERNION, Law, Port, flat, span
+from covocp.export.laws.law import CODES, QUATERNION, Law, Port, flat, span
 from covocp.export.laws.nlp_plugins import hessians, plugin_functions, plugin_settings, refused_option
 from covocp.export.laws.replanning import Replannable, replannable, stacked, unit_quaternion
+from covocp.export.laws.solver_bounds import coarse, narrowed, nlp_bounds, outside
 from covocp.export.text.names import identifier
 from covocp.passage.written import Tape
 from covocp.problem.builder import Problem
@@ -38,8 +39,6 @@ from covocp.transcription.transcribing import transcribe, written_out
 
 # In the NLP's own units: what counts as solved.
 INFEASIBLE, STATIONARY = 1e-6, 1e-5
-# Fatrop widens bounds by this, relative to their size or to 1 where they are smaller, and offers no option for it.
-WIDENED = 1e-8
 # Cost in units of its slope that counts as zero, and where the slope is taken, in units of the variables.
 ROUNDING, APART = 1e-6, 1e-2
 # Directions in which the curvature of the cost is looked at, and how far, in units of the variables.
@@ -61,7 +60,8 @@ RESIDUALS = ("infeasibility", "stationarity")
 # Share of what counts as met by which residuals may differ at the same plan: CasADi's C code of Ipopt leaves another
 # slope there, of a stiff plant one of 2e-7 for one of 6e-9.
 SAME_RESIDUAL = 0.1
-STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED")
+STATUSES = ("OK", "ARGUMENT_NOT_FINITE", "NOT_CONVERGED", "FAILED", "COARSE")
+SOLVED = (CODES["OK"], CODES["COARSE"])  # the conditions hold
 ABOUT = (
     "A plan from a new start. Begins at the guess (the variables of an earlier plan, or NULL) and returns the nodes of "
     "the plan, its cost, and how well the first-order conditions of a minimum hold (in the solver's units). A saddle "
@@ -195,7 +195,7 @@ def _failure(law: Law) -> str:
     failures = 0
     for number, row in enumerate(law.points(np.random.default_rng(SEED), TRIALS)):
         values = law.values(row[None, :])[0]
-        failures += int(values[-1]) != CODES["OK"]
+        failures += int(values[-1]) not in SOLVED
         if failures > (FAILURES if number else 0):
             left = ", ".join(f"{name} {values[span(law.outputs, name)][0]:.1e}" for name in RESIDUALS)
             status = STATUS_NAMES[int(values[-1])]
@@ -320,16 +320,19 @@ def _core(task: _Task, nlp: NLP, method: str, settings: dict[str, Any]) -> _Core
         if entry.attitude is not None
     }
     p = ca.vertcat(ca.MX(0, 1), *stacked(task.made, symbols | turned, task.names))
-    bounds = _bounds(task, p, symbols.get("duration"))
+    bounds = nlp_bounds(task.nlp, p, symbols.get("duration"))
     start = ca.fmin(ca.fmax(guess, bounds["lbx"]), bounds["ubx"])
     given: dict[str, Any] = {"x0": start, "lam_x0": task.multipliers[0], "lam_g0": task.multipliers[1]}
-    given |= {"p": ca.vertcat(p, task.scale), **(_narrowed(bounds) if method == "fatrop" else bounds)}
+    given |= {"p": ca.vertcat(p, task.scale), **(narrowed(bounds) if method == "fatrop" else bounds)}
     result = solver(**given)
     evaluated: Any = nlp.evaluate(result["x"], ca.vertcat(p, 1.0))
     residuals = _residuals(task, nlp, result, evaluated[-1], p, bounds, symbols.get("duration", 1.0))
+    residuals = ca.fmax(residuals[0], outside(task.nlp, p)), residuals[1]
     outputs = _results(task, result["x"], evaluated, residuals)
     bad = ca.logic_not(ca.logic_and(residuals[0] <= INFEASIBLE, residuals[1] <= STATIONARY))
-    values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], CODES["OK"])]
+    short = coarse(nlp, p, evaluated)
+    good = CODES["OK"] if short is None else ca.if_else(short, CODES["COARSE"], CODES["OK"])
+    values = [value for _, value in outputs] + [ca.if_else(bad, CODES["NOT_CONVERGED"], good)]
     function = ca.Function("solve", [*symbols.values(), guess], [flat(v) for v in values])
     return _Core(function=function, results=(*(port for port, _ in outputs), Port(name="status")))
 
@@ -408,48 +411,6 @@ def _where(what: str, nlp: NLP) -> str:
     return "interval" if what == "control" and nlp.mesh.control == "constant" else "node"
 
 
-def _bounds(task: _Task, p: Given, duration: Given) -> dict[str, Any]:
-    """Bounds of the NLP as expressions of the parameters: `NLP.bounds` with symbols where values are prescribed."""
-    nlp, st, mesh = task.nlp, task.nlp.statement, task.nlp.mesh
-    numbers = nlp.bounds(st.values)
-    known = [np.flatnonzero(~np.isnan(v)) for v in st.boundary_values(st.values)]
-    values = st.boundary(p)
-    count = len(mesh.starts)
-    last_e = st.nx * count + st.ne * (count - 1)
-    places = [(0, known[0], values[0], nlp.scales.x), (st.nx * (count - 1), known[1], values[1], nlp.scales.x)]
-    if not mesh.eliminated:
-        places += [(st.nx * count, known[2], values[2], nlp.scales.e), (last_e, known[3], values[3], nlp.scales.e)]
-    lower, upper = ca.MX(ca.DM(numbers["lbx"])), ca.MX(ca.DM(numbers["ubx"]))
-    for offset, rows, value, scale in places:
-        if rows.size:
-            fixed = value[rows.tolist()] / ca.DM(scale[rows])
-            lower[(offset + rows).tolist()] = fixed
-            upper[(offset + rows).tolist()] = fixed
-    if duration is not None:
-        lower[-1] = upper[-1] = duration / nlp.scales.duration
-    lbg, ubg = ca.MX(ca.DM(numbers["lbg"])), ca.MX(ca.DM(numbers["ubg"]))
-    offset = 0
-    for entry in nlp.rows:
-        size = entry.lower.size
-        if entry.kind == "final_matrices":
-            target = values[3][known[3].tolist()] / ca.DM(entry.scale)
-            lbg[offset : offset + size] = target
-            ubg[offset : offset + size] = target
-        offset += size
-    return {"lbx": lower, "ubx": upper, "lbg": lbg, "ubg": ubg}
-
-
-def _narrowed(bounds: dict[str, Any]) -> dict[str, Any]:
-    """Bounds that fatrop widens to these; those that are equal stay, as fatrop leaves them, and so do infinite ones."""
-    result = {}
-    for lower, upper in (("lbx", "ubx"), ("lbg", "ubg")):
-        room = (bounds[upper] - bounds[lower]) / 2
-        for name, sign in ((lower, 1.0), (upper, -1.0)):
-            widened = WIDENED * ca.fmin(ca.fmax(1.0, ca.fabs(bounds[name])), LARGEST)
-            result[name] = bounds[name] + sign * ca.fmin(widened, room)
-    return result
-
-
 def _residuals(
     task: _Task, nlp: NLP, result: Mapping[str, Any], g: Given, p: Given, bounds: Mapping[str, Any], duration: Given
 ) -> tuple[Any, Any]:
@@ -476,6 +437,8 @@ def _points(task: _Task, default: Array, random: np.random.Generator, count: int
     for entry in task.made.entries:
         size = entry.port.size
         rows[1:, offset : offset + size] += entry.deviation * random.uniform(-1.0, 1.0, (count - 1, size))
+        if entry.limits is not None:
+            rows[1:, offset : offset + size] = np.clip(rows[1:, offset : offset + size], *entry.limits)
         if entry.port.columns > 1:
             rows[1:, offset : offset + size] *= random.uniform(0.9, 1.1, (count - 1, 1))
         offset += size
