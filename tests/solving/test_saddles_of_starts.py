@@ -124,3 +124,15 @@ def test_a_minimum_that_the_guess_met_is_no_saddle(method):
         solution = co.solve(ocp, method=method, progress=False)
         assert solution.optimality.curvature > 0
     assert solution["r"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("start", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_decision_that_acts_at_the_end_alone_is_found_in_the_unit_of_its_bounds(method, start):
+    """The first Hessian of "reduced" is that of the decision in all segments, not of its value at the start."""
+    ocp, cost = regulator()
+    r = ocp.decision("r", guess=0.0, lower=-2.0, upper=2.0)
+    ocp.minimize(running=cost, terminal=1.0 - ca.cos(r))
+    solution = co.solve(ocp, method=method, guess={"r": start}, progress=False)
+    assert solution.cost == pytest.approx(REGULATED, abs=1e-6)
+    assert solution.stats["iterations"] < 50
