@@ -71,11 +71,13 @@ def first_curvature(
         diagonal[flat] = metric[flat] * _along_slope(slope_at, slope, w, metric, own)
     for i in np.flatnonzero(own):
         if not first <= i < first + nodes * nu:
+            # a decision is one number, whatever segment it acts in: alone at the start it may cost nothing
+            together = slice(i, st.nx * len(nlp.mesh.starts), st.nx) if i in st.decisions else slice(i, i + 1)
             step = DISPLACEMENT * max(1.0, abs(float(w[i])))
             moved = w.copy()
-            moved[i] += step
-            change = (slope_at(moved) - slope)[i] / step
-            floor = abs(float(slope[i])) / max(1.0, abs(float(w[i])))
+            moved[together] += step
+            change = float((slope_at(moved) - slope)[together].sum()) / step
+            floor = abs(float(slope[together].sum())) / max(1.0, abs(float(w[i])))
             diagonal[i] = max(abs(change) if np.isfinite(change) else 0.0, floor, diagonal[own].max() * 1e-6, 1e-12)
     return Curvature.of(result[np.ix_(chosen, chosen)])
 

@@ -47,6 +47,7 @@ def quadratic(a, c, duration, *, final=0.0, lower=-np.inf, beside=False):
     return ocp
 
 
+@pytest.mark.filterwarnings("ignore:This is no minimum")  # a run of no steps at a saddle
 @pytest.mark.parametrize("control", ["linear", "constant"])
 @pytest.mark.parametrize(("a", "duration"), [(0.0, 2.0), (4.0, 8.0), (-1.0, 5.0)])
 def test_conjugate_point_of_a_plant_that_may_be_unstable(a, duration, control):

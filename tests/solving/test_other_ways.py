@@ -43,6 +43,7 @@ def test_a_condition_that_does_not_act_leaves_the_best_gain(best):
     assert found.stats["iterations"] < 50
 
 
+@pytest.mark.filterwarnings("ignore:This is no minimum")  # on long steps, as the printout says
 @pytest.mark.parametrize(
     ("options", "step", "by"),
     [({}, "gauss", "covariance_step='gauss'"), ({"covariance_step": "rk4"}, "rk4", "hessian='limited-memory'")],
@@ -82,6 +83,7 @@ def raising(monkeypatch, where):
     monkeypatch.setattr(solver, "made_ready", ready)
 
 
+@pytest.mark.filterwarnings("ignore:This is no minimum")  # on long steps, as the printout says
 def test_without_the_option_of_the_hessian_ipopt_is_another_way(best):
     """The method "auto" has none; it lets Ipopt run where a gain is free."""
     auto = co.Solver(swung(), "auto", intervals=30, substeps=1, covariance_step="rk4")

@@ -27,11 +27,11 @@ from covocp.extremal.active_constraints import held_by
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
+from covocp.extremal.free_starts import free_start, largest, start_weights
 from covocp.extremal.hamiltonian import Costates
 from covocp.extremal.lagrangian import arguments, interval_slopes, node_size, second_order
 from covocp.extremal.tangents import Between, Tangents
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.scales import choose_scales
 
 LANCZOS_STEPS = 120
 # Residual of the smallest Ritz value, relative to the largest eigenvalue, at which it is known well enough; its sign
@@ -115,7 +115,7 @@ def _smallest(extremal: Extremal, seconds: float) -> Curvature | None:
     operator = reduced.operator(strict)
     if not np.isfinite(operator(np.ones(strict.shape[1]))).all():
         return None
-    left = seconds / reduced.seconds - extremal.statement.nu  # some were needed for the units
+    left = seconds / reduced.seconds - _for_units(extremal.statement.nu, reduced.tangents.start)
     products = _Products(left=max(left, LEAST_STEPS))
     values, vectors, error, known = _extremes(operator, strict, products)
     if not known and values[0] >= -error:  # a negative one is there whatever else is
@@ -271,22 +271,22 @@ class _Reduced:
         own, touching = held.controls[:: mesh.points], held.touching[:: mesh.points]  # those between follow from them
         free = own == 0
         free[mesh.idle] = False  # what moves them acts for no time
-        tangents = tangents_along(extremal, free, _free_start(extremal))
+        tangents = tangents_along(extremal, free, free_start(extremal))
         if not tangents.size:
             return None
         between = _between(extremal, fine)
         given = arguments(fine, _costates(fine, through=tangents.gain is None))
         product, jacobian = second_order(st, fine.mesh, held.entries)
         once = _seconds(product, given)
-        if once * (LEAST_STEPS + st.nu) > seconds:
+        if once * (LEAST_STEPS + _for_units(st.nu, tangents.start)) > seconds:
             raise _TooLongError
         moving = np.flatnonzero(tangents.free).tolist()
+        applied, weights = _applied(product, given), np.zeros(0)
+        if tangents.start:
+            curved = _curved(tangents, between, applied)
+            weights = start_weights(extremal, tangents.start, curved, len(moving))
         shares = ca.diag(ca.DM(_shares(fine, product, given)[np.array(moving, dtype=np.intp) % st.nu]))
         metric = shares @ mass_matrix(mesh, t.duration, st.nu)[moving, moving] @ shares
-        weights = np.zeros(0)
-        if tangents.start:  # in units that say something where the best control is none
-            controls = choose_scales(st, mesh, t, extremal.parameters).u.mean()
-            weights = t.duration * (controls / _scales(t.x)[list(tangents.start)]) ** 2
         root = _root(ca.diagcat(metric, ca.diag(ca.DM(weights))))
         rows = _by_v(tangents, *between.backward(*_split(fine, np.asarray(jacobian(*given).full()))), root)
         if not np.isfinite(rows).all():
@@ -301,7 +301,7 @@ class _Reduced:
             tangents=tangents,
             between=between,
             root=root,
-            product=_applied(product, given),
+            product=applied,
             strict=rows[held.strict],
             loose=-side[:, None] * loose,
             seconds=once,
@@ -357,6 +357,22 @@ def _seconds(product: ca.Function, given: tuple[Any, ...]) -> float:
     begin = time.perf_counter()
     product(*given, np.zeros(product.size1_in(product.n_in() - 1)))
     return max(time.perf_counter() - begin, float(np.finfo(float).tiny))
+
+
+def _for_units(controls: int, start: tuple[int, ...]) -> int:
+    """Products with the Hessian that the units of the metric take."""
+    return controls + (1 + len(start) if start else 0)
+
+
+def _curved(tangents: Tangents, between: Between, product: Callable[[Array], Array]) -> Callable[[Array], float]:
+    """Second slope of the Lagrangian along v of the tangents."""
+
+    def along(v: Array) -> float:
+        z, u = between.forward(*tangents.forward(v[:, None]))
+        moved = np.concatenate([z.ravel(), u.ravel()])
+        return float(moved @ product(moved))
+
+    return along
 
 
 def _shares(fine: Extremal, product: ca.Function, given: tuple[Any, ...]) -> Array:
@@ -435,7 +451,7 @@ def tangents_along(
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     A, before, after = interval_slopes(extremal)
     z = t.x if not st.coupled else np.hstack([t.x, t.e])
-    scales = (_scales(z), _scales(t.u))
+    scales = (largest(z), largest(t.u))
     constant = mesh.control == "constant"
     if constant:
         before = before + after
@@ -454,20 +470,6 @@ def _costates(extremal: Extremal, *, through: bool) -> Costates:
         none = np.zeros((0, extremal.statement.nx))
         extremal = replace(extremal, multipliers=replace(extremal.multipliers, gaps=none))
     return discrete_costates(extremal)[0]
-
-
-def _scales(values: Array) -> Array:
-    """Largest magnitude of each column; 1 where it is always zero."""
-    largest = np.abs(values).max(axis=0, initial=0.0)
-    return np.asarray(np.where(largest > 0, largest, 1.0))
-
-
-def _free_start(extremal: Extremal) -> tuple[int, ...]:
-    """Entries of the initial state that are free and not at a bound."""
-    st, x = extremal.statement, extremal.trajectory.x
-    lower, upper = st.state_bounds
-    room = np.minimum(x[0] - lower, upper - x[0]) > 1e-5 * _scales(x)
-    return tuple(np.flatnonzero(np.isnan(st.boundary_values(extremal.parameters)[0]) & room).tolist())
 
 
 def held_jacobian(extremal: Extremal) -> Array:

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.errors import warn_user
 from covocp.base.matrices import Array, standard_deviations
 from covocp.base.residuals import VANISHING, complementary
 from covocp.extremal.adjoint_steps import explicit_pairs
@@ -176,6 +177,15 @@ def assess(
     )
     nothing = max(absolute_cost(extremal) + others, float(values[:, 1].max())) <= ZERO_COST  # costs may cancel
     return _of_nothing(found) if nothing else found
+
+
+def mention_saddle(curvature: float | None) -> None:
+    """Warn of a point that meets the first conditions, of negative curvature (relative to the largest)."""
+    if curvature is not None and curvature < 0:
+        warn_user(
+            f"This is no minimum: the reduced Hessian has a negative curvature, {curvature:.1e} of its largest. "
+            "Start elsewhere, or go on from there by method='ipopt' (guess=)."
+        )
 
 
 def _stationarity(extremal: Extremal, slopes: Array, scale: float, within: Within | None) -> float:

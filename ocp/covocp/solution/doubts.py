@@ -108,11 +108,6 @@ def _mention_slopes(solution: Solution, fine: bool) -> None:
             f"The point is stationary by the slopes that the method integrates, not by those of its cost on this mesh "
             f"(stationarity {found.stationarity:.1e}). Use more intervals, or method='ipopt' from there (guess=)."
         )
-    if found.curvature is not None and found.curvature < 0:
-        warn_user(
-            f"This is no minimum: the reduced Hessian has a negative curvature, {found.curvature:.1e} of its largest. "
-            "Start elsewhere, or go on from there by method='ipopt' (guess=)."
-        )
 
 
 def _unknown_error(solution: Solution) -> str:

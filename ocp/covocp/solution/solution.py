@@ -27,7 +27,7 @@ from covocp.extremal.links import Within
 from covocp.extremal.mean_effect import MeanEffect, mean_effect, remembered
 from covocp.extremal.mesh_error import mesh_error
 from covocp.extremal.nodes import filter_gains, rates_along
-from covocp.extremal.optimality import Optimality, assess, identities
+from covocp.extremal.optimality import Optimality, assess, identities, mention_saddle
 from covocp.extremal.path_limits import Passed, left_tables, limited, passed_limits
 from covocp.extremal.phase_loops import PhaseLoop
 from covocp.extremal.polynomials import Dense
@@ -235,7 +235,10 @@ class Solution:
         known = (self.mesh_error, self.smallest_eigenvalue, self.loop, self.cost_identity)
         if not self.optimised:
             return identities(self.extremal, *known)
-        return assess(self.extremal, self.costates, *known, self.within, longest(self.stats))
+        found = assess(self.extremal, self.costates, *known, self.within, longest(self.stats))
+        if self.converged:
+            mention_saddle(found.curvature)
+        return found
 
     @property
     def cost_identity(self) -> float | None:

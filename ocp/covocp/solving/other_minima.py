@@ -12,13 +12,15 @@ from covocp.base.errors import CovocpError, last_line, warn_user
 from covocp.base.later import later
 from covocp.base.matrices import Array
 from covocp.base.progress import Progress
+from covocp.extremal.cost_sizes import variable_cost
 from covocp.extremal.extremal import Extremal, Guess, Outcome, Prepared
 from covocp.extremal.links import ChainOutcome
+from covocp.extremal.optimality import mention_saddle
 from covocp.solution.patience import longest
 from covocp.solving.attempts import cost_of, counted, with_stats
 from covocp.solving.turns import unwound
 from covocp.solving.warm_start import make_guess
-from covocp.transcription.scales import choose_scales
+from covocp.transcription.scales import WIDE_BOUNDS, choose_scales, unvanishing
 from covocp.transcription.starts import moving_units
 from covocp.transcription.trajectory import Trajectory
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 SUSPICIOUS_ITERATIONS = 3
 # A run whose control moved no further than this share of it (or of its unit) ended where it began: the same suspicion.
 UNMOVED = 1e-6
+# The same of a decision or an initial state that started beside its guess (`first_guess.BESIDE`).
+UNMOVED_START = 0.03
 # A saddle is left by the size of the controls, or by this share of what moves a state by its scale: in these units a
 # step is none too small for the solver to see, nor so large that it leads to another valley.
 DISPLACEMENT = 0.3
@@ -85,6 +89,7 @@ def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: P
     exact = outcome.stats.get("hessian") == "exact"
     few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
     suspicious = few or bool(outcome.stats.get("concave")) or _stayed(start.trajectory, outcome.extremal)
+    suspicious = suspicious or _start_stayed(start, outcome.extremal)
     if not outcome.converged or not suspicious or reporter.stop:
         return outcome
     left, longer = reporter.left[0], longest(outcome.stats)
@@ -106,15 +111,26 @@ def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: P
     limit = cost_of(outcome) - CHEAPER * abs(cost_of(outcome))
     better = [c for c in candidates if c.converged and cost_of(c) < limit]
     if not better:
+        if candidates:
+            mention_saddle(curvature.value / curvature.largest)
         return outcome
     best = min(better, key=cost_of)
     together = counted(outcome, best)
     if cost_of(outcome) - cost_of(best) <= HARDLY * abs(cost_of(outcome)):
+        if curvature.start.any():
+            _mention_left(best, seconds)
         return with_stats(best, **together)
     warn_user(
         "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
     )
     return with_stats(best, **together, left_saddle=True)
+
+
+def _mention_left(outcome: Outcome, seconds: float) -> None:
+    """Warn where a run from beside a saddle went no further: initial states may be in far too small a unit for it."""
+    curvature = later("extremal.curvature").smallest_curvature(outcome.extremal, seconds)
+    if curvature is not None and curvature.verdict == "saddle":
+        mention_saddle(curvature.value / curvature.largest)
 
 
 def _stayed(before: Trajectory, extremal: Extremal) -> bool:
@@ -129,16 +145,40 @@ def _stayed(before: Trajectory, extremal: Extremal) -> bool:
     return bool((moved <= UNMOVED * (sizes + units)).all())
 
 
+def _start_stayed(start: Guess, extremal: Extremal) -> bool:
+    """Whether an initial state that is free, or a decision, ended about where it began.
+
+    Where its slope vanishes by symmetry it does, however far the controls go. A cold start is a little beside its
+    guess, and may lead back to it, or no further: in the unit that far bounds tell this is none.
+    """
+    free = list(later("extremal.free_starts").free_start(extremal))
+    if not free:
+        return False
+    t = extremal.trajectory
+    units = unvanishing(extremal.statement, extremal.mesh, t, extremal.parameters)
+    share = UNMOVED if start.warm else UNMOVED_START
+    return bool((np.abs(t.x[0] - start.trajectory.x[0]) <= share * units)[free].any())
+
+
 def _displaced(extremal: Extremal, curvature: Curvature, sign: float) -> Trajectory:
-    """The trajectory moved to one side along the direction of the smallest curvature."""
+    """The trajectory moved to one side along the direction of the smallest curvature.
+
+    Bounds may tell too large a magnitude of an initial state, and none at all where they are left out: it is moved so
+    far that by its curvature a share of the cost is gained, between what the bounds count for at least and at most.
+    """
     t, st = extremal.trajectory, extremal.statement
-    scales = choose_scales(st, extremal.mesh, t, extremal.parameters)
     units = moving_units(st, extremal.mesh, t, extremal.parameters)
     controls = np.maximum(np.sqrt(np.mean(t.u**2, axis=0)), DISPLACEMENT * units)
-    shares = [np.abs(curvature.direction) / controls, np.abs(curvature.start) / (DISPLACEMENT * scales.x)]
-    step = sign / max(float(share.max(initial=0.0)) for share in shares)
+    moved = float((np.abs(curvature.direction) / controls).max(initial=0.0))
+    steps = []
+    for wide in (1.0, WIDE_BOUNDS):
+        sizes = DISPLACEMENT * unvanishing(st, extremal.mesh, t, extremal.parameters, wide)
+        steps.append(1.0 / max(moved, float((np.abs(curvature.start) / sizes).max(initial=0.0))))
+    seen = np.sqrt(2.0 * DISPLACEMENT**2 * variable_cost(extremal) / abs(curvature.value))
+    step = sign * float(np.clip(seen, steps[0], steps[1]))
     x = t.x.copy()
     x[0] = np.clip(x[0] + step * curvature.start, *st.state_bounds)
+    x[1:, st.decisions] = x[0, st.decisions]
     u = np.clip(t.u + step * curvature.direction, *st.control_bounds)
     return Trajectory(x=x, u=u, e=t.e, duration=t.duration)
 

@@ -8,13 +8,15 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from covocp.base.errors import ProblemError, SolveError, evaluating, no_option
+from covocp.base.errors import ProblemError, SolveError, evaluating, no_option, warn_user
 from covocp.base.expressions import Given
 from covocp.base.progress import Progress
 from covocp.extremal.densities import impossible_in_phases
 from covocp.extremal.links import ChainOutcome
+from covocp.extremal.phase_curvature import curvature_between_links, stayed
 from covocp.problem.phases import Phases
 from covocp.solution.doubts import mention_doubts, mention_limits
+from covocp.solution.patience import longest
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.report import stated_first
 from covocp.solving.attempts import interrupted
@@ -186,4 +188,20 @@ def _finished(solution: PhasesSolution, allow_failure: bool) -> PhasesSolution:
     for phase in solution.phases:
         mention_doubts(phase)
         mention_limits(phase)
+    _mention_saddles(solution)
     return solution
+
+
+def _mention_saddles(solution: PhasesSolution) -> None:
+    """Warn of phases that keep a decision or a free initial state where its slope vanishes at no minimum."""
+    extremals, links = [phase.extremal for phase in solution.phases], solution.links
+    for i, phase in enumerate(solution.phases):
+        if not stayed(extremals[i], links[i - 1] if i else None):
+            continue
+        found = curvature_between_links(extremals, links, i, longest(phase.stats))
+        if found is not None and found.verdict == "saddle":
+            warn_user(
+                f"The phase '{phase.name}' is no minimum: with its ends held the reduced Hessian has a negative "
+                f"curvature, {found.value / found.largest:.1e} of its largest. Start elsewhere: another guess of its "
+                "decisions and free initial values, or guess='multistart'."
+            )

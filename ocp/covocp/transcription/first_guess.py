@@ -24,6 +24,9 @@ from covocp.transcription.steps import moving_interval, nominal_interval
 # A control guess that is a single number is bent by this multiple of its scale, so that a stationary point that owes
 # its existence to a symmetry (u = 0 in equilibrium identification, Schmidt 5.2) is never where the solver starts.
 BENDING = 1.0
+# So is the guess of a decision or of a free initial value, by this share of its magnitude: it says where about that is.
+# A slope that vanishes by symmetry would keep it there, and a Hessian that is negative there stops Newton's method.
+BESIDE = 0.01
 # Where a decision has no bound its initial covariance is tried at so many times its magnitude.
 FAR = 10.0
 
@@ -140,8 +143,8 @@ def _other_count(block: Block, received: str) -> ProblemError:
     )
 
 
-def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
-    """Initial state and matrices, the free entries guessed."""
+def starts(statement: Statement, mesh: Mesh, parameters: Array, *, bent: bool = False) -> tuple[Array, Array]:
+    """Initial state and matrices, the free entries guessed; bent: where a guess says little, a little beside it."""
     x0, _, e0, ef = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     default = np.clip(np.zeros_like(x0), lower, upper)
@@ -149,6 +152,8 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
         guess = statement.guesses[block.name]
         if guess is not None:
             default[block.span] = evaluate_guess(block, guess, mesh.nodes)[0]
+    if bent:
+        default = np.where(_bendable(statement), _beside(default, lower, upper), default)
     e0 = np.where(np.isnan(e0), np.nan_to_num(ef), e0)
     for block in statement.matrices:
         if statement.guesses[block.name] is not None:
@@ -159,6 +164,28 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, 
     _check_covariances(statement, e0)
     _check_tied(statement, x0, parameters)
     return x0, e0
+
+
+def _bendable(statement: Statement) -> Array:
+    """Whether a guess says only about where a state starts, (nx,): of decisions, and by one number or by none.
+
+    Not of attitudes, which are of unit length.
+    """
+    result = np.zeros(statement.nx, dtype=bool)
+    for block in statement.states:
+        plain = is_plain(statement.guesses[block.name]) and not block.tangent
+        result[block.span] = plain or block.role == "decision"
+    return result
+
+
+def _beside(values: Array, lower: Array, upper: Array) -> Array:
+    """Values a little beside some others, on the side where the bounds are further away.
+
+    The magnitude is that of the value; of zero it is the range of the bounds or 1, the lesser one.
+    """
+    span = np.where(upper > lower, upper - lower, 0.0)
+    size = np.minimum(np.where(values != 0.0, np.abs(values), 1.0), span)
+    return np.asarray(values + np.where(upper - values >= values - lower, BESIDE, -BESIDE) * size)
 
 
 def matrix_guess(block: Block, guess: Given) -> Array:

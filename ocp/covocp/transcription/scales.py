@@ -8,7 +8,7 @@ import numpy as np
 
 from covocp.base.matrices import Array, half_indices, unpack
 from covocp.statement.statement import Block, Statement
-from covocp.transcription.first_guess import simulate_states
+from covocp.transcription.first_guess import evaluate_guess, simulate_states
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
 from covocp.transcription.resolution import estimated_rows, resolutions
@@ -28,6 +28,8 @@ AT_START, REACHED = 1e-3, 1e-9
 PRIOR_AT_START, PRIOR_REACHED = 1e3, 10.0
 # Share of a given scale that a point which was reached is at least judged by: who gave it may be wrong by as much.
 GIVEN_SHARE = 1e-6
+# Half the range of bounds counts up to so many times what else tells of a state that may have vanished.
+WIDE_BOUNDS = 1e3
 # What no quantity has in any unit: the rest of a state or control that is zero. It is no magnitude.
 NOTHING = 1e-50
 # A variance that starts at zero and stays below this share of the largest one is what steps leave of one that is zero.
@@ -64,11 +66,9 @@ def magnitudes(
         reached: whether a solver found it: then it tells more than scales that were given.
         far: so many times what the measurements resolve.
     """
-    x0, xf, e0, _ = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
-    ends = np.maximum(np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf)))
-    most = (PRIOR_REACHED if reached else PRIOR_AT_START) * np.where(ends > 0, ends, 1.0)
-    deviations, moved = np.minimum(_deviations(statement, e0), most), np.abs(guess.x).max(axis=0, initial=0.0)
+    ends, deviations = _prescribed(statement, parameters, PRIOR_REACHED if reached else PRIOR_AT_START)
+    moved = np.abs(guess.x).max(axis=0, initial=0.0)
     found = np.max([moved, ends, deviations], axis=0)
     if (untold := (ends <= NOTHING) & (moved <= deviations)).any() and not reached:
         resolved = far * resolutions(statement, guess, parameters)
@@ -89,6 +89,42 @@ def magnitudes(
         size = np.minimum(np.where(own > NOTHING, own, 1.0), _half_range(statement, block))
         u[block.span] = _as_given(statement, block, size, own > NOTHING, reached)
     return Scales(x=x, u=u, e=_matrix_scales(statement, guess.e), duration=statement.duration.guess)
+
+
+def unvanishing(
+    statement: Statement, mesh: Mesh, found: Trajectory, parameters: Array, wide: float = WIDE_BOUNDS
+) -> Array:
+    """Magnitudes of the states (nx,) along a trajectory that do not vanish with it.
+
+    A state that is best at zero is there up to what the tolerance leaves, which is no magnitude: the scale, the guess
+    and the ends that are given of it, its deviation and its bounds are, and 1 where none of them tells any.
+
+    Args:
+        statement: the problem.
+        mesh: of the trajectory.
+        found: the trajectory.
+        parameters: of the statement.
+        wide: half the range of bounds counts up to so many times what else is given (1 where nothing is).
+    """
+    told = np.max(_prescribed(statement, parameters, PRIOR_REACHED), axis=0)
+    for block in statement.states:
+        values = [told[block.span]]
+        if block.name in statement.scales and block.role != "decision":  # those have the range of their bounds
+            values.append(np.broadcast_to(statement.scales[block.name], block.size))
+        if statement.guesses[block.name] is not None:
+            values.append(np.abs(evaluate_guess(block, statement.guesses[block.name], mesh.nodes)).max(axis=0))
+        told[block.span] = np.max(values, axis=0)
+    lower, upper = statement.state_bounds
+    half = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), 0.0)
+    told = np.maximum(told, np.minimum(half, wide * np.where(told > NOTHING, told, 1.0)))
+    return np.asarray(np.maximum(np.abs(found.x).max(axis=0, initial=0.0), np.where(told > NOTHING, told, 1.0)))
+
+
+def _prescribed(statement: Statement, parameters: Array, most: float) -> tuple[Array, Array]:
+    """Magnitudes of the states (nx,) by their values at the ends, and by their deviations: these up to a multiple."""
+    x0, xf, e0, _ = statement.boundary_values(parameters)
+    ends = np.maximum(np.abs(np.nan_to_num(x0)), np.abs(np.nan_to_num(xf)))
+    return ends, np.minimum(_deviations(statement, e0), most * np.where(ends > 0, ends, 1.0))
 
 
 def _deviations(statement: Statement, e: Array) -> Array:

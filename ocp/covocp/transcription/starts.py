@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
 from covocp.base.short_repr import short_repr
@@ -123,8 +124,8 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
     Where the nominal is unstable a feedback holds it.
     """
     duration = statement.duration.guess
-    start, e0 = starts(statement, mesh, parameters)
     u = controls_guess(statement, mesh.nodes, mesh.control)
+    start, e0 = beside_guesses(statement, mesh, parameters)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
     plain = True
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
@@ -143,6 +144,20 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
     return First(trajectory=completed(statement, mesh, parameters, u), plain=plain)
 
 
+def beside_guesses(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
+    """Initial state and matrices, free entries a little beside their guesses, unless the model has no values there."""
+    guessed = starts(statement, mesh, parameters)
+    if not np.isnan(statement.boundary_values(parameters)[0]).any():
+        return guessed
+    u = controls_guess(statement, mesh.nodes, mesh.control)[:1].ravel()
+    try:
+        start, e0 = starts(statement, mesh, parameters, bent=True)
+        check_model(statement, start, u, e0, statement.duration.guess, parameters)
+    except ProblemError:
+        return guessed
+    return start, e0
+
+
 def completed(
     statement: Statement,
     mesh: Mesh,
@@ -158,7 +173,8 @@ def completed(
     Another initial state than the guessed one, or another duration, may be given; or the states, which then count.
     """
     own, e0 = starts(statement, mesh, parameters)
-    start = own if start is None else start
+    if start is None:
+        start, e0 = beside_guesses(statement, mesh, parameters)
     duration = statement.duration.guess if duration is None else duration
     guessed = [b for b in statement.states if statement.guesses[b.name] is not None]
     if x is not None:
@@ -246,7 +262,7 @@ def _tracked(statement: Statement, mesh: Mesh, parameters: Array, rows: tuple[in
         guess = statement.guesses[block.name]
         if guess is not None:
             path[:, block.span] = interpolated(evaluate_guess(block, guess, mesh.nodes), mesh.nodes, coarse.nodes)
-    start = starts(statement, mesh, parameters)[0]
+    start = beside_guesses(statement, mesh, parameters)[0]
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
     run = base_run(statement, coarse, parameters, start, flat)
     run = replace(run, scale=np.maximum(run.scale, np.abs(path).max(axis=0)), units=_units(run, flat, path))
@@ -432,7 +448,7 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
     """Starts of several shapes and sizes, brought to the final values with little energy, the cheapest first."""
     coarse = _coarse(statement, mesh, tuple(parameters))
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
-    run = base_run(statement, coarse, parameters, starts(statement, mesh, parameters)[0], flat)
+    run = base_run(statement, coarse, parameters, beside_guesses(statement, mesh, parameters)[0], flat)
     run = replace(run, units=_units(run, flat))
     fixed, target = targets(run)
     judged = []
