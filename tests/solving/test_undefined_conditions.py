@@ -12,7 +12,7 @@ import pytest
 import covocp as co
 from covocp.base.residuals import Residuals
 from covocp.solving.comparison import terminal_miss
-from covocp.transcription.starts import _merit
+from covocp.transcription.ranking import merit
 from covocp.transcription.steering import Run
 
 
@@ -152,8 +152,8 @@ def test_a_start_along_which_it_has_no_value_is_none() -> None:
     one = np.ones(1)
     run = Run(statement=st, mesh=mesh, scale=one, units=one, start=one, duration=4.0, parameters=np.zeros(0))
     control = np.ones((mesh.control_nodes, 1))
-    assert _merit(run, 0.5 * control)[0] == pytest.approx(1.0)
-    assert _merit(run, -control) == (np.inf, np.inf)
+    assert merit(run, 0.5 * control)[0] == pytest.approx(1.0)
+    assert merit(run, -control) == (np.inf, np.inf)
 
 
 def test_a_gradient_method_that_starts_there_names_it() -> None:
