@@ -36,8 +36,8 @@ RUNS = 4
 FINAL, HELD = 1e4, 2.0
 # A run is no better than another one by less than this share.
 BETTER = 1e-3
-# Growth exponent of a nominal over the whole time from which on it is held: by itself it grows by ten thousand times.
-EXPLOSIVE = 9.2
+# Growth exponent of a nominal over the whole time from which on it is held: by itself it grows a thousand times.
+EXPLOSIVE = 6.9
 # Share of an excitation below which there is none.
 LEAST_SHARE = 1e-9
 
