@@ -143,8 +143,8 @@ def _other_count(block: Block, received: str) -> ProblemError:
     )
 
 
-def starts(statement: Statement, mesh: Mesh, parameters: Array, *, bent: bool = False) -> tuple[Array, Array]:
-    """Initial state and matrices, the free entries guessed; bent: where a guess says little, a little beside it."""
+def starts(statement: Statement, mesh: Mesh, parameters: Array, bent: Array | None = None) -> tuple[Array, Array]:
+    """Initial state and matrices, free entries guessed; bent: by units, a little beside a guess that says little."""
     x0, _, e0, ef = statement.boundary_values(parameters)
     lower, upper = statement.state_bounds
     default = np.clip(np.zeros_like(x0), lower, upper)
@@ -152,8 +152,8 @@ def starts(statement: Statement, mesh: Mesh, parameters: Array, *, bent: bool = 
         guess = statement.guesses[block.name]
         if guess is not None:
             default[block.span] = evaluate_guess(block, guess, mesh.nodes)[0]
-    if bent:
-        default = np.where(_bendable(statement), _beside(default, lower, upper), default)
+    if bent is not None:
+        default = np.where(_bendable(statement), _beside(default, bent, lower, upper), default)
     e0 = np.where(np.isnan(e0), np.nan_to_num(ef), e0)
     for block in statement.matrices:
         if statement.guesses[block.name] is not None:
@@ -178,13 +178,13 @@ def _bendable(statement: Statement) -> Array:
     return result
 
 
-def _beside(values: Array, lower: Array, upper: Array) -> Array:
+def _beside(values: Array, units: Array, lower: Array, upper: Array) -> Array:
     """Values a little beside some others, on the side where the bounds are further away.
 
-    The magnitude is that of the value; of zero it is the range of the bounds or 1, the lesser one.
+    The magnitude is that of the value; of zero it is the unit or the range of the bounds, the lesser one.
     """
     span = np.where(upper > lower, upper - lower, 0.0)
-    size = np.minimum(np.where(values != 0.0, np.abs(values), 1.0), span)
+    size = np.minimum(np.where(values != 0.0, np.abs(values), units), span)
     return np.asarray(values + np.where(upper - values >= values - lower, BESIDE, -BESIDE) * size)
 
 

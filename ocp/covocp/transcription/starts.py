@@ -134,11 +134,24 @@ def beside_guesses(statement: Statement, mesh: Mesh, parameters: Array) -> tuple
         return guessed
     u = controls_guess(statement, mesh.nodes, mesh.control)[:1].ravel()
     try:
-        start, e0 = starts(statement, mesh, parameters, bent=True)
+        start, e0 = starts(statement, mesh, parameters, _units_beside(statement, mesh, parameters, guessed))
         check_model(statement, start, u, e0, statement.duration.guess, parameters)
     except ProblemError:
         return guessed
     return start, e0
+
+
+def _units_beside(statement: Statement, mesh: Mesh, parameters: Array, guessed: tuple[Array, Array]) -> Array:
+    """Units of the states (nx,): scales that are given, else final values, else what they pass through; else 1."""
+    final = np.abs(np.nan_to_num(statement.boundary_values(parameters)[1]))
+    flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
+    x = simulate_states(statement, mesh, *guessed, flat, statement.duration.guess, parameters)
+    units = np.where(final > 0, final, np.abs(x).max(axis=0))
+    for block in statement.states:
+        units[block.span] = statement.scales.get(block.name, units[block.span])
+        own = units[block.span]
+        units[block.span] = np.where(own > 0, own, own.max())
+    return np.where(units > 0, units, 1.0)
 
 
 def completed(
