@@ -133,7 +133,7 @@ def test_the_feedback_of_least_energy_mirrors_what_grows(control, scale):
         units=np.ones(1),
     )
     run = in_moving_units(told, line, flat)
-    aimed = aim(run, rate * np.eye(1), line[-1], np.array([np.nan]))
+    aimed = aim(run, line, flat[0], np.zeros(statement.ne), np.array([np.nan]))
     found = held(run, line, aimed, flat)
     t = duration * mesh.nodes
     np.testing.assert_allclose(found.x[:, 0] / scale, np.exp(-rate * t), atol=2e-3)

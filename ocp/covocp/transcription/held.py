@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,12 +22,13 @@ import numpy as np
 from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.statement.interval import Interval
+from covocp.statement.interval import Interval, model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, StepKind
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steering import Run
 from covocp.transcription.steps import nominal_interval
+from covocp.transcription.stiffness import state_jacobian
 
 # Runs under feedback, each with that of the nominal linearised along the last one.
 RUNS = 4
@@ -38,6 +39,13 @@ FINAL, HELD = 1e4, 2.0
 BETTER = 1e-3
 # Growth exponent of a nominal over the whole time from which on it is held: by itself it grows a thousand times.
 EXPLOSIVE = 6.9
+# Step of second differences in scales of the states; share of a cost below which they are roundoff; scales by which a
+# state is moved at most.
+DIFFERENCE, CURVED, FAR = 0.1, 1e-9, 1e3
+# Places along a line at which it is asked what grows.
+PLACES = 10
+# Share of what a control moves below which it does not act on a mode.
+UNFELT = 1e-9
 # Share of an excitation below which there is none.
 LEAST_SHARE = 1e-9
 
@@ -79,25 +87,82 @@ class _Law(NamedTuple):
     added: Array
 
 
-def aim(run: Run, slope: Array, end: Array, target: Array) -> Aim | None:
-    """Where a run that is held shall end; None where the nominal does not grow by far over the time that it has.
+def aim(run: Run, line: Array, u: Array, e: Array, target: Array) -> Aim | None:
+    """Where a run that is held near a line shall end.
 
     Args:
         run: its scales and duration.
-        slope: of the rates by the states, where it starts (nx, nx).
-        end: where it ends if nothing says more, (nx,).
+        line: states at the nodes, (N + 1, nx).
+        u: control there (nu,).
+        e: half-vectors there (ne,).
         target: final values of the states, (nx,); nan where there is none.
+
+    Returns:
+        None unless all along the line something that controls move grows by far over the time it has: where the end is
+        stable, or what is between, the nominal goes there by itself.
     """
+    found = None
+    for k in np.unique(np.linspace(0, line.shape[0] - 1, PLACES).astype(int)):
+        found = _growing(run, (line[k], u, e, run.duration * run.mesh.nodes[k], run.duration, run.parameters))
+        if found is None:
+            return None
+    assert found is not None
+    growth, across = found
+    weight = (HELD * across * growth) @ across.conj().T
+    fixed = np.diag(np.where(np.isnan(target), 0.0, FINAL))
+    return Aim(goal=np.where(np.isnan(target), line[-1], target), weight=weight.real + fixed)
+
+
+def _growing(run: Run, at: tuple[Any, ...]) -> tuple[Array, Any] | None:
+    """Exponents over the whole time, left eigenvectors (columns) of what grows and controls move; None if by little."""
+    slope = np.asarray(state_jacobian(run.statement)(*at).full())
     if not np.isfinite(slope).all():
         return None
     rates, across = np.linalg.eig((slope * run.divisors / run.divisors[:, None]).T)
     growth = run.duration * rates.real
     if not growth.max(initial=0.0) > EXPLOSIVE:
         return None
-    unstable = across[:, growth > 0.0]
-    weight = (HELD * unstable * growth[growth > 0.0]) @ unstable.conj().T
-    fixed = np.diag(np.where(np.isnan(target), 0.0, FINAL))
-    return Aim(goal=np.where(np.isnan(target), end, target), weight=weight.real + fixed)
+    acting = np.asarray(_by_controls(run.statement)(*at).full()) / run.divisors[:, None]
+    felt = np.abs(across.T @ acting) > UNFELT * np.linalg.norm(acting, axis=0)  # else no control changes what grows
+    chosen = (growth > 0.0) & felt.any(axis=1)
+    return (growth[chosen], across[:, chosen]) if growth[chosen].max(initial=0.0) > EXPLOSIVE else None
+
+
+@lru_cache(maxsize=KEPT)
+def _by_controls(statement: Statement) -> ca.Function:
+    """f_u as a function of the six arguments."""
+    symbols = model_symbols(statement)
+    assert statement.nominal is not None
+    rate = statement.nominal(*symbols[:2], *symbols[3:])[0]
+    return ca.Function("by_controls", symbols, [ca.densify(ca.jacobian(rate, symbols[1]))])
+
+
+def preferred(run: Run, u: Array, e: Array, free: Array) -> Array:
+    """Where the cost prefers some states to be, each by itself, from the start of a run on; where they are otherwise.
+
+    By second differences of the running cost over the whole time and of the terminal one.
+
+    Args:
+        run: its start, scales and parameters.
+        u: control (nu,).
+        e: half-vectors (ne,).
+        free: which states may be elsewhere, (nx,).
+    """
+    st, T, p = run.statement, run.duration, run.parameters
+    rows = np.flatnonzero(free)
+    steps = DIFFERENCE * run.divisors
+    x = np.tile(run.start, (1 + 2 * rows.size, 1))
+    x[1 + 2 * np.arange(rows.size), rows] += steps[rows]
+    x[2 + 2 * np.arange(rows.size), rows] -= steps[rows]
+    running = np.array([float(st.rates(v, u, e, 0.0, T, p)[2]) for v in x])
+    cost = T * running + np.array([float(st.terminal(v, e, T, p)) for v in x])
+    above, below = cost[1::2], cost[2::2]
+    bend, slope = above + below - 2.0 * cost[0], 0.5 * (above - below)
+    seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
+    moved = np.where(seen, -slope / np.where(seen, bend, 1.0), 0.0)
+    goal = run.start.copy()
+    goal[rows] += np.where(np.abs(moved) * DIFFERENCE < FAR, moved, 0.0) * steps[rows]
+    return np.asarray(np.clip(goal, *st.state_bounds))
 
 
 def in_moving_units(run: Run, line: Array, flat: Array) -> Run:
@@ -184,21 +249,30 @@ def _law(run: Run, x: Array, u: Array, wanted: Array, aim: Aim) -> _Law | None:
         F, G, jump = _stage(slopes, k, linear)
         at = k + 1 if linear else k
         R, ahead = np.diag(energy[at]), P @ jump + p
-        try:
-            solved = np.linalg.solve(R + G.T @ P @ G, np.column_stack([G.T @ P @ F, G.T @ ahead + R @ departure[at]]))
-        except np.linalg.LinAlgError:
+        solved = _solved(R + G.T @ P @ G, np.column_stack([G.T @ P @ F, G.T @ ahead + R @ departure[at]]))
+        if solved is None:
             return None
         gains[k], added[k] = -solved[:, :-1], -solved[:, -1]
         moved = F + G @ gains[k]
         p = moved.T @ ahead + gains[k].T @ (R @ departure[at])
         P = moved.T @ P @ moved + gains[k].T @ R @ gains[k]
-        if not np.isfinite(P).all():
-            return None
-    first = np.zeros(nu)
+    first = np.zeros((nu, 1))
     if linear:
         R = np.diag(energy[0])
-        first = -np.linalg.solve(R + P[n:, n:], p[n:] + R @ departure[0])
-    return _Law(first=first, gains=gains, added=added)
+        solved = _solved(R + P[n:, n:], (p[n:] + R @ departure[0])[:, None])
+        if solved is None:
+            return None
+        first = -solved
+    return _Law(first=first[:, 0], gains=gains, added=added)
+
+
+def _solved(matrix: Array, right: Array) -> Array | None:
+    """What solves a linear system; None where it is singular, or not finite."""
+    try:
+        found = np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(found) if np.isfinite(found).all() else None
 
 
 def _linearised(run: Run, x: Array, u: Array) -> _Slopes | None:

@@ -32,12 +32,12 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
-from covocp.transcription.held import Held, aim, excited, in_moving_units
+from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred
 from covocp.transcription.mesh import Mesh, Options, explicit_substeps
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import Run, resampled, steer, track
-from covocp.transcription.stiffness import state_jacobian, stiffness
+from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory
 
 # A bend is halved until its second half moves the states as its first half does, up to this share, or until it moves
@@ -87,6 +87,8 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Traj
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
         yield own.trajectory
+        if own.held:
+            yield own_start(statement, mesh, parameters, hold=False).trajectory
         if free:
             yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
         return
@@ -101,10 +103,10 @@ def _neutral(statement: Statement) -> Statement:
     return replace(statement, guesses={**statement.guesses, **dict.fromkeys(moving)}) if moving else statement
 
 
-def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
+def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool = True) -> First:
     """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated.
 
-    Where the nominal is unstable a feedback holds it.
+    Where the nominal is unstable and would stay so a feedback holds it, unless it is asked to be left to itself.
     """
     duration = statement.duration.guess
     u = controls_guess(statement, mesh.nodes, mesh.control)
@@ -113,7 +115,7 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array) -> First:
     plain = True
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
         flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
-        run = _held(statement, mesh, parameters, start, e0, (flat, u))
+        run = _held(statement, mesh, parameters, start, e0, (flat, u)) if hold else None
         if run is not None:
             return First(trajectory=completed(statement, mesh, parameters, run.u, x=run.x), plain=True, held=True)
         followed = _followed(statement)
@@ -231,11 +233,16 @@ def _held(
     if not all(is_plain(guess) or np.shape(guess) == (block.size,) for block, guess in guesses):
         return None
     run, target = _told_run(statement, mesh, parameters, start), statement.boundary_values(parameters)[1]
-    line = start + mesh.nodes[:, None] * (np.where(np.isnan(target), start, target) - start)
+    if aim(run, start[None, :], flat[0], e0, target) is None:
+        return None
+    free = np.isnan(target)
+    for block in statement.states:
+        free[block.span] &= block.role == "moving" and not block.tangent
+    end = np.where(np.isnan(target), preferred(run, flat[0], e0, free), target)
+    line = start + mesh.nodes[:, None] * (end - start)
     for block, guess in guesses:
         line[:, block.span] = evaluate_guess(block, guess, mesh.nodes)
-    slope = state_jacobian(statement)(start, flat[0], e0, 0.0, run.duration, parameters)
-    aimed = aim(run, np.asarray(slope.full()), line[-1], target)
+    aimed = aim(run, line, flat[0], e0, target)
     if aimed is None:
         return None
     run = in_moving_units(run, line, flat)
