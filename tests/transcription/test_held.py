@@ -153,3 +153,40 @@ def test_what_is_stable_is_left_alone():
     statement = ocp.statement()
     mesh = resolve_mesh(statement, Options(intervals=50), statement.values)
     assert not own_start(statement, mesh, statement.values).held
+
+
+@pytest.mark.parametrize("end", [{"final": [np.pi, 0.0]}, {"final": [2 * np.pi, 0.0]}, {}])
+def test_what_falls_by_itself_is_left_to_fall(end):
+    """To hang is stable, and on the way round as well; without a final value the cost says where it shall be."""
+    ocp = co.Problem(8.0, name="let down")
+    x = ocp.state("x", 2, initial=[0.3, 0.0], **end)
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], 9.81 * ca.sin(x[0]) - 0.1 * x[1] + u))
+    ocp.minimize(running=u**2, terminal=0.0 if end else 10 * ((x[0] - np.pi) ** 2 + x[1] ** 2))
+    statement = ocp.statement()
+    mesh = resolve_mesh(statement, Options(intervals=100), statement.values)
+    assert not own_start(statement, mesh, statement.values).held
+    solution = co.solve(ocp, progress=False)
+
+    def rate(t, y):
+        torque = np.interp(t, solution.t, solution["u"].ravel())
+        return [y[1], 9.81 * np.sin(y[0]) - 0.1 * y[1] + torque, torque**2]
+
+    y = np.array([0.3, 0.0, 0.0])
+    for begin, stop in zip(solution.t[:-1], solution.t[1:], strict=True):  # the control has corners at the nodes
+        y = solve_ivp(rate, (begin, stop), y, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    held_up = 80.0  # what a start that is held upright leads to
+    assert y[2] < 0.2 * held_up
+    np.testing.assert_allclose(y[:2], solution["x"][-1], atol=5e-3)
+
+
+def test_what_no_control_moves_is_not_held():
+    ocp = co.Problem(10.0, name="beside")
+    x, z = ocp.state("x", initial=1.0, final=0.0), ocp.state("z", initial=1e-6)
+    u = ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.dynamics(z, 1.2 * z)
+    ocp.minimize(running=u**2)
+    statement = ocp.statement()
+    mesh = resolve_mesh(statement, Options(intervals=50), statement.values)
+    assert not own_start(statement, mesh, statement.values).held

@@ -114,14 +114,15 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
     plain = True
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
-        flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
-        run = _held(statement, mesh, parameters, start, e0, (flat, u)) if hold else None
+        run = _held(statement, mesh, tuple(parameters)) if hold else None
         if run is not None:
-            return First(trajectory=completed(statement, mesh, parameters, run.u, x=run.x), plain=True, held=True)
+            kept = completed(statement, mesh, parameters, run.u.copy(), x=run.x.copy())
+            return First(trajectory=kept, plain=True, held=True)
         followed = _followed(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)
         else:
+            flat = controls_guess(statement, mesh.nodes, mesh.control, sign=0.0)
             units = untold_units(statement, mesh, parameters, flat)
             u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
     elif statement.nu and statement.coupled:
@@ -221,17 +222,18 @@ def _told_run(statement: Statement, mesh: Mesh, parameters: Array, start: Array)
     )
 
 
-def _held(
-    statement: Statement, mesh: Mesh, parameters: Array, start: Array, e0: Array, controls: tuple[Array, Array]
-) -> Held | None:
-    """A run that a feedback holds, from flat and bent controls, near what is guessed of the states.
+@lru_cache(maxsize=2)
+def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held | None:
+    """A run that a feedback holds near what is guessed of the states, or from the start to where ends and cost want it.
 
-    None where the nominal is stable, none is found, or the guesses say how the states move.
+    None where the nominal is stable somewhere there, none is found, or the guesses say how the states move.
     """
-    flat, bent = controls
     guesses = [(b, statement.guesses[b.name]) for b in statement.states if statement.guesses[b.name] is not None]
     if not all(is_plain(guess) or np.shape(guess) == (block.size,) for block, guess in guesses):
         return None
+    parameters = np.array(values)
+    flat, bent = (controls_guess(statement, mesh.nodes, mesh.control, sign=sign) for sign in (0.0, 1.0))
+    start, e0 = beside_guesses(statement, mesh, parameters)
     run, target = _told_run(statement, mesh, parameters, start), statement.boundary_values(parameters)[1]
     if aim(run, start[None, :], flat[0], e0, target) is None:
         return None
