@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -81,12 +82,37 @@ def test_small_variances_and_exact_matrices_stay_as_they_are():
         assert np.array_equal(without_rounding(matrix, np.array([1e4, 1.0])), matrix)
 
 
-def test_a_covariance_that_is_declared_may_have_rounding_too():
-    ocp = co.Problem(1.0)
-    x, v = ocp.state("x", initial=0.0), ocp.state("v", initial=0.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, 0.0, noise=1.0)
-    ocp.measurement("m", x, noise=1.0)
-    ocp.estimation_covariance(initial=np.diag([0.5, -1e-17]))
+NEGATIVE = [[[-1e-10, 0.0], [0.0, 1e6]], [[-1e-9, 0.0], [0.0, 1e6]], [[0.5, 0.0], [0.0, -1e-17]]]
+NEGATIVE += [[[-1e-10, 1e-8], [1e-8, 1e6]], [[0.5, 1e-18], [1e-18, -1e-17]]]
+
+
+@pytest.mark.parametrize("matrix", NEGATIVE)
+def test_no_declared_variance_is_negative_however_far_apart_the_units_are(matrix):
+    """In a re-solve from variances of 0.5 and 0.2 as well, unless it is rounding of these."""
+    given, ocp = np.array(matrix), co.Problem(1.0)
+    x = ocp.state("x", 2, initial=0.0)
+    ocp.dynamics(x, ca.MX.zeros(2), noise=np.eye(2))
+    ocp.measurement("m", x[0], noise=1.0)
+    ways = [
+        lambda: ocp.estimation_covariance(initial=given),
+        lambda: ocp.state("y", 2, initial=0.0, variance=given),
+        lambda: ocp.unknown("b", [0.0, 0.0], variance=given),
+        lambda: ocp.symmetric("P", 2, initial=given, lower=0.0),
+    ]
+    if np.diagonal(given).min() < -1e-13:
+        ways.append(lambda: solver((0.5, 0.2)).solve(covariance=given, progress=False))
+    for way in ways:
+        with pytest.raises(co.ProblemError, match=r"not positive semidefinite|outside its bounds"):
+            way()
+
+
+@pytest.mark.parametrize("declared", [0.0, 1e-3])
+def test_a_row_without_variance_may_have_one_rounding_of_the_largest(declared):
+    """n eps = 4.4e-16 of it, and only where that row is declared with none."""
+    two = solver((1e6, declared))
+    if declared == 0.0:
+        given = np.diag([1e6, -4e-10])
+        found = two.solve(covariance=given, progress=False, iteration_limit=0, assess=False)
+        assert np.array_equal(found["E"][0], np.diag([1e6, 0.0]))
     with pytest.raises(co.ProblemError, match="not positive semidefinite"):
-        co.Problem(1.0).symmetric("P", 2, initial=np.diag([0.5, -1e-12]), lower=0.0)
+        two.solve(covariance=np.diag([1e6, -5e-10 if declared == 0.0 else -4e-10]), progress=False)

@@ -280,7 +280,7 @@ def _indefinite(numbers: Array, definite: bool) -> str:
     """What keeps a finite density or variance from being symmetric and positive (semi)definite; "" where nothing."""
     if not numbers.size:
         return ""
-    scaled = over_units(numbers, own_units(numbers, alone=True))  # entries 10^18 apart say nothing of each other
+    scaled = over_units(numbers, own_units(numbers, negative=True))  # entries 10^18 apart say nothing of each other
     if not np.allclose(scaled, scaled.T, rtol=1e-9, atol=1e-12):
         return "is not symmetric"
     values, scalar = np.linalg.eigvalsh(scaled), numbers.size == 1

@@ -125,19 +125,16 @@ def unpack(half: ArrayLike, size: int) -> Array:
     return np.asarray(np.asarray(half, dtype=float)[..., unpack_indices(size)])
 
 
-def own_units(matrices: Array, alone: bool = False) -> Array:
+def own_units(matrices: Array, negative: bool = False) -> Array:
     """Units of the rows of symmetric matrices (..., n, n) in which their diagonals are 1, (..., n).
 
     In these no decision depends on the units that something is stated in. A variance that is not positive has no unit
-    of its own: its row gets that of the largest; where it is `alone`, without an entry beside it, that of its size.
+    of its own: its row gets that of the largest entry; where `negative` ones count as they are, that of their size.
     """
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     sizes = np.abs(diagonal)
     largest = np.abs(matrices).max(axis=(-2, -1), initial=0.0)[..., None]
-    kept = diagonal > 0
-    if alone:
-        kept = kept | ((sizes > 0) & (np.count_nonzero(matrices, axis=-1) <= 1))
-    sizes = np.where(kept, sizes, largest)
+    sizes = np.where((diagonal > 0) | (negative & (sizes > 0)), sizes, largest)
     return np.asarray(np.sqrt(np.where(sizes > 0, sizes, 1.0)))
 
 
@@ -158,12 +155,12 @@ def semidefinite_part(matrix: Array) -> Array:
 def without_rounding(matrix: Array, once: Array | None = None) -> Array:
     """A matrix as the covariance that it is but for rounding; as it is where it is none.
 
-    A filter leaves E - K H E, whose entries are known to rounding of what the variances were before. Where nothing
-    tells how large these were, a variance that is not positive may be the rounding of the largest entry.
+    A filter leaves E - K H E, whose entries are known to rounding of what the variances were before. Of a row that had
+    none, a variance that is not positive may be one rounding of the largest entry for each row.
 
     Args:
         matrix: (n, n).
-        once: variances of the same rows that they may have had before, (n,); 0 where none is known.
+        once: variances that the same rows had before, (n,); None: nothing was before, and none may be negative.
 
     Returns:
         Symmetric and semidefinite where rounding alone keeps it from being so: rows of variances that are not positive
@@ -173,8 +170,8 @@ def without_rounding(matrix: Array, once: Array | None = None) -> Array:
         return matrix
     diagonal, size = np.diagonal(matrix), matrix.shape[0]
     before = np.maximum(diagonal, 0.0 if once is None else once)
-    rubble = RUBBLE * size * np.finfo(float).eps * np.abs(matrix).max(initial=0.0)
-    margins = np.where(before > 0.0, ROUNDINGS * before, rubble)
+    beside = 0.0 if once is None else size * np.finfo(float).eps * np.abs(matrix).max(initial=0.0)
+    margins = np.where(before > 0.0, ROUNDINGS * before, beside)
     deviations = np.sqrt(margins)
     if not (np.abs(matrix - matrix.T) <= deviations[:, None] * deviations).all():
         return matrix

@@ -76,23 +76,39 @@ class Residuals:
         )
 
 
-def onto_bounds(values: Array, lower: Array, upper: Array, sizes: Array) -> Array:
-    """Values, at a bound where they pass it by no more than a solution may that keeps it.
-
-    What a bound may be passed by is a share of it, of the width between both, of the least of them, as where a solution
-    is judged; of a bound that is zero it is a share of the size of the value.
+def onto_bounds(values: Array, lower: Array, upper: Array, margins: Array) -> Array:
+    """Values, at a bound where they pass it by no more than these margins.
 
     Args:
         values: what is bounded.
         lower: bounds, -inf where there is none.
         upper: bounds, inf where there is none.
-        sizes: of the values, 0 where nothing tells: 1.
+        margins: of the lower and of the upper bounds, (2, size).
     """
-    limits = np.abs(np.array([lower, upper]))
-    margins = np.where(np.isfinite(limits) & (limits > 0), limits, np.where(sizes > 0, sizes, 1.0))
-    margins = BETWEEN_NODES * np.minimum(margins, np.where(upper > lower, upper - lower, np.inf))
     held = np.clip(values, lower, upper)
     return np.where((values >= lower - margins[0]) & (values <= upper + margins[1]), held, values)
+
+
+def passing(lower: Array, upper: Array, told: Array, otherwise: Array) -> Array:
+    """By how much values may pass their bounds where a solution that keeps them does: a share of their size.
+
+    That size is the smallest of what tells it: what is told, the width between both bounds, the bound that is passed.
+    The bound may be far larger than all that ever changes: a distance from the centre of the Earth, a date.
+
+    Args:
+        lower: bounds, -inf where there is none.
+        upper: bounds, inf where there is none.
+        told: sizes, a row each, for lower and for upper bounds, (2, rows, size); 0: tells nothing.
+        otherwise: sizes where all these tell nothing, (size,); 0: 1.
+
+    Returns:
+        Margins of the lower and of the upper bounds, (2, size).
+    """
+    limits = np.abs(np.array([lower, upper]))
+    width = np.broadcast_to(upper - lower, limits.shape)
+    sizes = np.concatenate([told, limits[:, None], width[:, None]], axis=1)
+    smallest = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.inf).min(axis=1)
+    return BETWEEN_NODES * np.where(np.isfinite(smallest), smallest, np.where(otherwise > 0, otherwise, 1.0))
 
 
 def complementary(multipliers: Array, values: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -12,13 +12,9 @@ from covocp.base.checks import check_inside, column, data_column, is_symbolic
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Given
 from covocp.base.matrices import Array
-from covocp.base.residuals import onto_bounds
-
-# Size of a value that no scale tells: at a bound of zero it may be beyond by rounding alone.
-UNTOLD = 1e-7
 
 
-def end_value(name: str, what: str, value: Given, lower: Array, upper: Array, scale: Array | None = None) -> Any:
+def end_value(name: str, what: str, value: Given, lower: Array, upper: Array) -> Any:
     """An initial or final value of a vector as a column; what is free is NaN in it.
 
     Args:
@@ -26,8 +22,7 @@ def end_value(name: str, what: str, value: Given, lower: Array, upper: Array, sc
         what: "initial" or "final".
         value: a number, a sequence with None where a component is free, an expression of parameters; None: free.
         lower: bounds, shape (size,), that numbers must keep.
-        upper: likewise. An initial value that passes them no further than a plan may is at the bound.
-        scale: of the state, where one was given.
+        upper: likewise. Numbers that pass them by rounding are at the bound.
 
     Raises:
         ProblemError: NaN or inf, a size that does not fit, a value outside the bounds.
@@ -37,11 +32,8 @@ def end_value(name: str, what: str, value: Given, lower: Array, upper: Array, sc
         return ca.MX(ca.DM.nan(lower.size, 1))
     if not is_symbolic(value):
         numbers = column(name, f"{what} value", value, lower.size, nan=True)
-        if what == "initial":
-            value = numbers = onto_bounds(
-                numbers, lower, upper, np.full(lower.size, UNTOLD if scale is None else scale)
-            )
         check_inside(name, what, numbers, lower, upper)
+        value = np.clip(numbers, lower, upper)
     return data_column(name, f"{what} value", value, lower.size, nan=True)
 
 

@@ -13,7 +13,7 @@ from covocp.base.checks import as_number, check_density, check_symmetric_numbers
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr, Given
 from covocp.base.matrices import Array, pack, standard_deviations, unpack, without_rounding
-from covocp.base.residuals import onto_bounds
+from covocp.base.residuals import onto_bounds, passing
 from covocp.base.short_repr import short_repr
 from covocp.problem.attitude import as_quaternion
 from covocp.problem.checks import find_name
@@ -34,7 +34,7 @@ class Start:
         value: as declared, of the parameter.
         known: which entries of a state are no free ones; of a matrix all.
         lower, upper: bounds of these entries.
-        sizes: of these entries of a state, as far as its declaration tells; 0 where it does not.
+        margins: by which these entries of a state may pass their bounds and be at them, (2, entries).
     """
 
     of: State | Matrix
@@ -44,7 +44,7 @@ class Start:
     known: tuple[int, ...]
     lower: Array
     upper: Array
-    sizes: Array
+    margins: Array
 
     __repr__ = short_repr
 
@@ -97,7 +97,7 @@ def restartable(declarations: Declarations, statement: Statement) -> Restartable
                     known=tuple(range(half.size)),
                     lower=-limits,
                     upper=limits,
-                    sizes=np.zeros(half.size),
+                    margins=np.zeros((2, half.size)),
                 )
             )
             declarations = declarations.adding(parameters=own)
@@ -125,20 +125,32 @@ def _with_start(
             known=tuple(known),
             lower=state.lower[known],
             upper=state.upper[known],
-            sizes=_sizes(state, start, end)[known],
+            margins=_margins(state, start, end, known),
         )
     )
     return _started(declarations.adding(parameters=own), "states", position, ca.vertcat(*rows))
 
 
-def _sizes(state: State, start: Array, end: Array) -> Array:
-    """The scale of a state, or the largest of its initial and final values and its standard deviations; 0: untold."""
-    if state.scale is not None:
-        return np.abs(np.broadcast_to(state.scale, start.shape))
-    sizes = np.maximum(np.abs(np.nan_to_num(start)), np.abs(np.nan_to_num(end)))
-    if state.chart is not None or not state.variance.is_constant():
-        return sizes
-    return np.maximum(sizes, standard_deviations(np.asarray(ca.evalf(state.variance).full())))
+def _margins(state: State, start: Array, end: Array, known: list[int]) -> Array:
+    """By how much entries of a state may pass their bounds as a plan along one does, (2, entries).
+
+    What is declared tells the size of what moves: the scale, how far from their bound the initial and final values are.
+    Where that is nothing, and the bound zero, it is the size of these values and of their standard deviations.
+
+    Args:
+        state: its declaration.
+        start: initial values, NaN where they are free.
+        end: final values, likewise.
+        known: the entries.
+    """
+    ends = np.abs(np.nan_to_num([start[known], end[known]])).max(axis=0)
+    if state.chart is None and state.variance.is_constant():
+        ends = np.maximum(ends, standard_deviations(np.asarray(ca.evalf(state.variance).full()))[known])
+    scale = np.zeros(start.size) if state.scale is None else np.abs(np.broadcast_to(state.scale, start.shape))
+    bounds = np.array([state.lower[known], state.upper[known]])
+    away = np.nan_to_num(np.abs([start[known] - bounds, end[known] - bounds]), posinf=0.0).max(axis=0)
+    told = np.stack([np.broadcast_to(scale[known], bounds.shape), away], axis=1)
+    return passing(bounds[0], bounds[1], told, ends)
 
 
 def _parameter(declarations: Declarations, entry: State | Matrix, value: Array) -> Parameter:
@@ -250,7 +262,7 @@ def _state_value(start: Start, value: Given) -> Array:
         raise _wrong(name, f"finite numbers in the entries {known}", str(numbers))
     if len(known) < size and not np.isnan(np.delete(numbers, known)).all():
         raise _wrong(name, f"NaN in the entries that are free: all but {known}", str(numbers))
-    found = onto_bounds(numbers[known], start.lower, start.upper, start.sizes)
+    found = onto_bounds(numbers[known], start.lower, start.upper, start.margins)
     if not ((found >= start.lower) & (found <= start.upper)).all():
         low, high, own = (_in_digits(values) for values in (start.lower, start.upper, numbers[known]))
         raise _wrong(name, f"numbers within the bounds {low} to {high} of the state", own)

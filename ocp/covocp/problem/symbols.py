@@ -39,15 +39,14 @@ def vector_state(
     """
     name, size = own["name"], own["size"]
     low, high = bound_columns(name, *bounds, size)
-    scale = scale_column(name, scale, size)
     return State(
         **own,
-        initial=end_value(name, "initial", ends[0], low, high, scale),
+        initial=end_value(name, "initial", ends[0], low, high),
         final=end_value(name, "final", ends[1], low, high),
         lower=low,
         upper=high,
         guess=guess,
-        scale=scale,
+        scale=scale_column(name, scale, size),
         variance=density_matrix(name, "variance", 0.0 if variance is None else variance, size),
     )
 
