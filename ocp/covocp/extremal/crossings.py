@@ -19,7 +19,6 @@ from covocp.extremal.dense_output import between_nodes, dense_output, mapped
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.path_limits import columns_between, places_along
 from covocp.extremal.polynomials import Dense
-from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import INPUTS, Statement
 from covocp.transcription.covariance_steps import KEPT
@@ -244,7 +243,7 @@ def _forbidden(statement: Statement, first: Array, last: Array, slope: Array) ->
     if not st.path.size:
         return False
     sizes = (st.nx, st.nu, st.ne, 1, 1, st.np)
-    both = [_path_values(st.path)(*np.split(side, np.cumsum(sizes)[:-1])) for side in (first, last)]
+    both = [_path_values(st.path.function)(*np.split(side, np.cumsum(sizes)[:-1])) for side in (first, last)]
     one, other = (np.asarray(value.full()).ravel() for value, _ in both)
     normals = np.asarray(both[0][1].full())
     along, size = normals @ slope, (normals**2).sum(axis=1)
@@ -262,10 +261,10 @@ def _beyond(first: Array, last: Array, step: Array, lower: Array, upper: Array) 
 
 
 @lru_cache(maxsize=KEPT)
-def _path_values(conditions: Conditions) -> ca.Function:
+def _path_values(function: ca.Function) -> ca.Function:
     """Conditions along the path, and their slopes by state, control and matrices."""
-    symbols = conditions.function.mx_in()
-    value = conditions.function(*symbols)
+    symbols: Any = function.mx_in()
+    value: Any = function(*symbols)
     slopes = ca.horzcat(*(ca.jacobian(value, symbols[i]) for i in MOVING))
     return ca.Function("limits", symbols, [ca.densify(value), ca.densify(slopes)])
 
