@@ -279,3 +279,77 @@ def test_a_smooth_transition_comes_near(width, within):
     assert said == []
     assert solution.cost == pytest.approx(1.125, rel=within)
     assert solution.optimality.curvature > 0
+
+
+def bang_bang():
+    ocp = co.Problem(4.0, name="bang")
+    x, v = ocp.state("x", initial=0.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u", lower=-1, upper=1)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=ca.if_else(u > 0, 0.1, 0.0) + 1e-3 * u**2, terminal=-x)
+    return ocp
+
+
+def test_a_control_that_jumps_over_a_border_is_no_crossing():
+    """Half the time at each bound: -4 + 0.1 2 + 1e-3 4."""
+    solution, said = told(bang_bang, intervals=50)
+    assert not any(JUMPS in text for text in said)
+    assert solution.cost == pytest.approx(-3.796, abs=1e-3)
+
+
+def test_a_control_that_passes_a_border_smoothly_is_told():
+    ocp = co.Problem(4.0, name="slow")
+    x, v = ocp.state("x", initial=-1.0, final=1.0), ocp.state("v", initial=0.0, final=0.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    ocp.minimize(running=u**2 + ca.if_else(u > 0, 0.1, 0.0))
+    assert any("crosses the border of 'u > 0'" in text for text in told(ocp, intervals=50)[1])
+
+
+def limited_speed(fine, *, bound):
+    """The way of 3 in 4 s with a speed of at most 1 takes (16/9) of int u^2: v = 1 in the middle of 1.5, 1, 1.5 s."""
+    ocp = co.Problem(4.0, name="limited")
+    x = ocp.state("x", initial=0.0, final=3.0)
+    v = ocp.state("v", initial=0.0, final=0.0, **({"upper": 1.0} if bound else {}))
+    u = ocp.control("u", lower=-2, upper=2)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u)
+    if not bound:
+        ocp.subject_to(v, upper=1.0)
+    ocp.minimize(running=u**2 + ca.if_else(v > fine, 10.0, 0.0))
+    return ocp
+
+
+@pytest.mark.parametrize("bound", [True, False])
+def test_a_side_that_is_forbidden_is_not_reached(bound):
+    solution, said = told(limited_speed(1.0, bound=bound), intervals=50)
+    assert not any(JUMPS in text for text in said)
+    assert solution.cost == pytest.approx(16 / 9, rel=1e-4)
+    assert solution.optimality.curvature > 0
+
+
+@pytest.mark.parametrize("bound", [True, False])
+def test_a_border_inside_a_limit_is_told(bound):
+    assert any(JUMPS in text for text in told(limited_speed(0.9, bound=bound), intervals=50)[1])
+
+
+@pytest.mark.parametrize("order", [5, 6])
+def test_a_given_start_on_the_border_may_be_left_slowly(order):
+    ocp = co.Problem(4.0, name="chain")
+    x = ocp.state("x", order, initial=[0.0] * order, final=[1.0, *[0.0] * (order - 1)])
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1:], ca.if_else(x[0] > 0, 1.0, 1.2) * u))
+    ocp.minimize(running=u**2)
+    assert not any(JUMPS in text for text in told(ocp, intervals=50)[1])
+
+
+def test_branch_cuts_of_angles_are_told():
+    def angle(x):
+        return ca.atan2(ca.sin(x), ca.cos(x))
+
+    _, said = told(lambda: moved(lambda x, u: u + 0.3 * angle(x), initial=2.0, final=4.0), intervals=50)
+    assert any("the border of 'atan2(sin(x), cos(x))'" in text for text in said)
+    _, said = told(lambda: moved(lambda x, u: u + 0.3 * ca.sin(angle(x)), initial=2.0, final=4.0), intervals=50)
+    assert not any(JUMPS in text for text in said)

@@ -19,12 +19,12 @@ WHOLE = ("OP_FLOOR", "OP_CEIL", "OP_FMOD", "OP_REMAINDER")
 # What a choice is made by: where its pieces end is known from these.
 LOGICAL = ("OP_LT", "OP_LE", "OP_EQ", "OP_NE", "OP_AND", "OP_OR", "OP_NOT")
 # Operations by which a value may jump where a piece ends; what it is at a single point (==) is no piece.
-JUMPING = ("OP_LT", "OP_LE", "OP_SIGN", "OP_IF_ELSE_ZERO", "OP_COPYSIGN", *WHOLE)
+JUMPING = ("OP_LT", "OP_LE", "OP_SIGN", "OP_IF_ELSE_ZERO", "OP_COPYSIGN", "OP_ATAN2", *WHOLE)
 # How what is compared is written; with its operands.
 WRITTEN = {
     "OP_LT": "{} < {}", "OP_LE": "{} <= {}", "OP_SIGN": "sign({})", "OP_FLOOR": "floor({})", "OP_CEIL": "ceil({})",
     "OP_FMOD": "fmod({}, {})", "OP_REMAINDER": "remainder({}, {})", "OP_COPYSIGN": "copysign({}, {})",
-    "OP_IF_ELSE_ZERO": "if_else({}, ...)",
+    "OP_IF_ELSE_ZERO": "if_else({}, ...)", "OP_ATAN2": "atan2({}, {})",
 }  # fmt: skip
 # Letters from which on what is compared is not written out.
 LONG = 60
@@ -107,7 +107,7 @@ def borders_of(function: ca.Function, moving: Sequence[int]) -> Borders | None:
         moving: numbers of these arguments.
     """
     found, seen = [], set()
-    for name, node in _pieces(function):
+    for name, node in _pieces(function, "OP_ATAN2"):  # which jumps where its first operand is zero, the second below
         chosen = name == "OP_IF_ELSE_ZERO" and any(node.dep(0).is_op(code) for code in _codes(LOGICAL))
         if name in JUMPING and not chosen and node.element_hash() not in seen:
             seen.add(node.element_hash())
@@ -183,11 +183,11 @@ def _end(name: str, node: Any) -> Any:
     return node.dep(1 if name == "OP_COPYSIGN" else 0)
 
 
-def _pieces(function: ca.Function) -> list[tuple[str, Any]]:
-    """The operations that have pieces, by name; none where the function does not consist of scalar operations."""
+def _pieces(function: ca.Function, *others: str) -> list[tuple[str, Any]]:
+    """The operations that have pieces, and some others, by name; none where not all are scalar operations."""
     if not function.is_a("SXFunction"):
         return []
-    names = _codes((*TWO_SIDED, *ONE_SIDED))
+    names = _codes((*TWO_SIDED, *ONE_SIDED, *others))
     found = [(k, names.get(function.instruction_id(k), "")) for k in range(function.n_instructions())]
     found = [(k, name) for k, name in found if name]
     expressions: Any = function.instructions_sx() if found else []

@@ -378,7 +378,8 @@ def _decisions(extremal: Extremal, costates: Costates, within: Within | None) ->
 
 
 def _curvature(extremal: Extremal, seconds: float) -> float | None:
-    if met_jumps(extremal):  # whose moments no derivative sees
+    """Of a solution that is optimised, and no part of a chain."""
+    if met_jumps(extremal, False, True):  # whose moments no derivative sees
         return np.nan
     result = smallest_curvature(extremal, seconds)
     if result is None or result.verdict == "flat":

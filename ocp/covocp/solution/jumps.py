@@ -22,13 +22,18 @@ def mention_jumps(solution: Solution) -> tuple[Jump, ...]:
 
     A running cost that jumps with what scatters was warned of when the problem was made ready.
     """
-    if solution.statement is None or solution.origin not in (Origin.OPTIMISED, Origin.CLASSICAL):
-        return ()
-    found = met_jumps(solution.extremal, linked=solution.within is not None, optimised=solution.optimised)
+    found = jumps_of(solution)
     untold = [jump for jump in found if jump.what or not _scatters(solution, jump)]
     if untold:
         warn_user(_words(solution, untold))
     return found
+
+
+def jumps_of(solution: Solution) -> tuple[Jump, ...]:
+    """Jumps of the model that a solution meets which some method found."""
+    if solution.statement is None or solution.origin not in (Origin.OPTIMISED, Origin.CLASSICAL):
+        return ()
+    return met_jumps(solution.extremal, solution.within is not None, solution.optimised)
 
 
 def coarse_elsewhere(solution: Solution, jumps: tuple[Jump, ...]) -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.pages import Section, Sentence, Table
-from covocp.extremal.jumps import met_jumps
 from covocp.extremal.path_limits import acting
+from covocp.solution.jumps import jumps_of
 from covocp.solution.origin import Origin
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
 
 def _unknown_curvature(solution: Solution) -> str:
     """Why it is not known whether a solution is a minimum."""
-    if solution.statement is not None and met_jumps(solution.extremal):
+    if jumps_of(solution):
         return "NOT KNOWN: the model jumps with the state, and slopes do not see when; see the warning"
     return "NOT KNOWN: it would take longer than the solution, solve again with fewer intervals"
 
