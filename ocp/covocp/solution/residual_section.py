@@ -115,7 +115,7 @@ def _verdict(solution: Solution, name: str, value: float) -> str:
 def _unknown_curvature(solution: Solution) -> str:
     """Why it is not known whether a solution is a minimum."""
     if jumps_of(solution):
-        return "NOT KNOWN: the model jumps with the state, and slopes do not see when; see the warning"
+        return "NOT KNOWN: the model jumps with the state, and slopes do not see when"
     return "NOT KNOWN: it would take longer than the solution, solve again with fewer intervals"
 
 
