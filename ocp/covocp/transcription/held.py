@@ -102,7 +102,7 @@ def aim(run: Run, line: Array, u: Array, e: Array, target: Array) -> Aim | None:
         stable, or what is between, the nominal goes there by itself.
     """
     found = None
-    for k in np.unique(np.linspace(0, line.shape[0] - 1, PLACES).astype(int)):
+    for k in sorted({round(place) for place in np.linspace(0, line.shape[0] - 1, PLACES)}):
         found = _growing(run, (line[k], u, e, run.duration * run.mesh.nodes[k], run.duration, run.parameters))
         if found is None:
             return None
