@@ -353,3 +353,13 @@ def test_branch_cuts_of_angles_are_told():
     assert any("the border of 'atan2(sin(x), cos(x))'" in text for text in said)
     _, said = told(lambda: moved(lambda x, u: u + 0.3 * ca.sin(angle(x)), initial=2.0, final=4.0), intervals=50)
     assert not any(JUMPS in text for text in said)
+
+
+def test_a_border_that_moves_with_the_time_is_no_bound():
+    """x <= 1 and a fine while x > t: the path lies on both at t = 1 and crosses one of them."""
+    ocp = co.Problem(2.0, name="stick")
+    x, u = ocp.state("x", initial=0.0, upper=1.0), ocp.control("u", lower=-5, upper=5)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=0.01 * u**2 - 0.1 * x + 0.5 * ca.if_else(x > ocp.time, 1.0, 0.0))
+    with pytest.warns(co.CovocpWarning, match="jumps with the state"):
+        co.solve(ocp, "ipopt", progress=False)

@@ -167,3 +167,16 @@ def test_a_free_start_is_beside_its_guess_in_the_units_of_the_problem(unit: floa
     solution = co.solve(ocp, "ipopt", progress=False)
     assert solution.cost == pytest.approx(swing_by_its_conditions(), rel=1e-5)
     assert solution.stats["iterations"] <= 10
+
+
+@pytest.mark.parametrize("guess", [0.9, 0.995])
+def test_a_decision_whose_cost_has_no_value_beside_its_guess_stays_there(guess: float) -> None:
+    """Of a terminal cost as of a running one; the best is where 1 - e^2 is a quarter, for whatever the rest costs."""
+    ocp = co.Problem(2.0, name="orbit")
+    e = ocp.decision("e", guess=guess)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2, terminal=10.0 * (ca.sqrt(1.0 - e**2) - 0.5) ** 2)
+    solution = co.solve(ocp, "ipopt", progress=False)
+    assert solution.cost == pytest.approx(0.5, rel=1e-6)
+    assert abs(float(solution["e"])) == pytest.approx(np.sqrt(0.75), rel=1e-4)

@@ -192,3 +192,37 @@ def test_what_no_control_moves_is_not_held():
     statement = ocp.statement()
     mesh = resolve_mesh(statement, Options(intervals=50), statement.values)
     assert not own_start(statement, mesh, statement.values).held
+
+
+def falling(**end):
+    """A damped pendulum from 0.5 rad off its upper rest, its ends free."""
+    ocp = co.Problem(6.0, name="falling")
+    x = ocp.state("x", 2, initial=[0.5, 0.0])
+    u = ocp.control("u")
+    ocp.dynamics(x, ca.vertcat(x[1], 4.0 * ca.sin(x[0]) - 0.1 * x[1] + u))
+    ocp.minimize(running=u**2 + end.get("share", 0.0) * x[0] ** 2)
+    return ocp
+
+
+@pytest.mark.filterwarnings("ignore:What the steps are off grows")
+def test_what_nothing_wants_anywhere_falls():
+    """Nothing but the control costs: none is the best. Held up, it had been called solved at 3.9."""
+    assert co.solve(falling(), progress=False).cost < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:What the steps are off grows")
+def test_a_faint_wish_is_not_worth_holding():
+    """At most what it costs with no control at all, by scipy."""
+    left = solve_ivp(
+        lambda t, y: [y[1], 4.0 * np.sin(y[0]) - 0.1 * y[1], 1e-6 * y[0] ** 2], (0, 6), [0.5, 0, 0], rtol=1e-10
+    )
+    assert co.solve(falling(share=1e-6), progress=False).cost < 1.01 * left.y[2, -1]
+
+
+def test_a_cost_that_falls_on_and_on_prefers_no_place():
+    """1/x: one step of Newton is no place where it wants to be; with no control it costs 1/3 (1 - e^-18)."""
+    ocp = co.Problem(6.0, name="away")
+    x, u = ocp.state("x", initial=1.0), ocp.control("u")
+    ocp.dynamics(x, 3.0 * x + u)
+    ocp.minimize(running=u**2 + 1.0 / x)
+    assert co.solve(ocp, progress=False).cost < 1.0 / 3.0

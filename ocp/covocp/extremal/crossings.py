@@ -25,7 +25,7 @@ from covocp.transcription.covariance_steps import KEPT
 
 # Numbers of the arguments that move with what is chosen.
 MOVING = tuple(INPUTS.index(name) for name in ("state", "control", "matrices"))
-CONTROL, TIME, PARAMETERS = (INPUTS.index(name) for name in ("control", "time", "parameters"))
+CONTROL, TIME, DURATION, PARAMETERS = (INPUTS.index(n) for n in ("control", "time", "duration", "parameters"))
 # Equal parts of an interval at whose ends it is looked at.
 PARTS = 10
 # Share of the largest value of what is compared below which it is on the border, and by which it is moved to its sides
@@ -155,7 +155,7 @@ def crossings(path: Path, borders: Borders, linked: bool) -> Iterator[Met]:
     (k, s), values = runs.points, runs.values
     for row, i, crossed in runs.reached:
         found = _moved(path, borders, (row, int(k[i]), float(s[i])), BESIDE * runs.sizes[row])
-        if found is not None and not _forbidden(path.extremal.statement, *found):
+        if found is not None and not _forbidden(path.extremal.statement, borders, row, found):
             yield Met(row, int(k[i]), float(s[i]), crossed, found[:2])
     if not runs.within:
         return
@@ -163,7 +163,7 @@ def crossings(path: Path, borders: Borders, linked: bool) -> Iterator[Met]:
     gaps = k[points], s[points], s[points + 1]
     for met in _bracketed(path, borders, rows, gaps, (values[rows, points], values[rows, points + 1])):
         found = _moved(path, borders, met[:3], BESIDE * runs.sizes[met.border])
-        if found is None or not _forbidden(path.extremal.statement, *found):
+        if found is None or not _forbidden(path.extremal.statement, borders, met.border, found):
             yield met
 
 
@@ -231,9 +231,16 @@ def _moved(
     return _beside(borders, row, at, distance)
 
 
-def _forbidden(statement: Statement, first: Array, last: Array, slope: Array) -> bool:
-    """Whether one side of a border is beyond a bound, or a condition along the path, whose limit is the border."""
-    st, moving = statement, slope.size
+def _forbidden(statement: Statement, borders: Borders, row: int, found: tuple[Array, Array, Array]) -> bool:
+    """Whether one side of a border is beyond a bound, or a condition along the path, whose limit is the border.
+
+    A border that moves with the time is none of them.
+    """
+    times = (TIME, DURATION) if statement.duration.free else (TIME,)
+    if any(columns_of(borders, row, i) for i in times):
+        return False
+    (first, last, slope), st = found, statement
+    moving = slope.size
     step = (last - first)[:moving]
     lower = np.concatenate([st.state_bounds[0], st.control_bounds[0], st.matrix_lower])
     upper = np.concatenate([st.state_bounds[1], st.control_bounds[1], np.full(st.ne, np.inf)])

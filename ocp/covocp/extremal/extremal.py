@@ -153,6 +153,7 @@ class Guess:
         warm: whether it comes from a solution.
         tentative: whether there are others: a method that loses its way should stop.
         scales: units of a program that is made for it; None: chosen by the trajectory.
+        held: whether a feedback holds an unstable nominal along it, which need not be the way.
     """
 
     trajectory: Trajectory
@@ -161,5 +162,6 @@ class Guess:
     warm: bool = False
     tentative: bool = False
     scales: Scales | None = None
+    held: bool = False
 
     __repr__ = short_repr

@@ -29,7 +29,8 @@ def from_starts(
     """Solve from the first start from which the method finds its way.
 
     A method that loses its way (`wandered` among its counts) is stopped while other starts are left. Where it does from
-    all of them, the first run counts: it is made again, and not stopped, where it was stopped.
+    all of them, the first run counts: it is made again, and not stopped, where it was stopped. Where a run fails from a
+    start that a feedback holds, there is another one that is left to itself.
 
     Returns:
         The outcome, and the start from which it came.
@@ -46,12 +47,14 @@ def from_starts(
             refused.append(error)
             continue
         tried.append((outcome, guess))
-        if outcome.converged or not outcome.stats.get("wandered") or reporter.stop:
+        if outcome.converged or not (outcome.stats.get("wandered") or guess.held) or reporter.stop:
             break
     if not tried:
         raise refused[0]
     outcome, guess = tried[-1]
-    if not outcome.converged and outcome.stats.get("wandered") and not reporter.stop:
+    if not outcome.converged and tried[0][1].held and not tried[0][0].stats.get("wandered"):
+        outcome, guess = tried[0]
+    elif not outcome.converged and outcome.stats.get("wandered") and not reporter.stop:
         guess = tried[0][1]
         outcome = prepared.solve(values, guess, reporter)
     if len(tried) > 1:

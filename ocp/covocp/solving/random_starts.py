@@ -56,7 +56,7 @@ def random_guesses(statement: Statement, mesh: Mesh, parameters: Array, count: i
     except ProblemError as error:  # the others may lie within the domain of the model
         own = error
     else:
-        yield Guess(trajectory=first)
+        yield Guess(trajectory=first.trajectory)
     made = 0
     for k in range(count):
         guess = drawn_guess(statement, mesh, parameters, count, seed, k)

@@ -59,8 +59,8 @@ def make_guesses(
     elif isinstance(guess, Solution):
         yield _from_solution(statement, mesh, parameters, guess, linked)
     elif guess is None or isinstance(guess, Mapping):
-        for trajectory in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
-            yield Guess(trajectory=trajectory)
+        for first in ranked(_with_guesses(statement, guess or {}), mesh, parameters):
+            yield Guess(trajectory=first.trajectory, held=first.held)
     else:
         raise ProblemError(
             "The guess is of an unknown kind.",

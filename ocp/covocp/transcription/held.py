@@ -22,13 +22,14 @@ import numpy as np
 from covocp.base.buffered import Buffered, Matrices
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.statement.interval import Interval, model_symbols
+from covocp.statement.interval import Interval, model_symbols, repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.covariance_steps import KEPT, StepKind
 from covocp.transcription.shooting import interval_columns
 from covocp.transcription.steering import Run
 from covocp.transcription.steps import nominal_interval
 from covocp.transcription.stiffness import state_jacobian
+from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Runs under feedback, each with that of the nominal linearised along the last one.
 RUNS = 4
@@ -42,6 +43,10 @@ EXPLOSIVE = 6.9
 # Step of second differences in scales of the states; share of a cost below which they are roundoff; scales by which a
 # state is moved at most.
 DIFFERENCE, CURVED, FAR = 0.1, 1e-9, 1e3
+# Shares of the time at which it is asked what the running cost prefers; share of a slope that is none.
+SHARES, SETTLED = (1.0 / 6.0, 0.5, 5.0 / 6.0), 0.3
+# A run that is held is too dear from so many times the cost of one that by itself goes where it shall, but for a miss.
+DEAR, MISSED = 3.0, 0.3
 # Places along a line at which it is asked what grows.
 PLACES = 10
 # Share of what a control moves below which it does not act on a mode.
@@ -137,32 +142,83 @@ def _by_controls(statement: Statement) -> ca.Function:
     return ca.Function("by_controls", symbols, [ca.densify(ca.jacobian(rate, symbols[1]))])
 
 
-def preferred(run: Run, u: Array, e: Array, free: Array) -> Array:
+def preferred(run: Run, u: Array, e: Array, free: Array) -> Array | None:
     """Where the cost prefers some states to be, each by itself, from the start of a run on; where they are otherwise.
 
-    By second differences of the running cost over the whole time and of the terminal one.
+    By second differences of the running cost at some times, in the mean over all of the time, and of the terminal one;
+    the slope must be about nothing there: a cost that falls on and on prefers no place.
 
     Args:
         run: its start, scales and parameters.
         u: control (nu,).
         e: half-vectors (ne,).
         free: which states may be elsewhere, (nx,).
+
+    Returns:
+        None where the cost prefers no place at all.
     """
-    st, T, p = run.statement, run.duration, run.parameters
     rows = np.flatnonzero(free)
-    steps = DIFFERENCE * run.divisors
-    x = np.tile(run.start, (1 + 2 * rows.size, 1))
-    x[1 + 2 * np.arange(rows.size), rows] += steps[rows]
-    x[2 + 2 * np.arange(rows.size), rows] -= steps[rows]
-    running = np.array([float(st.rates(v, u, e, 0.0, T, p)[2]) for v in x])
-    cost = T * running + np.array([float(st.terminal(v, e, T, p)) for v in x])
-    above, below = cost[1::2], cost[2::2]
-    bend, slope = above + below - 2.0 * cost[0], 0.5 * (above - below)
-    seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
-    moved = np.where(seen, -slope / np.where(seen, bend, 1.0), 0.0)
+    cost, bend, slope = _differences(run, run.start, rows, u, e)
+    with np.errstate(all="ignore"):
+        seen = np.isfinite(bend) & np.isfinite(slope) & (bend > CURVED * np.abs(cost).max(initial=0.0))
+        moved = np.where(seen, -slope / np.where(seen, bend, 1.0), 0.0)
+    seen &= np.abs(moved) * DIFFERENCE < FAR
     goal = run.start.copy()
-    goal[rows] += np.where(np.abs(moved) * DIFFERENCE < FAR, moved, 0.0) * steps[rows]
-    return np.asarray(np.clip(goal, *st.state_bounds))
+    goal[rows] += np.where(seen, moved, 0.0) * DIFFERENCE * run.divisors[rows]
+    goal = np.clip(goal, *run.statement.state_bounds)
+    after = _differences(run, goal, rows, u, e)[2]
+    with np.errstate(all="ignore"):
+        seen &= np.abs(after) <= np.maximum(SETTLED * np.abs(slope), DIFFERENCE * bend)
+    if not seen.any():
+        return None
+    goal[rows] = np.where(seen, goal[rows], run.start[rows])
+    return goal
+
+
+def _differences(run: Run, x: Array, rows: Any, u: Array, e: Array) -> tuple[Array, Array, Array]:
+    """Costs about a point, second and first differences by some states, by shares of their scales; NaN if they fail."""
+    st, T, p = run.statement, run.duration, run.parameters
+    steps, each = DIFFERENCE * run.divisors, np.arange(rows.size)
+    points = np.tile(x, (1 + 2 * rows.size, 1))
+    points[1 + 2 * each, rows] += steps[rows]
+    points[2 + 2 * each, rows] -= steps[rows]
+    cost = np.full(points.shape[0], np.nan)
+    try:
+        for k, point in enumerate(points):
+            running = [float(st.rates(point, u, e, share * T, T, p)[2]) for share in SHARES]
+            cost[k] = T * np.mean(running) + float(st.terminal(point, e, T, p))
+    except RuntimeError:  # CasADi's, or one of a function that the user gave
+        pass
+    above, below = cost[1::2], cost[2::2]
+    with np.errstate(all="ignore"):
+        return cost, above + below - 2.0 * cost[0], 0.5 * (above - below)
+
+
+def too_dear(run: Run, held: Trajectory, left: Trajectory) -> bool:
+    """Whether a run that is held costs far more than one that is left to itself and goes where it shall, too.
+
+    What covariances cost is left out: of both they are about the same.
+    """
+    final = run.statement.boundary_values(run.parameters)[1]
+    with np.errstate(all="ignore"):
+        missed = np.nan_to_num(np.abs(left.x[-1] - final)) / run.divisors
+        apart = np.abs(run.states(left.u)[-1] - left.x[-1]) / np.maximum(run.divisors, np.abs(left.x).max(axis=0))
+        if not max(missed.max(initial=0.0), apart.max(initial=0.0)) < MISSED:
+            return False
+        costs = [_rough_cost(run, start) for start in (held, left)]
+    return bool(np.isfinite(costs).all() and costs[0] > DEAR * max(costs[1], 0.0) and costs[0] > costs[1])
+
+
+def _rough_cost(run: Run, start: Trajectory) -> float:
+    """The cost of states and controls at the nodes by the trapezoidal rule, with no covariances."""
+    st, T, p, count = run.statement, run.duration, run.parameters, start.x.shape[0]
+    e = np.zeros(st.ne)
+    columns = (start.x.T, at_nodes(start.u, count).T, np.zeros((st.ne, count)), run.mesh.nodes[None, :] * T)
+    try:
+        running = np.asarray(st.rates.map(count)(*columns, *repeated(T, p, count))[2].full()).ravel()
+        return T * float(np.trapezoid(running, run.mesh.nodes)) + float(st.terminal(start.x[-1], e, T, p))
+    except RuntimeError:
+        return float("nan")
 
 
 def in_moving_units(run: Run, line: Array, flat: Array) -> Run:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +33,7 @@ from covocp.transcription.first_guess import (
     simulate_states,
     starts,
 )
-from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred
+from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred, too_dear
 from covocp.transcription.mesh import Mesh, Options, explicit_substeps
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
@@ -77,7 +78,7 @@ class First:
     __repr__ = short_repr
 
 
-def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Trajectory]:
+def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[First]:
     """Starts, the best first; those after the problem's own are made when they are asked for, unless it is not plain.
 
     Raises:
@@ -86,14 +87,14 @@ def ranked(statement: Statement, mesh: Mesh, parameters: Array) -> Iterator[Traj
     own = own_start(statement, mesh, parameters)
     free = statement.nu > 0 and not statement.coupled
     if own.plain or not free:
-        yield own.trajectory
+        yield own
         if own.held:
-            yield own_start(statement, mesh, parameters, hold=False).trajectory
+            yield own_start(statement, mesh, parameters, hold=False)
         if free:
             yield from _others(_neutral(statement), mesh, parameters, own.trajectory)
         return
     found = list(_others(statement, mesh, parameters, own.trajectory))
-    yield from found or [own.trajectory]
+    yield from found or [own]
 
 
 def _neutral(statement: Statement) -> Statement:
@@ -112,12 +113,9 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     u = controls_guess(statement, mesh.nodes, mesh.control)
     start, e0 = beside_guesses(statement, mesh, parameters)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
-    plain = True
+    plain, run = True, None
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
         run = _held(statement, mesh, tuple(parameters)) if hold else None
-        if run is not None:
-            kept = completed(statement, mesh, parameters, run.u.copy(), x=run.x.copy())
-            return First(trajectory=kept, plain=True, held=True)
         followed = _followed(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)
@@ -127,7 +125,16 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
             u, plain = _bent(base_run(statement, mesh, parameters, start, flat), u, flat, units)
     elif statement.nu and statement.coupled:
         u = _within_reach(statement, mesh, parameters, u)
-    return First(trajectory=completed(statement, mesh, parameters, u), plain=plain)
+    left = completed(statement, mesh, parameters, u)
+    if np.isnan(statement.boundary_values(parameters)[0]).any() and not _ends_well(statement, left, parameters):
+        other = completed(statement, mesh, parameters, u, start=starts(statement, mesh, parameters)[0])
+        left = other if _ends_well(statement, other, parameters) else left
+    if run is None:
+        return First(trajectory=left, plain=plain)
+    kept = completed(statement, mesh, parameters, run.u.copy(), x=run.x.copy())
+    if too_dear(_told_run(statement, mesh, parameters, start), kept, left):
+        return First(trajectory=left, plain=plain)
+    return First(trajectory=kept, plain=True, held=True)
 
 
 def beside_guesses(statement: Statement, mesh: Mesh, parameters: Array) -> tuple[Array, Array]:
@@ -142,6 +149,15 @@ def beside_guesses(statement: Statement, mesh: Mesh, parameters: Array) -> tuple
     except ProblemError:
         return guessed
     return start, e0
+
+
+def _ends_well(statement: Statement, t: Trajectory, parameters: Array) -> bool:
+    """Whether the terminal cost and the conditions at the end have values at the end of a trajectory."""
+    x, u, e, duration = t.x[-1], t.u[-1], t.e[-1], t.duration
+    values = [statement.terminal(x, e, duration, parameters)]
+    if statement.end.size:
+        values.append(statement.end.function(x, u, e, duration, duration, parameters))
+    return all(np.isfinite(np.asarray(ca.DM(value).full())).all() for value in values)
 
 
 def _units_beside(statement: Statement, mesh: Mesh, parameters: Array, guessed: tuple[Array, Array]) -> Array:
@@ -240,7 +256,10 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     free = np.isnan(target)
     for block in statement.states:
         free[block.span] &= block.role == "moving" and not block.tangent
-    end = np.where(np.isnan(target), preferred(run, flat[0], e0, free), target)
+    wanted = preferred(run, flat[0], e0, free)
+    if wanted is None and not guesses and np.isnan(target[statement.moving or slice(None)]).all():
+        return None  # nothing says where it shall be
+    end = np.where(np.isnan(target), start if wanted is None else wanted, target)
     line = start + mesh.nodes[:, None] * (end - start)
     for block, guess in guesses:
         line[:, block.span] = evaluate_guess(block, guess, mesh.nodes)
@@ -449,7 +468,7 @@ def _coarse(statement: Statement, mesh: Mesh, parameters: tuple[float, ...]) -> 
     return replace(mesh, nodes=nodes, substeps=steps, segments=(count,), eliminated=True, points=1, readings=none)
 
 
-def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory) -> Iterator[Trajectory]:
+def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory) -> Iterator[First]:
     """Starts of several shapes and sizes, brought to the final values with little energy, the cheapest first."""
     coarse = _coarse(statement, mesh, tuple(parameters))
     flat = controls_guess(statement, coarse.nodes, mesh.control, sign=0.0)
@@ -462,4 +481,4 @@ def _others(statement: Statement, mesh: Mesh, parameters: Array, own: Trajectory
         best = distinct([judged(run, fixed, target, entry.u, flat, FINE_STEPS) for entry in best])
     for entry in best:
         u = run.clip(resampled(unsymmetric(run, entry.u, flat), coarse, mesh))
-        yield completed(statement, mesh, parameters, u)
+        yield First(trajectory=completed(statement, mesh, parameters, u), plain=False)
