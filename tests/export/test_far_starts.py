@@ -2,51 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from exports import QUICK
-from scipy.integrate import solve_ivp
+from limited_speed import cost_along, limited_speed
 
 import covocp as co
 
 pytestmark = pytest.mark.needs_cc
 
 
-def limited(running: bool = True) -> co.Problem:
-    """A double integrator of limited speed whose position is measured."""
-    ocp = co.Problem(4.0, "limited speed")
-    x = ocp.state("x", initial=0.0, final=3.0, variance=0.01)
-    v = ocp.state("v", initial=0.0, final=0.0, upper=1.0, variance=0.01)
-    u = ocp.control("u", lower=-2.0, upper=2.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, u, noise=0.01)
-    ocp.measurement("m", x, noise=0.01 * (1 + x**2))
-    E = ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * u**2 + (E[x, x] if running else 0.0), terminal=0.0 if running else E[x, x])
-    return ocp
-
-
-def integrated(plan: dict[str, np.ndarray], prior: np.ndarray) -> float:
-    """The running cost along the controls of a plan by scipy's LSODA."""
-    t, u = plan["time"].ravel(), plan["u"].ravel()
-
-    def slope(s, y):
-        E, F = y[2:6].reshape(2, 2), np.array([[0.0, 1.0], [0.0, 0.0]])
-        rate = F @ E + E @ F.T + np.diag([0.0, 0.01]) - np.outer(E[:, 0], E[0]) / (0.01 * (1 + y[0] ** 2))
-        now = np.interp(s, t, u)
-        return np.r_[y[1], now, rate.ravel(), 0.5 * now**2 + E[0, 0]]
-
-    y = np.r_[0.0, 0.0, prior.ravel(), 0.0]
-    for begin, end in pairwise(t):
-        y = solve_ivp(slope, (begin, end), y, method="LSODA", rtol=1e-9, atol=1e-12).y[:, -1]
-    return float(y[-1])
-
-
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
-    package = co.export_c(limited(), tmp_path_factory.mktemp("far") / "p", name="limited", intervals=20)
+    package = co.export_c(limited_speed(), tmp_path_factory.mktemp("far") / "p", name="limited", intervals=20)
     package.build(flags=QUICK)
     return package
 
@@ -55,7 +23,7 @@ def package(tmp_path_factory):
 def test_a_prior_that_the_mesh_does_not_bear_is_told(package, prior):
     """OK means a cost that is right to about 1 %: it had been said of 33334 in place of 1.387."""
     plan = package.python().solve(initial_E=prior * np.eye(2))
-    error = abs(plan["cost"] / integrated(plan, prior * np.eye(2)) - 1)
+    error = abs(plan["cost"] / cost_along(plan["time"].ravel(), plan["u"].ravel(), prior * np.eye(2)) - 1)
     assert plan["status"] == ("COARSE" if error > 0.01 else "OK")
     assert (error < 0.005) == (prior < 1.0)
     assert plan["infeasibility"] < 1e-6
@@ -72,7 +40,7 @@ def test_an_unknown_speed_is_an_unknown_position_within_the_first_step(package, 
     """The cost had been 7 % too low, and OK: where the position is known nothing seems to be learnt at the start."""
     prior = np.diag(variances)
     plan = package.python().solve(initial_E=prior)
-    error = abs(plan["cost"] / integrated(plan, prior) - 1)
+    error = abs(plan["cost"] / cost_along(plan["time"].ravel(), plan["u"].ravel(), prior) - 1)
     assert plan["status"] == status
     assert (error < 0.01) == (status == "OK")
 
@@ -103,7 +71,7 @@ def test_the_package_says_what_it_means(package):
 
 
 def test_a_cost_that_does_not_see_the_way_bears_any_prior(tmp_path):
-    package = co.export_c(limited(running=False), tmp_path / "p", name="final", intervals=20)
+    package = co.export_c(limited_speed(running=False), tmp_path / "p", name="final", intervals=20)
     package.build(flags=QUICK)
     assert package.python().solve(initial_E=1e6 * np.eye(2))["status"] == "OK"
 

@@ -2,46 +2,22 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from limited_speed import NOISE, cost_along, limited_speed
 
 import covocp as co
 
-NOISE = 0.01
 
-
-def moved(noise: float = NOISE) -> co.Problem:
-    """A double integrator whose position is measured the less, the further it is; the cost is E's own on the way."""
+def moved() -> co.Problem:
+    """Its noise is a parameter."""
     ocp = co.Problem(4.0, "moved")
-    x = ocp.state("x", initial=0.0, final=3.0, variance=0.01)
-    v = ocp.state("v", initial=0.0, final=0.0, upper=1.0, variance=0.01)
-    u = ocp.control("u", lower=-2.0, upper=2.0)
-    ocp.dynamics(x, v)
-    ocp.dynamics(v, u, noise=0.01)
-    ocp.measurement("m", x, noise=ocp.parameter("noise", noise) * (1 + x**2))
-    E = ocp.estimation_covariance()
-    ocp.minimize(running=0.5 * u**2 + E[x, x])
-    return ocp
+    return limited_speed(ocp.parameter("noise", NOISE), ocp=ocp)
 
 
 def integrated(solution: co.Solution, prior: float, noise: float = NOISE) -> float:
-    """The cost along the controls of a solution by scipy's LSODA."""
-    t, u = solution.t, solution["u"].ravel()
-
-    def slope(s, y):
-        E = y[2:6].reshape(2, 2)
-        F = np.array([[0.0, 1.0], [0.0, 0.0]])
-        rate = F @ E + E @ F.T + np.diag([0.0, 0.01]) - np.outer(E[:, 0], E[0]) / (noise * (1 + y[0] ** 2))
-        now = np.interp(s, t, u)
-        return np.r_[y[1], now, rate.ravel(), 0.5 * now**2 + E[0, 0]]
-
-    y = np.r_[0.0, 0.0, prior, 0.0, 0.0, prior, 0.0]
-    for begin, end in pairwise(t):
-        y = solve_ivp(slope, (begin, end), y, method="LSODA", rtol=1e-9, atol=1e-12).y[:, -1]
-    return float(y[-1])
+    """The cost along the controls of a solution by scipy."""
+    return cost_along(solution.t, solution["u"].ravel(), prior * np.eye(2), noise)
 
 
 @pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])

@@ -6,8 +6,8 @@ pendulum round and round. Of least energy is the feedback that minimises
     sum_k w_k |u_k - v_k|^2 + |x_N - goal|^2
 
 for the nominal linearised along a reference, with controls v that break symmetries: it mirrors the unstable poles and
-leaves the stable ones, in any units. The first reference is a straight line to the final values, the next ones are the
-runs under the feedback.
+leaves the stable ones, in any units. The first reference is a straight line to the final values, or to where the cost
+prefers the states to be; the next ones are the runs under the feedback.
 """
 
 from __future__ import annotations
