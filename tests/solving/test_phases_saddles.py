@@ -67,10 +67,9 @@ def test_a_minimum_that_the_guess_met_is_none_to_be_told(best, method, last):
 def test_what_passes_to_a_later_phase_is_held():
     """x may not move at the end of the first phase alone: its own concave cost there is none of a free end."""
     phases = in_two(0.5, lambda r: (r - 0.5) ** 2)
-    first, second = (phase.extremal for phase in co.solve(phases, method="ipopt", progress=False).phases)
-    links = co.solve(phases, method="ipopt", progress=False).links
+    solution = co.solve(phases, method="ipopt", progress=False)
     for i in (0, 1):
-        found = curvature_between_links([first, second], links, i)
+        found = curvature_between_links([phase.extremal for phase in solution.phases], solution.links, i)
         z = found.start[0]
         assert found.verdict == "minimum"
         assert z == pytest.approx(0.0, abs=1e-9)
