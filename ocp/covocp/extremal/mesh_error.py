@@ -16,6 +16,7 @@ from covocp.extremal.open_loop import Departure, departure, nominal_along
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_run
 from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
+from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import magnitudes
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
@@ -97,7 +98,7 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
     if st.behind:  # what the phases before a link cost by what runs backward, at the start
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
-    least = LEAST_RANGE * magnitudes(st, t, extremal.parameters).x
+    least = LEAST_RANGE * _magnitudes(st, t, tuple(extremal.parameters.tolist())).x
     return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x, least)
 
 
@@ -109,6 +110,11 @@ def _halved(extremal: Extremal) -> Refined:
 @lru_cache(maxsize=2)
 def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
     return refined_run(statement, mesh, trajectory, np.array(parameters))
+
+
+@lru_cache(maxsize=2)
+def _magnitudes(statement: Statement, trajectory: Trajectory, parameters: tuple[float, ...]) -> Scales:
+    return magnitudes(statement, trajectory, np.array(parameters))
 
 
 def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
@@ -138,7 +144,7 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
 def _by_segments(extremal: Extremal, gaps: Array | float) -> tuple[Array, Array]:
     """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
     t, finer = extremal.trajectory, _halved(extremal)
-    scales, values = magnitudes(extremal.statement, t, extremal.parameters), np.hstack([t.x, t.e])
+    scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
     least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
     size = np.maximum(np.ptp(values, axis=0), least)

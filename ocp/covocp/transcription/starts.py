@@ -108,14 +108,21 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated.
 
     Where the nominal is unstable and would stay so a feedback holds it, unless it is asked to be left to itself.
+    The last ones are kept: a solver that is asked again for the same parameters starts from the same.
     """
+    return _own_start(statement, mesh, tuple(parameters), hold)
+
+
+@lru_cache(maxsize=2)
+def _own_start(statement: Statement, mesh: Mesh, values: tuple[float, ...], hold: bool) -> First:
+    parameters = np.array(values)
     duration = statement.duration.guess
     u = controls_guess(statement, mesh.nodes, mesh.control)
     start, e0 = beside_guesses(statement, mesh, parameters)
     check_model(statement, start, u[:1].ravel(), e0, duration, parameters)
     plain, run = True, None
     if statement.nu and not statement.coupled and all(is_plain(statement.guesses[b.name]) for b in statement.controls):
-        run = _held(statement, mesh, tuple(parameters)) if hold else None
+        run = _held(statement, mesh, values) if hold else None
         followed = _followed(statement)
         if followed:
             u = _tracked(statement, mesh, parameters, followed)
