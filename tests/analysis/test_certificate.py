@@ -454,6 +454,44 @@ def test_what_violates_the_constraints_of_the_problem_is_not_certified() -> None
         assert "violates" in certificate.reason
 
 
+def in_units(cost: float, state: float, control: float, second: float, **limits: Any) -> co.Problem:
+    """The first-order lag to x(T) = 1 with other units of cost, state, control and time."""
+    ocp = co.Problem(10.0 * second, name="lag in other units")
+    x = ocp.state("x", initial=0.0, final=state, variance=state**2)
+    b = ocp.unknown("b", mean=1.0 / second, variance=5.0 / second**2)
+    u = ocp.control("u", **limits)
+    ocp.dynamics(x, -b * x + u * state / (control * second), noise=state**2 / second)
+    ocp.measurement("position", x, noise=state**2 * second)
+    E: Any = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * cost / second * (u / control) ** 2, terminal=10.0 * cost * second**2 * E[b, b])
+    return ocp
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0, 1.0), (1e-13, 1.0, 1.0, 1.0), (1e-6, 1e-9, 1e-7, 1e3)])
+def test_no_unit_decides_what_is_certified(units: tuple[float, float, float, float]) -> None:
+    """A tolerance in the unit of the cost certified three times the least cost, where that is 1e-13."""
+    ocp = in_units(*units)
+    better, worse = (
+        co.certify(co.evaluate(ocp, nominal={"u": units[2] * found.trajectory.u}, intervals=80))
+        for found in (lag(10.0, 1.0), lag(10.0, 1.0, second=True))
+    )
+    assert better.certified, str(better)
+    assert better.stationarity < 1e-2
+    assert worse.verdict == "not certified"
+    # Exactly 7.71199239 - 7.08523968 in the unit of the cost, at least.
+    assert worse.gap > 0.6267 * units[0]
+
+
+def test_a_limit_in_a_small_unit_is_violated_by_a_share_of_it() -> None:
+    """Twice the limit, which is far below 1."""
+    best = lag(10.0, 1.0).trajectory.u
+    for size in (1.0, 1e-8):
+        ocp = in_units(1.0, 1.0, size, 1.0, upper=0.5 * size * best.max())
+        certificate = co.certify(co.evaluate(ocp, nominal={"u": size * best}, intervals=80))
+        assert certificate.verdict == "not certified"
+        assert "violates the constraints of the problem" in certificate.reason
+
+
 def test_certifying_takes_time_in_proportion_to_the_intervals() -> None:
     """Operations are counted by what is stored: nothing has two axes of control values."""
     st = unknown_lag.problem().statement()

@@ -23,12 +23,13 @@ from typing import Literal
 import numpy as np
 
 from covocp.analysis.conditions import why_not
+from covocp.analysis.constraint_duals import evaluated
 from covocp.analysis.lower_bound import Bound
 from covocp.analysis.mesh_bound import both_ends, divided, mesh_residual
 from covocp.analysis.reduction import Reduction, resolved
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import check_kind
-from covocp.base.matrices import unpack
+from covocp.base.matrices import Array, standard_deviations, unpack
 from covocp.base.pages import lines_as_html
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
@@ -37,18 +38,20 @@ from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.solution.phases import check_whole
 from covocp.solution.solution import Solution
+from covocp.statement.statement import Conditions
 
 Verdict = Literal["global minimum (certified)", "not certified", "does not apply"]
 
 # The tolerance of the eigenvalue is this multiple of its change from one mesh to the next, plus its error on the finer
 # one and the roundoff of the eigenproblem.
 SAFETY = 2.0
+# Of eigenvalues, which have no unit; of a cost it is a share of what its terms add up to without their signs.
 ROUNDOFF = 1e-9
 # Intervals of the coarser of the two meshes, at least.
 INTERVALS = 100
 # Below this an eigenvalue is negative, and not what the mesh leaves of zero.
 # Above these nothing is certified: what another control could save, relative to J; what a constraint is violated by,
-# relative to its limit or to the values.
+# relative to its limit or to what its values are made of.
 LARGEST_FALL = 1e-3
 LARGEST_GAP = 1e-3
 LARGEST_VIOLATION = 1e-6
@@ -65,7 +68,7 @@ class Certificate:
             conditions, relative to the energy int u' L_uu u dt.
         tolerance: down to minus this the eigenvalue counts as zero; from its change by halving the mesh.
         stationarity: norm of the slope of the Lagrangian in the energy metric, between the nodes as well, relative to
-            sqrt(2 |J|).
+            sqrt(2 |J|); where the terms of J cancel, to what is left of them by rounding.
         consistency: largest relative difference between Lambda^-1 and E_bb(T) of the solution.
         gap: no admissible control of finite energy costs less by more than this [cost]; inf where nothing is known,
             None where the theory does not apply.
@@ -172,13 +175,14 @@ def _certified(solution: Solution, reporter: Progress) -> Certificate:
     covariance = unpack(extremal.trajectory.e[-1], size)[nx:, nx:]
     information = Reduction(extremal.statement, mesh, extremal.parameters).covariance(extremal.trajectory.u)[2]
     consistency = float(np.abs(np.linalg.inv(information) - covariance).max() / np.abs(covariance).max())
-    verdict, reason = _judge(eigenvalue, gap, mesh_gap, abs(cost))
+    least = max(ROUNDOFF * bounds[-1].magnitude, float(np.finfo(float).tiny))
+    verdict, reason = _judge(eigenvalue, gap, mesh_gap, LARGEST_GAP * abs(cost) + least)
     return Certificate(
         verdict=verdict,
         reason=reason,
         smallest_eigenvalue=eigenvalue,
         tolerance=tolerance,
-        stationarity=float(np.linalg.norm(bounds[-1].slope) / np.sqrt(2 * max(abs(cost), ROUNDOFF))),
+        stationarity=float(np.linalg.norm(bounds[-1].slope) / np.sqrt(2 * max(abs(cost), least))),
         consistency=consistency,
         gap=gap,
         mesh_gap=mesh_gap,
@@ -190,9 +194,8 @@ def _difference(pair: list[float]) -> float:
     return 0.0 if pair[0] == pair[1] else abs(pair[1] - pair[0])
 
 
-def _judge(eigenvalue: float, gap: float, mesh_gap: float | None, cost: float) -> tuple[Verdict, str]:
-    """Verdict and reason from the numbers."""
-    allowed = LARGEST_GAP * cost + ROUNDOFF
+def _judge(eigenvalue: float, gap: float, mesh_gap: float | None, allowed: float) -> tuple[Verdict, str]:
+    """Verdict and reason from the numbers; `allowed`: the largest gap that is none [cost]."""
     if gap <= allowed:
         on_mesh = "" if mesh_gap is None else f" (on its own mesh: {mesh_gap:.2g})"
         return (
@@ -215,32 +218,46 @@ def _judge(eigenvalue: float, gap: float, mesh_gap: float | None, cost: float) -
 
 
 def violations(solution: Solution) -> Mapping[str, float]:
-    """What a solution violates its problem by, by name, beyond a share of the limit or of the values.
+    """What a solution violates its problem by, by name, beyond a share of the natural size of it.
 
-    It is looked at where limits are imposed: at the nodes, and at the points between them.
+    It is looked at where limits are imposed: at the nodes, and at the points between them. A limit counts with its own
+    size, that of the values along the whole way, and what they are made of: of a state its standard deviation, of a
+    condition its terms. So no unit decides, and a limit of zero that is met up to rounding is met.
     """
     extremal = refined(solution.extremal)
     st, t = extremal.statement, extremal.trajectory
     x0, xf, _, _ = st.boundary_values(extremal.parameters)
+    deviations = standard_deviations(unpack(t.e, st.matrices[0].size))[:, : st.nx]
+    states = np.maximum(np.abs(t.x), deviations).max(axis=0)
+    controls = np.abs(t.u).max(axis=0)
     groups = [
-        (st.control_names, t.u, *st.control_bounds, ""),
-        (st.state_names, t.x, *st.state_bounds, ""),
+        (st.control_names, t.u, *st.control_bounds, controls, ""),
+        (st.state_names, t.x, *st.state_bounds, states, ""),
     ]
     for given, values, words in ((x0, t.x[:1], "initial value of "), (xf, t.x[-1:], "final value of ")):
         lower, upper = (np.where(np.isnan(given), free, given) for free in (-np.inf, np.inf))
-        groups.append((st.state_names, values, lower, upper, words))
+        groups.append((st.state_names, values, lower, upper, states, words))
+    terms = np.concatenate([states, controls])
     for conditions, _, values in extremal.inequalities():
-        groups.append((conditions.names, values, conditions.lower, conditions.upper, ""))
+        assert isinstance(conditions, Conditions)  # at instants none: they have no certificate
+        sizes = np.maximum(np.abs(values).max(axis=0), _terms(extremal, conditions, terms))
+        groups.append((conditions.names, values, conditions.lower, conditions.upper, sizes, ""))
     result = dict(solution.violations)
-    for names, values, lower, upper, words in groups:
+    for names, values, lower, upper, sizes, words in groups:
         limits = [np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (lower, upper)]
-        whole = t.x if values.shape[1:] == t.x.shape[1:] and "value" in words else values
-        size = np.maximum.reduce([np.ones(lower.size), *limits, np.abs(whole).max(axis=0)])
         excess = np.maximum(lower - values, values - upper).max(axis=0)
-        for name, value, allowed in zip(names, excess, LARGEST_VIOLATION * size, strict=True):
-            if value > allowed:
+        allowed = LARGEST_VIOLATION * np.maximum.reduce([sizes, *limits])
+        for name, value, most in zip(names, excess, allowed, strict=True):
+            if value > most:
                 result[words + name] = max(float(value), result.get(words + name, 0.0))
     return result
+
+
+def _terms(extremal: Extremal, conditions: Conditions, sizes: Array) -> Array:
+    """The largest term of affine conditions, (rows,), for sizes of state and control, (nx + nu,)."""
+    z = np.hstack([extremal.trajectory.x, extremal.controls])
+    _, maps = evaluated(extremal, conditions, z, extremal.time)
+    return np.asarray((np.abs(maps) * sizes).max(axis=(0, 2)))
 
 
 def _on_the_mesh(extremal: Extremal, eigenvalue: float, tolerance: float, reach: Callable[[], float]) -> float | None:

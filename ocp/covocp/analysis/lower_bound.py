@@ -40,6 +40,7 @@ class Bound:
         stages: the reduction on the mesh.
         zeta: trajectory of the control that the bound touches, moved to where it keeps the terminal conditions.
         cost: its cost, with the reduction on this mesh.
+        magnitude: what the terms of the cost (of the stages, of x(T), of Lambda) add up to without their signs [cost].
         uncertain: tr(C Lambda^-1), the part of it that q is linear in.
         information: Lambda (nb, nb).
         curvature: Hessian of q by zeta in each stage; `own`: of the cost of x and u alone.
@@ -53,6 +54,7 @@ class Bound:
     stages: Stages
     zeta: Array
     cost: float
+    magnitude: float
     uncertain: float
     information: Array
     curvature: Array
@@ -80,7 +82,8 @@ class Bound:
         covariance = np.linalg.inv(information)
         weight = terminal_weight(st, parameters)[nx:, nx:]
         uncertain = float(np.trace(weight @ covariance))
-        running = 0.5 * float(np.einsum("ki,kij,kj->", zeta[:-1], stages.running, zeta[:-1]))
+        running = 0.5 * np.einsum("ki,kij,kj->k", zeta[:-1], stages.running, zeta[:-1])
+        terminal = terminal_cost(st, parameters, x)
         own, last = stages.running, end_slopes(st, parameters, x)
         curvature = own - stages.weighted(covariance @ weight @ covariance)
 
@@ -97,7 +100,8 @@ class Bound:
         return Bound(
             stages=stages,
             zeta=zeta,
-            cost=running + terminal_cost(st, parameters, x) + uncertain,
+            cost=float(running.sum()) + terminal + uncertain,
+            magnitude=float(np.abs(running).sum()) + abs(terminal) + abs(uncertain),
             uncertain=uncertain,
             information=information,
             curvature=curvature,
@@ -209,6 +213,9 @@ def _admissible(extremal: Extremal, stages: Stages, w: Array) -> tuple[Array, Ar
         slopes[:, i] = stages.in_roots(stages.slopes(by_xi, np.zeros(shape)))
     if not rows.shape[0]:
         return slopes, zeta
+    units = np.linalg.norm(slopes, axis=0)  # conditions on states in other units count alike
+    units = np.where(units > 0.0, units, 1.0)
+    slopes, missed = slopes / units, missed / units
     left, values, right = np.linalg.svd(slopes, full_matrices=False)
     kept = values > 1e-10 * max(float(values[0]), float(np.finfo(float).tiny))
     held = left[:, kept]

@@ -64,8 +64,11 @@ def mesh_residual(extremal: Extremal, w: Array) -> tuple[float, float]:
     right = np.column_stack(columns)
     solved = solveh_banded(banded, right)
     gram = right.T @ solved
-    held = lstsq(gram[1:, 1:], gram[1:, 0])[0] if rows.shape[0] else np.zeros(0)
-    return float(np.sqrt(max(0.0, gram[0, 0] - gram[0, 1:] @ held))), slack
+    units = np.sqrt(np.diag(gram)[1:])  # conditions on states in other units count alike
+    units = np.where(units > 0.0, units, 1.0)
+    along = gram[1:, 0] / units
+    held = lstsq(gram[1:, 1:] / np.outer(units, units), along)[0] if rows.shape[0] else np.zeros(0)
+    return float(np.sqrt(max(0.0, gram[0, 0] - along @ held))), slack
 
 
 def both_ends(extremal: Extremal) -> Array:
