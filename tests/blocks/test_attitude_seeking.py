@@ -268,6 +268,25 @@ def test_solver_and_enumeration_fly_alike():
     np.testing.assert_allclose(*(fed(law, attitudes, powers, 5) for law in smooth), atol=1e-6)
 
 
+@pytest.mark.parametrize("power", [1e-12, 1e3])
+def test_four_zones_are_flown_alike_in_every_unit_of_power(power):
+    """The law knows no unit; with tolerances on b a step in mW was of 1e7 deg."""
+    many = [*ZONES, ((0, 0, 1), (1, 0, 0), 20.0, "exclusion"), ((0, 0, 1), (0, 1, 0), 15.0, "exclusion")]
+    paths = []
+    for c in (1.0, power):
+        units = {"noise": 0.0025 * c**2, "drift": 0.02 * c**2, "motion_drift": 16 * c**2, "prior_covariance": c**2}
+        law = attitude_seeking.projected(many, kappa=0.05 / c, excitation=0.02, **units)
+        q = so3.to_quaternion(so3.principal(2, 0.9) @ so3.principal(3, 1.4))
+        memory, path = law.initial(q), []
+        for _ in range(40):
+            memory = law.update(memory, q, c * 4.0 * so3.from_quaternion(q)[2, 2])
+            q = law.step(memory)
+            path.append(q)
+        paths.append(path)
+    np.testing.assert_allclose(*paths, atol=1e-6)
+    assert so3.from_quaternion(q)[2, 2] > 0.95  # and it arrives
+
+
 def test_more_than_three_zones_go_to_the_solver():
     many = [*ZONES, ((0, 0, 1), (0, 0, -1), 30.0, "exclusion"), ((0, 0, 1), (0, 1, -1), 10.0, "exclusion")]
     law = attitude_seeking.projected(many, **QUIET)

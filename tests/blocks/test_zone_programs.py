@@ -12,6 +12,7 @@ from attitude_programs import Case, Literal, Reduced, random_case, unit
 from hypothesis import given
 from hypothesis import strategies as st
 from linear_systems import FIXED, SEEDS
+from scipy.optimize import nnls
 
 from covocp.blocks import so3
 from covocp.blocks.zone_programs import Rows, box_problem, projection, projection_by_solver, reduced
@@ -201,6 +202,58 @@ def test_enumeration_and_solver_project_alike(seed):
     x = ca.MX.sym("b", 3)
     solved = ca.Function("solved", [x], [projection_by_solver(x, ca.MX(ca.DM(A)), ca.MX(ca.DM(beta)), 0.05)])(b)
     np.testing.assert_allclose(enumerated, solved.full(), atol=1e-6)
+
+
+def nearest(A, beta, wanted):
+    """The nearest vector with A d >= beta by Lawson and Hanson's least distance programming; None: there is none."""
+    rest = beta - A @ wanted
+    matrix = np.vstack([A.T, rest / np.abs(rest).max()])
+    found = nnls(matrix, np.array([0.0, 0.0, 0.0, 1.0]))[0]
+    residual = matrix @ found - np.array([0.0, 0.0, 0.0, 1.0])
+    return None if np.linalg.norm(residual) < 1e-7 else wanted - np.abs(rest).max() * residual[:3] / residual[3]
+
+
+@cache
+def solver_of(rows, kappa):
+    symbols = ca.MX.sym("b", 3), ca.MX.sym("A", rows, 3), ca.MX.sym("beta", rows)
+    return ca.Function("solved", list(symbols), [projection_by_solver(*symbols, kappa)])
+
+
+@pytest.mark.parametrize("power", [1e-12, 1e-3, 1.0, 1e3, 1e9])
+def test_solver_projects_alike_in_every_unit_of_power(power):
+    """Of b as given, tolerances decided: in mW the step was of 1e5 rad, in units of 1e9 W none."""
+    generator, seen = np.random.default_rng(3), 0
+    for trial in range(40):
+        count = 2 + trial % 7
+        A = np.cross(unit(generator.standard_normal((count, 3))), unit(generator.standard_normal((count, 3))))
+        A[1] = A[0] if trial % 3 == 0 else A[1]  # twice the same
+        beta = A @ (0.3 * generator.standard_normal(3)) - generator.uniform(0.0, 0.2, count)
+        wanted = 0.3 * generator.standard_normal(3)
+        expected = nearest(A, beta, wanted)
+        found = np.ravel(solver_of(count, 0.05 / power)(wanted * power / 0.05, A, beta).full()) * 0.05 / power
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        seen += np.abs(expected - wanted).max() > 1e-3
+    assert seen > 20
+
+
+def test_rows_that_contradict_one_another_move_no_further_than_one_of_them_wants():
+    """Four, two against two; and an axis opposite to its cone, whose row is nothing but rounding."""
+    against = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0], [-0.5, 0, 0]])
+    found = np.ravel(solver_of(4, 0.05)([0.0, 2.0, 0.0], against, [0.3, 0.2, 0.1, 0.1]).full())
+    np.testing.assert_allclose(0.05 * found, [0.3, 0.1, 0.0], atol=1e-9)
+    opposite = so3.exp(np.array([0.4, -0.7, 0.2]))
+    A, beta = zone_rows(opposite, zones_of([((0, 1, 0), -opposite.T @ [0.0, 1.0, 0.0], 20.0, "inclusion")]))
+    A = A + 1e-17
+    wanted = np.array([1.0, 2.0, 3.0])
+    enumerated = ca.evalf(projection(ca.SX(ca.DM(wanted)), Rows(ca.DM(A), ca.DM(beta)), 0.05)).full()
+    np.testing.assert_allclose(np.ravel(enumerated), wanted, rtol=1e-12)
+    np.testing.assert_allclose(np.ravel(solver_of(1, 0.05)(wanted, A, beta).full()), wanted, rtol=1e-12)
+
+
+def test_solver_writes_nothing_to_the_console(capfd):
+    for wanted in ([1.0, -2.0, 0.5], [0.0, 0.0, 0.0], [-30.0, 0.0, 0.0]):
+        solver_of(4, 0.05)(wanted, np.vstack([np.eye(3), np.ones(3)]), -0.1 * np.ones(4))
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("kind", ["projection", "reduction"])

@@ -5,13 +5,15 @@ seeking; the step bound is |kappa b| <= d_max. All programs here come down to th
 
     min mu'G mu / 2 - g'mu,  0 <= mu <= s
 
-of the multipliers of at most three rows, which is solved by going through its active sets.
+of the multipliers of at most three rows, which is solved by going through its active sets. Projections between more
+zones are left to OSQP, in units in which they are of size 1, and where it does not find the optimum, among them all
+programs that have none, the same is done with every three of the rows: a vector of three numbers needs no more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import product
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -32,11 +34,18 @@ CORRECTIONS = 6
 SILENT = 1e-6
 # Shares of a step that sequential programming leaves too much; more would be a zone that cannot be met.
 SHORTER = 1e-3
-# Tight, and polished: what is left is about 1e-9.
+# A row shorter than this says nothing about where to turn: its axis is in the middle of the cone, or opposite to it,
+# and what is left of x * z is rounding.
+SHORTEST_ROW = 1e-12
+# Rows whose G leaves less than this of a pivot depend on one another, up to rounding.
+DEPENDENT = 1e-13
+# Of a program of size 1: what is left is about 1e-9. Polishing would write to the console.
 OSQP: dict[str, Any] = {
     "error_on_fail": False,
-    "osqp": {"verbose": False, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000, "polish": True},
+    "osqp": {"verbose": False, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 4000, "polish": False},
 }
+# Residuals of the conditions of optimality up to which its answer is taken.
+OPTIMAL = 1e-7
 
 
 class Rows(NamedTuple):
@@ -78,7 +87,7 @@ class _Weighted(NamedTuple):
     linear: Any
 
 
-def box_problem(G: Expr, g: Expr, limits: Expr = None) -> Any:
+def box_problem(G: Expr, g: Expr, limits: Expr = None, *, dependent: float = 0.0) -> Any:
     """Multipliers of least mu'G mu / 2 - g'mu between 0 and limits, by enumeration.
 
     Each active set gives one candidate, cut off at the limits so that it is feasible; the best of them is the solution,
@@ -88,6 +97,7 @@ def box_problem(G: Expr, g: Expr, limits: Expr = None) -> Any:
         G: SX, positive semidefinite, (m, m), m <= 3.
         g: SX, (m, 1).
         limits: SX or DM, (m, 1); None: none.
+        dependent: share of an entry of the diagonal of G; where elimination leaves no more, rows count as dependent.
 
     Returns:
         mu, SX, (m, 1).
@@ -98,14 +108,14 @@ def box_problem(G: Expr, g: Expr, limits: Expr = None) -> Any:
     for kinds in product(choices, repeat=count):
         if not any(kinds):
             continue
-        mu = _candidate(G, g, limits, kinds)
+        mu = _candidate(G, g, limits, kinds, dependent)
         cost = ca.dot(mu, 0.5 * (G @ mu) - g)
         better = cost < least  # also false where the cost is no number
         best, least = ca.if_else(better, mu, best), ca.if_else(better, cost, least)
     return best
 
 
-def _candidate(G: Expr, g: Expr, limits: Expr, kinds: tuple[int, ...]) -> Any:
+def _candidate(G: Expr, g: Expr, limits: Expr, kinds: tuple[int, ...], dependent: float) -> Any:
     """Multipliers of one active set; of each row 0: zero, 1: between, 2: at its limit."""
     free = [i for i, kind in enumerate(kinds) if kind == 1]
     mu = ca.SX.zeros(len(kinds), 1)
@@ -114,17 +124,19 @@ def _candidate(G: Expr, g: Expr, limits: Expr, kinds: tuple[int, ...]) -> Any:
             mu[i] = limits[i]
     if free:
         right = g[free] - (G @ mu)[free] if any(kind == 2 for kind in kinds) else g[free]
-        found = _solved(G[free, free], right)
+        found = _solved(G[free, free], right, dependent)
         for k, i in enumerate(free):
             mu[i] = ca.fmax(found[k], 0) if limits is None else ca.fmin(ca.fmax(found[k], 0), limits[i])
     return mu
 
 
-def _solved(M: Expr, right: Expr) -> Any:
+def _solved(M: Expr, right: Expr, dependent: float) -> Any:
     """M^-1 right of at most three rows by elimination; what a pivot of zero would decide is zero."""
     rows, values = ca.SX(M), ca.SX(right)
     count = rows.shape[0]
     for k in range(count):
+        if dependent > 0 and k:
+            rows[k, k] = where(rows[k, k] > dependent * M[k, k], rows[k, k])
         for i in range(k + 1, count):
             share = _over(rows[i, k], rows[k, k])
             rows[i, k:] = rows[i, k:] - share * rows[k, k:]
@@ -169,10 +181,60 @@ def projection_by_solver(gradient: Expr, matrix: Expr, bounds: Expr, kappa: floa
     Returns:
         MX, (3, 1).
     """
-    shape = {"h": ca.Sparsity.dense(3, 3), "a": ca.Sparsity.dense(*matrix.shape)}
-    solver = ca.conic("projection", "osqp", shape, OSQP)
-    found = solver(h=ca.MX.eye(3), g=-gradient, a=kappa * matrix, lba=bounds)
-    return found["x"]
+    step = ca.MX.sym("step", 3)
+    rows, limits = ca.MX.sym("A", *matrix.shape), ca.MX.sym("beta", matrix.shape[0])
+    lengths = ca.sqrt(ca.sum2(rows**2))
+    told = lengths > SHORTEST_ROW
+    units = ca.if_else(told, lengths, 1)
+    directions = rows * ca.repmat(told / units, 1, 3)
+    distances = ca.if_else(told, limits / units, 0)
+    size = ca.fmax(ca.norm_2(step), ca.fmax(0, ca.mmax(distances)))
+    size = ca.if_else(size > 0, size, 1)
+    arguments = [step / size, directions, distances / size]
+    found = size * _projected_to_planes(matrix.shape[0])(*arguments)
+    left = ca.mmin(directions @ step - distances)
+    kept = ca.Function("kept", [step, rows, limits], [ca.if_else(left >= 0, step, found, True)])
+    return kept(kappa * gradient, matrix, bounds) / kappa
+
+
+def _projected_to_planes(count: int) -> ca.Function:
+    """(e, a (m, 3), beta (m,)) -> the nearest vector to e with a e >= beta, rows of length one or zero, all of size 1.
+
+    What OSQP says is looked at: v = e + a'mu, mu >= 0, a v >= beta, mu'(a v - beta) = 0.
+    """
+    e, a, beta = ca.MX.sym("e", 3), ca.MX.sym("a", count, 3), ca.MX.sym("beta", count)
+    shape = {"h": ca.Sparsity.dense(3, 3), "a": ca.Sparsity.dense(count, 3)}
+    found = ca.conic("projection", "osqp", shape, OSQP)(h=ca.MX.eye(3), g=-e, a=a, lba=beta)
+    v, mu = found["x"], ca.fmax(0, -found["lam_a"])
+    left = a @ v - beta
+    residual = ca.fmax(ca.norm_inf(v - e - a.T @ mu), ca.fmax(ca.mmax(ca.fabs(mu * left)), -ca.mmin(left)))
+    # also false where the residual is no number
+    best = ca.if_else(residual <= OPTIMAL, v, _by_threes(count)(e, a, beta), True)
+    return ca.Function("projected", [e, a, beta], [best])
+
+
+def _by_threes(count: int) -> ca.Function:
+    """The same by the active sets of every three rows.
+
+    The multipliers of all active sets are feasible in the dual program, so the best of them is its solution where there
+    is one. Where rows contradict one another it is what the enumeration of three takes: of active sets without
+    contradiction the one that moves the vector the most.
+    """
+    e, three, best = ca.SX.sym("e", 3), ca.SX.sym("rows", 4 * MOST_ROWS), ca.SX.sym("best", 4)
+    rows = ca.reshape(three, 4, MOST_ROWS).T
+    a, beta = rows[:, :3], rows[:, 3]
+    G, g = a @ a.T, beta - a @ e
+    mu = box_problem(G, g, dependent=DEPENDENT)
+    tried = ca.vertcat(ca.dot(mu, 0.5 * (G @ mu) - g), a.T @ mu)
+    step = ca.Function("three", [best, e, three], [ca.if_else(tried[0] < best[0], tried, best)])
+    whole = max(count, MOST_ROWS)  # rows of zero, where there are fewer than three, do nothing
+    chosen = [k for rows in combinations(range(whole), MOST_ROWS) for k in rows]
+    place, matrix, bounds = ca.MX.sym("e", 3), ca.MX.sym("a", count, 3), ca.MX.sym("beta", count)
+    table = ca.horzcat(ca.horzcat(matrix, bounds).T, ca.MX.zeros(4, whole - count))
+    sets = len(chosen) // MOST_ROWS
+    threes = ca.reshape(table[:, chosen], 4 * MOST_ROWS, sets)
+    last = step.mapaccum("threes", sets)(ca.MX.zeros(4), ca.repmat(place, 1, sets), threes)[:, -1]
+    return ca.Function("by_threes", [place, matrix, bounds], [place + last[1:]])
 
 
 def reduced(
@@ -243,9 +305,10 @@ def _feasible_share(rows: Rows, d: Expr) -> Any:
 
 def _unbounded(cost: _Weighted, rows: Rows, kappa: float) -> Constrained:
     """Hard rows, no step bound."""
-    A, beta = kappa * (ca.SX(rows.matrix) @ cost.vectors), ca.SX(rows.bounds)
+    told = ca.sum2(ca.SX(rows.matrix) ** 2) > SHORTEST_ROW**2
+    A, beta = kappa * ((ca.repmat(told, 1, 3) * rows.matrix) @ cost.vectors), ca.SX(rows.bounds)
     scaled = A @ ca.diag(1 / cost.values)
-    mu = box_problem(scaled @ A.T, beta - scaled @ cost.linear)
+    mu = box_problem(scaled @ A.T, beta - scaled @ cost.linear, dependent=DEPENDENT)
     along = (cost.linear + A.T @ mu) / cost.values
     return Constrained(cost.vectors @ along, ca.SX(0), mu, ca.fmax(0, beta - A @ along))
 
