@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import covocp as co
-from covocp.blocks import sdre, theta_d, theta_d_tuning
+from covocp.blocks import sdre, theta_d, theta_d_radius, theta_d_series, theta_d_tuning
 from covocp.models import agile_aircraft, theta_d_benchmarks
 from covocp.simulation.laws import simulate_law
 
@@ -31,6 +31,57 @@ def test_radius_of_known_singularities():
         # Here the nearest singularity is where two eigenvalues of the Hamiltonian matrix meet in zero.
         inverse_roots = np.linalg.eigvals(np.linalg.solve(constant, -direction))
         assert found == pytest.approx(1.0 / np.abs(inverse_roots).max(), rel=1e-3)
+
+
+def test_radius_of_an_oscillator_with_two_pairs_of_branch_points_of_nearly_the_same_distance():
+    """p_12 = -k + sqrt(k^2 + 1), k = 2 + 2 s; p_22 = -a + sqrt(a^2 + 2 p_12 + 1), a = 0.2 + s."""
+    oscillator = np.array([[0.0, 1.0], [-2.0, -0.2]]), np.array([[0.0, 0.0], [-2.0, -1.0]]), [0.0, 1.0], np.eye(2), 1.0
+
+    def inner(s):
+        k = 2 + 2 * s
+        return (0.2 + s) ** 2 + 2 * (-k + np.sqrt(k**2 + 1)) + 1
+
+    s = -0.08 + 1.11j
+    for _ in range(20):
+        s -= inner(s) / ((inner(s + 1e-6) - inner(s - 1e-6)) / 2e-6)
+    assert abs(inner(s)) < 1e-12
+    assert abs(s) < np.sqrt(5.0) / 2  # of k = i
+    assert theta_d.radius(*oscillator) == pytest.approx(abs(s), rel=1e-8)
+    x = ca.SX.sym("x", 2)
+    constant, direction, *rest = oscillator
+    found = theta_d.convergence(x, constant, x[0] * direction, *rest, [[1.0, 0.0], [1.3, 0.0], [-1.3, 2.0]], warn=False)
+    np.testing.assert_allclose(found.radius, abs(s) / np.array([1.0, 1.3, 1.3]), rtol=1e-8)
+    assert not found.converges
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e5, 1e-6)])
+def test_radius_of_two_scalar_systems_in_any_units(units):
+    """p = a + sqrt(a^2 + 1), a = a_0 + s d: branch points where a = +-i, none where lambda of one meets -lambda of the
+    other."""
+    U, first, second = np.diag(units), np.array([-0.5, 0.3]), np.array([0.2, -0.4])
+    found = theta_d.radius(np.diag(first), np.diag(second), U, np.linalg.inv(U) ** 2, np.eye(2))
+    assert found == pytest.approx(np.abs((1j - first) / second).min(), rel=1e-6)
+
+
+def test_radius_ends_where_a_mode_cannot_be_reached():
+    """x1' = x1 + (1 - s) u: p (1 - s)^2 = 1 + sqrt(1 + (1 - s)^2) has a pole at 1, branch points at 1 +- i."""
+    # As the input must not depend on s, it comes through a fast state: x1' = x1 + (1 - s) x2, x2' = -3 x2 + u.
+    A, D = np.array([[1.0, 1.0], [0.0, -3.0]]), np.array([[0.0, -1.0], [0.0, 0.0]])
+    assert theta_d.radius(A, D, [0.0, 1.0], np.eye(2), 1.0) == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_radius_agrees_with_terms_of_high_order(seed):
+    """n^3/2 T_n R^n, 500 terms, neither grows nor vanishes."""
+    generator = np.random.default_rng(seed)
+    size, inputs = 2 + seed % 3, 1 + seed % 2
+    A, D = generator.standard_normal((2, size, size))
+    B = generator.standard_normal((size, inputs))
+    found = theta_d.radius(A, D, B, np.eye(size), np.eye(inputs))
+    terms = theta_d_radius.scaled_terms(theta_d_series.start(A, B, np.eye(size), np.eye(inputs)), found * D, 500)
+    sizes = np.linalg.norm(terms, axis=(1, 2)) * np.arange(501.0) ** 1.5
+    # 250 terms apart, so to 0.8 percent of R; where a mode cannot be reached (seed 2) the pole is a double one.
+    assert 0.5 < sizes[380:].max() / sizes[130:250].max() < 7.0
 
 
 def test_radius_of_a_series_that_ends_is_infinite():
