@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
 import covocp as co
-from covocp.blocks import sdre, theta_d
+from covocp.blocks import sdre, theta_d, theta_d_series
 from covocp.models import agile_aircraft, theta_d_benchmarks
 
 RNG = np.random.default_rng(5)
@@ -486,3 +486,24 @@ def test_functions_that_differ_in_small_states_are_not_joined(unit):
     laws = [theta_d.regulator(x, A0, A, [0.0, 1.0], np.eye(2), 1.0, form=f) for f in ("polynomial", "operator")]
     state = np.array([0.3, 0.1]) * unit
     assert float(laws[0](state, 0)) == pytest.approx(float(laws[1](state, 0)), rel=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-19, 1.0, 1e12, 1e19])
+def test_forms_agree_in_every_unit_of_the_state(unit):
+    """1 / (1 + x / unit) is no constant, whatever it looks like at states of the order of 1."""
+    x = ca.SX.sym("x", 2)
+    A, state = ca.diag(ca.vertcat(-1 / (1 + x[0] / unit), -1)), [3.0 * unit, unit]
+    arguments = x, [[0, 1], [0, 0]], A, np.eye(2), np.eye(2), np.eye(2)
+    plain = theta_d.expansion(*arguments, form="operator", terms=3).sum(state, 0.0).full()
+    for form in ("auto", "polynomial"):
+        found = theta_d.expansion(*arguments, form=form, terms=3).sum(state, 0.0).full()
+        np.testing.assert_allclose(found, plain, rtol=1e-12)
+
+
+def test_dependence_is_still_seen_where_entries_change_fast():
+    """sin(2 x) = 2 sin(x) cos(x) at states of any size; the rounding of a large sum makes no difference of it."""
+    x = ca.SX.sym("x", 2)
+    A = ca.SX(2, 2)
+    A[0, 0], A[0, 1], A[1, 0], A[1, 1] = ca.sin(2 * x[0]), ca.sin(x[0]) * ca.cos(x[0]), x[1] / 57.3, x[1]
+    functions, _ = theta_d_series.separated(x, A)
+    assert len(functions) == 2

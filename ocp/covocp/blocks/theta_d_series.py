@@ -34,9 +34,12 @@ Monomial = tuple[int, ...]
 Polynomial = dict[Monomial, Array]
 
 # Scales of the random states at which entries of A(x) are compared, and the relative error up to which they count as
-# linearly dependent: what agrees at all these scales is the same function.
+# linearly dependent: what agrees at all these scales, and then at those of any unit, is the same function.
 SCALES = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 0.03, 0.3, 1.0, 3.0, 1e2, 1e4, 1e6)
+UNITS = tuple(10.0**k for k in range(-30, 31, 3))
 DEPENDENCE_TOLERANCE = 1e-11
+# Rounding of a state, and of what is computed from it, relative: at large states it moves what changes fast.
+STATE_ROUNDING = 16 * float(np.finfo(float).eps)
 # Coefficients of such combinations, of entries of size 1, that are none.
 ROUNDOFF = 1e-13
 # Operations of functions that are known everywhere from their values anywhere.
@@ -237,9 +240,15 @@ def _dependences(entries: Expr) -> tuple[NDArray[np.intp], Array]:
     basis = used[order[:rank]]
     coefficients = np.zeros((rank, count))
     coefficients[:, used[order]] = scaled * norms[used[order]] / norms[basis, None]
-    sizes = np.abs(fresh[:, basis]) @ np.abs(coefficients) + np.abs(fresh)
-    wrong = np.abs(fresh[:, basis] @ coefficients - fresh) > DEPENDENCE_TOLERANCE * sizes
-    return apart if wrong.any() else (basis, coefficients)
+    alike = _combine(fresh, 0.0, basis, coefficients) and _combine(*_in_any_units(entries), basis, coefficients)
+    return (basis, coefficients) if alike else apart
+
+
+def _combine(values: Array, blurs: Array | float, basis: NDArray[np.intp], coefficients: Array) -> bool:
+    """Whether all entries are the combinations of those of the basis, but for rounding."""
+    sizes = DEPENDENCE_TOLERANCE * np.abs(values) + blurs
+    allowed = sizes[:, basis] @ np.abs(coefficients) + sizes
+    return bool((np.abs(values[:, basis] @ coefficients - values) <= allowed).all())
 
 
 def polynomials(
@@ -329,6 +338,19 @@ def _values(function: Expr, seed: int) -> Array:
     sizes = np.abs(found).max(axis=1)
     known = np.isfinite(sizes) & (sizes > 0.0)
     return np.asarray(found[known] / sizes[known, None])
+
+
+def _in_any_units(function: Expr) -> tuple[Array, Array]:
+    """Values as `_values` has them, at states of all sizes, and what the rounding of the state does to them."""
+    state = ca.SX.sym("x", function.size1_in(0))
+    values = function(state)
+    inputs: Any = ([state], [values, ca.fabs(ca.jacobian(values, state)) @ ca.fabs(state)])
+    states = random_states(state.numel(), 32 * values.numel() + 64, 3, UNITS)
+    found = ca.Function("values", *inputs).map(len(states))(states.T)
+    entries, moved = (np.asarray(part.full().T) for part in found)
+    sizes = np.abs(entries).max(axis=1)
+    known = np.isfinite(sizes) & (sizes > 0.0) & np.isfinite(moved).all(axis=1)
+    return entries[known] / sizes[known, None], STATE_ROUNDING * moved[known] / sizes[known, None]
 
 
 def _inverse(closed_loop: Array) -> Array:
