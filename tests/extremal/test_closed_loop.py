@@ -337,3 +337,19 @@ def test_nothing_is_known_exactly_in_theory_and_nearly_in_practice():
         "correlation of the estimate and its error",
     ):
         assert text in str(solution)
+
+
+def test_what_is_known_exactly_has_no_correlation_of_its_estimate_and_error() -> None:
+    """An actuator without noise behind a gain that is free: rounding divided by rounding was 0.94."""
+    ocp = co.Problem(4.0)
+    x, v = ocp.state("x", initial=1.0, variance=0.02), ocp.state("v", initial=0.0, variance=0.01)
+    a, u = ocp.state("a", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, a, noise=0.01)
+    ocp.dynamics(a, (u - a) / 0.3)
+    ocp.measurement("m", x, noise=0.005)
+    ocp.minimize_expected(running=0.05 * u**2 + x**2 + 0.1 * a**2, terminal_weight={x: 20.0, v: 5.0})
+    ocp.chance(x, lower=-0.45, probability=0.95, name="wall")
+    found = co.solve(ocp, intervals=20, progress=False)
+    assert np.sqrt(found.loop.E[:, 2, 2].max()) < 1e-20
+    assert found.optimality.cross_covariance < 1e-4

@@ -299,3 +299,25 @@ def test_the_form_of_the_controls_is_told_where_a_limit_is_reached():
     assert solution.optimality.control_error == pytest.approx(solution.cost / optimum - 1.0, rel=0.5)
     assert solution.optimality.control_slope is None
     assert "estimated effect of the piecewise" in str(solution)
+
+
+@pytest.mark.parametrize("at", [[0.25], [0.25, 0.5, 0.75], [0.0, 0.5, 1.0]])
+def test_a_free_duration_meets_its_condition_with_readings_and_limits_inside_the_intervals(at: list[float]) -> None:
+    """The instants move with the duration; those of the mesh were looked for on the one of all points."""
+
+    def learning(duration: float | co.Free) -> co.Problem:
+        ocp = co.Problem(duration)
+        x, b = ocp.state("x", initial=0.0, final=1.0, variance=0.3), ocp.unknown("b", mean=1.0, variance=0.5)
+        u = ocp.control("u", lower=-5.0, upper=5.0)
+        ocp.dynamics(x, u - b * x, noise=0.01)
+        ocp.measurement("m", x, noise=0.01, at=at, relative=True)
+        E = ocp.estimation_covariance()
+        ocp.subject_to(x, upper=1.5, name="wall")
+        ocp.minimize(running=0.05 * u**2 + 0.1, terminal=E[b, b])
+        return ocp
+
+    best = co.solve(learning(co.Free(1.5, 0.5, 8.0)), intervals=20, points=2, progress=False)
+    assert best.optimality.transversality < 1e-4
+    for share in (0.97, 1.03):
+        fixed = co.solve(learning(share * best.duration), intervals=20, points=2, guess=best, progress=False)
+        assert fixed.cost > best.cost

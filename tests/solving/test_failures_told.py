@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -9,6 +10,7 @@ import pytest
 
 import covocp as co
 from covocp.solution.report import stated_first
+from covocp.solving.decisions import bent_cost
 
 FUEL = 2.0 * (2.0 - 3.0**0.5)  # of a mass moved by 1 within 4 s by at most 1, at rest at both ends
 
@@ -77,3 +79,20 @@ def test_order_of_violations():
     violations = {"one: continuity of x": 9.0, "two: limit": 1.0, "continuity of y": 8.0, "one: final value of x": 2.0}
     ordered = [name for name, _ in stated_first(violations)]
     assert ordered == ["one: final value of x", "two: limit", "one: continuity of x", "continuity of y"]
+
+
+def test_a_gain_is_no_kink_of_the_user() -> None:
+    """Of log(1 + X[u, u]) kinks in 'C' by fmax were told, which the toolbox had put there."""
+
+    def loop(bent: bool) -> co.Problem:
+        ocp = co.Problem(2.0)
+        x, u = ocp.state("x", initial=1.0, variance=0.2), ocp.control("u")
+        ocp.dynamics(x, 0.5 * x + u, noise=0.05)
+        ocp.measurement("m", x, noise=0.01)
+        X = ocp.closed_loop_covariance()
+        ocp.minimize_expected(running=u**2 + (ca.fabs(u) if bent else 0.0) + x**2 + ca.sqrt(1 + X[u, u]))
+        return ocp
+
+    assert bent_cost(co.solve(loop(bent=False), intervals=8, progress=False)) == ""
+    told = co.solve(loop(bent=True), intervals=8, max_iterations=5, progress=False, allow_failure=True)
+    assert "in 'u' (abs)" in bent_cost(replace(told, violations={}))

@@ -41,6 +41,8 @@ ACTIVE = 1e-5
 LARGE_SLOPE = 1e-5
 # Costs below this count as zero.
 NO_COST = 1e-12
+# Share of the largest deviation of a state below which what is left of it is rounding; squared, of that of any state.
+KNOWN = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,10 +254,12 @@ def _loop_identities(loop: ClosedLoop | None) -> dict[str, float | None]:
     """What must hold along every nominal: it checks the integration, not the optimum [spec of chapter 6, 2.1]."""
     if loop is None:
         return {}
-    tiny = np.finfo(float).tiny
     errors, estimates = (standard_deviations(v) for v in (loop.E, loop.X))
+    own = np.maximum(errors, estimates).max(axis=0)  # of what is known exactly rounding is left
+    least = np.maximum(KNOWN * own, KNOWN**2 * own.max(initial=0.0))
+    errors, estimates = (np.where(v > least, v, 0.0) for v in (errors, estimates))
     size = errors[:, :, None] * estimates[:, None, :]
-    cross = np.abs(loop.Z) / np.where(size > tiny, size, np.inf)
+    cross = np.abs(loop.Z) / np.where(size > 0.0, size, np.inf)
     return {
         "cross_covariance": float(cross.max(initial=0.0)),
         "conservation": loop.conservation,
@@ -341,7 +345,8 @@ def _beside(extremal: Extremal) -> NDArray[np.bool_]:
 
 def _transversality(extremal: Extremal, costates: Costates, values: Array, within: Within | None) -> float:
     """k_T + slope of the end conditions and of a link + int H_T dt + H(T), relative to the largest terms of H."""
-    if extremal.mesh.points > 1:  # costates jump inside the intervals
+    mesh = extremal.mesh
+    if mesh.points > 1:  # costates jump inside the intervals
         extremal = refined(extremal)
         costates = discrete_costates(extremal)[0]
     st, trajectory = extremal.statement, extremal.trajectory
@@ -357,8 +362,8 @@ def _transversality(extremal: Extremal, costates: Costates, values: Array, withi
     (explicit,) = along(duration_slope(st), extremal, costates)
     slope += float(np.trapezoid(explicit[:, 0], extremal.time))
     slope += 0.0 if within is None else within.by_duration
-    jumps = extremal.mesh.instants  # H jumps where something is read or holds, and the instant moves with T
-    moved = extremal.mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
+    jumps = mesh.instants  # H jumps where something is read or holds, and the instant moves with T
+    moved = mesh.nodes[jumps] @ (values[np.array(jumps, dtype=np.intp) + 1, 0] - values[jumps, 0])
     residual = slope + float(values[-1, 0]) - float(moved)
     bound = st.duration.lower if residual > 0 else st.duration.upper
     distance, others = abs(trajectory.duration - bound), 0.0 if within is None else within.size

@@ -148,10 +148,11 @@ def design_system(solution: Solution) -> System:
     block = _estimation(statement)
     if block is None:
         raise ProblemError(
-            "Nothing is estimated in this problem, so there is neither noise nor a filter to simulate.",
+            "The covariance of the estimate is no part of this problem, so there is no filter to simulate.",
             expected="a problem with minimize_expected() or estimation_covariance()",
             received=f"'{statement.name}' without either",
-            remedy="say what is uncertain (variance=, noise=) and call estimation_covariance()",
+            remedy="say what is uncertain (variance=, noise=) and call estimation_covariance() after the last state() "
+            "and unknown(): where no cost or condition contains it, the solution stays as it is",
         )
     start = np.concatenate([solution.trajectory.x[0], solution.parameters])
     return _system(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from covocp.base.expressions import Given
-from covocp.base.matrices import Array, half_indices, standard_deviations
+from covocp.base.matrices import Array, distinct, half_indices, near, standard_deviations
 from covocp.base.pages import Part, Section, Sentence, Table, as_text, number
 from covocp.blocks.rotation_chart import rotation_vectors
 from covocp.extremal.path_limits import NOTED
@@ -16,7 +16,7 @@ from covocp.solution.instants import instant_section
 from covocp.solution.origin import Classical, Origin
 from covocp.solution.residual_section import residual_section
 from covocp.statement.entries import entry_names, error_names
-from covocp.statement.statement import Block, Role
+from covocp.statement.statement import Block, Role, Statement
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -380,7 +380,7 @@ def _effort(solution: Solution) -> Section:
     """Mesh, iterations and time, a sentence."""
     mesh, stats = solution.mesh, solution.stats
     words = [
-        _intervals(mesh, stats),
+        _intervals(mesh, solution.extremal.stated, stats),
         f"controls piecewise {mesh.control}",
         _counted(mesh.substeps, "integration step") + " an interval",
         _counted(len(mesh.segments), "shooting segment"),
@@ -403,19 +403,21 @@ def _effort(solution: Solution) -> Section:
     return lines + ([Sentence("effort: " + ", ".join(effort))] if effort else [])
 
 
-def _intervals(mesh: Mesh, stats: Mapping[str, Any]) -> str:
+def _intervals(mesh: Mesh, stated: Statement | None, stats: Mapping[str, Any]) -> str:
     """The number of intervals, how the mesh that was asked for was graded, at how many instants something happens."""
     asked, added, count = stats.get("intervals_asked"), stats.get("nodes_added"), mesh.intervals - len(mesh.instants)
     read = [k for k in mesh.instants if mesh.readings[:, k].any()]
-    held = np.unique(mesh.nodes[[k for k in mesh.instants if k not in read]]).size
+    others = distinct(mesh.nodes[[k for k in mesh.instants if k not in read]])
+    held = np.ones(others.size, dtype=bool) if stated is None else near(others, np.array(stated.instants))
     words = _counted(count, "interval")
     if asked is not None and added is not None and any(added):
         places = "at both ends" if all(added) else "at the start" if added[0] else "at the end"
         words = f"{_counted(asked, 'interval')}, graded to {count} {places}"
     elif asked is not None and asked != count:
-        words = f"{_counted(asked, 'interval')} asked for, {count} between the instants"
+        words = f"{_counted(asked, 'interval')} asked for, {count} between the nodes that are needed"
     words += f", measurements taken at {_counted(len(read), 'instant')}" if read else ""
-    return words + (f", a node for conditions at {_counted(held, 'instant')}" if held else "")
+    words += f", a node for conditions at {_counted(int(held.sum()), 'instant')}" if held.any() else ""
+    return words + (f", the control jumps at {_counted(int((~held).sum()), 'instant')}" if not held.all() else "")
 
 
 def refinement(stats: Mapping[str, Any], of: str = "") -> list[Sentence]:

@@ -10,6 +10,7 @@ import numpy as np
 from covocp.base.kinks import MOSTLY_SMOOTH, kinks
 from covocp.base.matrices import Array
 from covocp.solution.solution import Solution
+from covocp.solving.gain_start import free_gain_block
 from covocp.statement.entries import entry_names
 from covocp.statement.interval import model_symbols
 
@@ -63,10 +64,14 @@ def bent_cost(solution: Solution) -> str:
     symbols = model_symbols(statement)
     controls = [kind.sym(block.name, block.size) for block in statement.controls]
     running = statement.rates(symbols[0], ca.vertcat(*controls), *symbols[2:])[2]
-    bends = [kinks(running, [control]) - MOSTLY_SMOOTH for control in controls]
+    own = free_gain_block(statement)  # which is in the cost by what this toolbox writes
+    bends = [
+        set() if block == own else kinks(running, [control]) - MOSTLY_SMOOTH
+        for block, control in zip(statement.controls, controls, strict=True)
+    ]
     if not any(bends):
         return ""
-    names = " and ".join(f"'{block.name}'" for block, own in zip(statement.controls, bends, strict=True) if own)
+    names = " and ".join(f"'{block.name}'" for block, bent in zip(statement.controls, bends, strict=True) if bent)
     words = ", ".join(sorted(set().union(*bends)))
     return (
         f"\n  The running cost has kinks or jumps in {names} ({words}), where its slope may jump: a likely reason. "

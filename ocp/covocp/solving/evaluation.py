@@ -7,21 +7,20 @@ statistics [6.11] is this with the gains of the design and the covariances of th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, cast, overload
 
 import numpy as np
 
-from covocp.base.checks import as_number, check_kind, column
-from covocp.base.errors import ProblemError, evaluating, no_option, spelling
+from covocp.base.checks import check_kind
+from covocp.base.errors import ProblemError, evaluating
 from covocp.base.expressions import Given
 from covocp.base.later import later
-from covocp.base.matrices import Array, distinct, unpack
+from covocp.base.matrices import Array, unpack
 from covocp.base.threads import one_at_a_time
 from covocp.extremal.closed_loop import close_loop, densities, start_covariance, variances
 from covocp.extremal.densities import check_noise, check_truth
-from covocp.extremal.extremal import Extremal, Outcome
-from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.extremal.extremal import Extremal
 from covocp.extremal.joint import Statistics
 from covocp.extremal.mesh_error import finer_steps
 from covocp.problem.builder import Problem
@@ -30,23 +29,18 @@ from covocp.solution.chances import reached
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution, check_whole
 from covocp.solution.solution import Solution
-from covocp.solving.gain_start import free_gain_block, gain_entries
+from covocp.solving.given_nominal import first_options, options_along, run_along
 from covocp.solving.missed import check_has_loop, missed_by_loop, told
 from covocp.solving.not_finite import with_shortest_steps
 from covocp.solving.unused import mention_forgotten
 from covocp.statement.entries import entry_names
 from covocp.statement.magnitudes import check_magnitudes
-from covocp.statement.names import name_of, stacked_parameters
+from covocp.statement.names import stacked_parameters
 from covocp.statement.statement import Statement
-from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
-from covocp.transcription.grading import graded
-from covocp.transcription.mesh import INTERVALS, Mesh, Options, control_places
 from covocp.transcription.nlp import check_costs
 
 # Relative difference of rates or slopes above which the truth is another system.
 SAME = 1e-9
-# Arguments of `evaluate` beside the options of the mesh.
-ARGUMENTS = ("nominal", "truth", "intervals", "parameters")
 
 
 @overload
@@ -80,7 +74,8 @@ def evaluate(
             (its variances and noise densities count), or a dict of parameter name to value; of phases `Phases`, the
             noise of whose jumps counts too, or such a dict.
         intervals: number of control intervals; None: 100, along a solution its own mesh. Of phases that of each, or a
-            list of one for each.
+            list of one for each. The nodes of a solution are added, twice where its control jumps: the control is the
+            same on every mesh, unless `control=` asks for another form than its own.
         parameters: values of parameters other than the declared ones, by name.
         options: of the mesh, as in `solve`.
 
@@ -136,7 +131,7 @@ def _along(
     mention_forgotten(problem)
     values = stacked_parameters(st, parameters)
     check_magnitudes(st, values)
-    given = graded(st, first_options(nominal, intervals, options), values)
+    given = options_along(st, nominal, first_options(nominal, intervals, options), values)
     outcome = run_along(st, nominal, given, values)
     own_steps = given.substeps == "auto"
     if not outcome.converged:
@@ -152,187 +147,6 @@ def _along(
     with np.errstate(invalid="ignore"):  # a condition that is infinite is told by its name
         solution = Solution.of(replace(outcome, stats=given.grading), METHOD)
     return told(solution) if solution.converged else solution
-
-
-def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> Options:
-    """The mesh that is asked for, or that of a nominal which is a solution."""
-    given = Options(intervals=INTERVALS if intervals is None else intervals, **_known(options))
-    if isinstance(nominal, Solution) and not options and intervals is None:
-        own = nominal.mesh
-        given = replace(given, grid=distinct(own.nodes), control=own.control)  # type: ignore[arg-type]
-    return given
-
-
-def run_along(
-    statement: Statement, nominal: Given, options: Options, parameters: Array, linked: Mapping[int, float] | None = None
-) -> Outcome:
-    """One run along a nominal.
-
-    Args:
-        statement: the problem.
-        nominal: as `evaluate` takes it.
-        options: of the mesh, graded.
-        parameters: of the statement.
-        linked: entries of the initial state that a phase before gives.
-    """
-    mesh = evaluation_mesh(statement, options, parameters)
-    u, duration = _controls(statement, mesh, nominal, options.grading.get("intervals_asked", 0))
-    x0, e0 = starts(statement, mesh, parameters)
-    given = _started_like(statement, nominal, x0, parameters, linked or {})
-    x0, e0 = statement.started(given, parameters, e0)
-    check_model(statement, x0, u[:1].ravel(), e0, duration, parameters)
-    return evaluate_controls(statement, mesh, u, duration, parameters, x0)
-
-
-def _started_like(
-    statement: Statement, nominal: Given, x0: Array, parameters: Array, linked: Mapping[int, float]
-) -> Array:
-    """The initial state, with the decisions of the nominal and, of a solution, what else is free there.
-
-    Raises:
-        ProblemError: the nominal does not give a decision: a guess is no choice; or another one than a phase before.
-    """
-    result = x0.copy()
-    decisions = [block for block in statement.states if block.role == "decision"]
-    if isinstance(nominal, Solution):
-        _take_free(statement, nominal, result, parameters, linked)
-        decisions = [block for block in decisions if block.name in {own.name for own in nominal.blocks}]
-    elif nominal is not None:
-        given, gain = _by_name(statement, nominal), free_gain_block(statement)
-        for block in decisions:
-            if block.name in given:
-                result[block.span] = column(block.name, "value", given[block.name], block.size)
-            elif block != gain and block.span.start not in linked:  # Gain(guess=) says what it is
-                raise _not_given("decision", block.name, ", ".join(given) or "nothing")
-        decisions = [block for block in decisions if block.name in given]
-    for block in decisions if nominal is not None else ():
-        _check_goes_on(block.name, result, block.span, linked)
-    result[list(linked)] = list(linked.values())
-    return result
-
-
-def _take_free(
-    statement: Statement, nominal: Solution, x: Array, parameters: Array, linked: Mapping[int, float]
-) -> None:
-    """Put what is free in an initial state as a solution has it.
-
-    Raises:
-        ProblemError: the solution has no value of a decision.
-    """
-    known = statement.boundary_values(parameters)[0]
-    gain = free_gain_block(statement)
-    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
-    for block in statement.states:
-        if block.name in own and own[block.name].size == block.size:
-            first = nominal.trajectory.x[0, own[block.name].span]
-            x[block.span] = np.where(np.isnan(known[block.span]), first, x[block.span])
-        elif block == gain and nominal.loop is not None:
-            x[block.span] = gain_entries(statement, block, nominal, nominal.t / nominal.duration)[0]
-        elif block.role == "decision" and block.span.start not in linked:
-            raise _not_given("decision", block.name, f"a solution of '{nominal.name}' without it")
-
-
-def _check_goes_on(name: str, values: Array, span: slice, linked: Mapping[int, float]) -> None:
-    """A decision that a phase before has is the same constant.
-
-    Raises:
-        ProblemError: the nominal has another value of it.
-    """
-    for entry in range(span.start, span.stop):
-        before = linked.get(entry, values[entry])
-        if abs(values[entry] - before) > SAME * abs(before):
-            raise ProblemError(
-                f"The nominal gives the decision '{name}' two values.",
-                expected="one value in all phases that have it",
-                received=f"{before:g} and {values[entry]:g}",
-                remedy=f"give '{name}' in the first phase that has it, and leave it out in the others",
-            )
-
-
-def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]:
-    """What a dict gives of controls and decisions, by name.
-
-    Raises:
-        ProblemError: the problem has none of that name.
-    """
-    decisions = tuple(block.name for block in statement.states if block.role == "decision")
-    names = (*(block.name for block in statement.controls), *decisions)
-    result: dict[str, Any] = {}
-    for key, value in nominal.items():
-        name = name_of(key, statement.symbols, names, missing_ok=True)
-        if not name:
-            kinds = "control or decision" if decisions else "control"
-            named = f"'{statement.name}'" if statement.name else "the problem"
-            raise ProblemError(
-                f"The nominal gives '{key}'"[:100] + f", and {named} has no {kinds} of that name.",
-                expected=f"a symbol or name of {', '.join(names)}" if names else f"nothing: it has no {kinds}",
-                received=repr(key)[:100],
-                remedy=spelling(key, names, "correct or remove it"),
-            )
-        result[name] = value
-    return result
-
-
-def _known(options: dict[str, Any]) -> dict[str, Any]:
-    """Options of the mesh; others mean nothing here."""
-    known = {field.name for field in fields(Options)} - {
-        "intervals",
-        "points",
-        "refine",
-    }  # nothing is imposed or solved here
-    for name in options:
-        if name not in known:
-            raise no_option("evaluate()", name, options[name], {*known, *ARGUMENTS})
-    return options
-
-
-def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> tuple[Array, float]:
-    """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
-    nodes, duration = mesh.nodes, statement.duration.guess
-    at = control_places(nodes, mesh.control)
-    if nominal is None:
-        return controls_guess(statement, nodes, mesh.control, sign=0.0), duration
-    if isinstance(nominal, Solution):
-        duration = nominal.duration if statement.duration.free else duration
-        same = nominal.mesh.control == mesh.control and np.array_equal(nominal.mesh.nodes, nodes)
-        sample = nominal.at(at * nominal.duration)
-        columns = []
-        for block in statement.controls:
-            if block.name not in {b.name for b in nominal.blocks if b.kind == "control"}:
-                if block == free_gain_block(statement) and nominal.loop is not None:
-                    columns.append(gain_entries(statement, block, nominal, at))
-                    continue
-                raise _not_given("control", block.name, f"a solution of '{nominal.name}' without it")
-            own = nominal.block(block.name)
-            columns.append(nominal.trajectory.u[:, own.span] if same else sample[block.name].reshape(-1, block.size))
-        return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
-    if not isinstance(nominal, Mapping):
-        raise ProblemError(
-            "The nominal is of an unknown kind.",
-            expected="a Solution, or a dict of control to number, array over the nodes or function of s = t/T",
-            received=repr(nominal)[:100],
-            remedy="correct nominal=",
-        )
-    given = _by_name(statement, nominal)
-    columns = []
-    for block in statement.controls:
-        if block.name not in given:
-            raise _not_given("control", block.name, ", ".join(given) or "nothing")
-        value = given[block.name]
-        value = value if callable(value) else as_number(block.name, "guess", value)
-        if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
-            value = value[(at * asked).astype(int)]  # one for each interval that was asked for
-        columns.append(evaluate_guess(block, value, at))
-    return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
-
-
-def _not_given(kind: str, name: str, received: str) -> ProblemError:
-    return ProblemError(
-        f"The nominal does not give the {kind} '{name}'.",
-        expected="a history of every control" if kind == "control" else "a value of every decision",
-        received=received,
-        remedy=f"add '{name}' to nominal=" if "solution" not in received else f"give a dict with '{name}' as nominal=",
-    )
 
 
 def _under(solution: Solution, truth: Given) -> Solution:

@@ -30,19 +30,13 @@ from covocp.solution.chances import reached
 from covocp.solution.doubts import mention_doubts
 from covocp.solution.origin import METHOD, Origin
 from covocp.solution.phases import PhasesSolution
-from covocp.solving.evaluation import (
-    SAME,
-    check_same,
-    first_options,
-    run_along,
-    statistics_along,
-)
+from covocp.solving.evaluation import SAME, check_same, statistics_along
+from covocp.solving.given_nominal import first_options, options_along, run_along
 from covocp.solving.missed import check_has_loop, missed_by_loop, with_missed
 from covocp.solving.phases_given import intervals_of, of_each, values_of
 from covocp.solving.phases_outcome import phases_solution
 from covocp.solving.unused import mention_forgotten_in
 from covocp.statement.chain import Chain
-from covocp.transcription.grading import graded
 from covocp.transcription.mesh import Options
 from covocp.transcription.nlp import check_costs
 
@@ -130,7 +124,7 @@ def run_all(chain: Chain, nominals: list[Any], options: tuple[Options, ...], val
             states, matrices = link.values(t.x[-1], t.e[-1], t.duration, filled[-1], value)
             value, linked = link.filled(value, matrices), dict(zip(link.states, states.tolist(), strict=True))
         try:
-            fine.append(graded(st, own, value))
+            fine.append(options_along(st, nominal, own, value))
             outcomes.append(run_along(st, nominal, fine[-1], value, linked))
             check_noise(outcomes[-1].extremal)
         except ProblemError as error:

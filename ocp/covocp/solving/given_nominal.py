@@ -1,0 +1,256 @@
+"""The control that `evaluate` is given: on which mesh it is what it is, and the run along it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from covocp.base.checks import as_number, column
+from covocp.base.errors import ProblemError, no_option, spelling
+from covocp.base.expressions import Given
+from covocp.base.matrices import SAME, Array, distinct, near
+from covocp.extremal.extremal import Outcome
+from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
+from covocp.solution.solution import Solution
+from covocp.solving.gain_start import free_gain_block, gain_entries
+from covocp.statement.names import name_of
+from covocp.statement.statement import Statement
+from covocp.transcription.first_guess import check_model, controls_guess, evaluate_guess, starts
+from covocp.transcription.grading import graded
+from covocp.transcription.mesh import INTERVALS, Graded, Mesh, Options, control_places
+
+# Arguments of `evaluate` beside the options of the mesh.
+ARGUMENTS = ("nominal", "truth", "intervals", "parameters")
+
+
+def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> Options:
+    """The mesh that is asked for; of a nominal that is a solution what is not asked for: its nodes, held or linear."""
+    known = _known(options)
+    if isinstance(nominal, Solution):
+        known = {"control": nominal.mesh.control, **known}
+        if intervals is None:
+            known = {"grid": distinct(nominal.mesh.nodes), **known}
+    return Options(intervals=INTERVALS if intervals is None else intervals, **known)
+
+
+def options_along(statement: Statement, nominal: Given, options: Options, parameters: Array) -> Options:
+    """The options with the graded mesh, to which the nodes of a nominal that is a solution are added.
+
+    Its control bends there, and where it jumps there are two: between other nodes it would be another control.
+
+    Args:
+        statement: the problem.
+        nominal: as `evaluate` takes it.
+        options: of the mesh.
+        parameters: of the statement.
+    """
+    given = graded(statement, options, parameters)
+    if not isinstance(nominal, Solution):
+        return given
+    nodes = _with_its_nodes(given.nodes(), nominal)
+    if nodes.size == given.nodes().size:
+        return given
+    if isinstance(given.grid, Graded):
+        return replace(given, grid=replace(given.grid, nodes=nodes))
+    asked = options.intervals if options.grid is None else given.nodes().size - 1
+    return replace(given, grid=Graded(nodes=nodes, asked=asked))
+
+
+def _with_its_nodes(nodes: Array, nominal: Solution) -> Array:
+    """Some nodes and those of a solution, twice where its linear control jumps."""
+    own = nominal.mesh
+    there = distinct(own.nodes)
+    together = np.sort(np.concatenate([nodes, there[~near(there, distinct(nodes))]]))
+    if own.control != "linear":
+        return together
+    inside = there[np.isin(there, own.nodes[own.instants])]
+    inside = inside[(inside > 0.0) & (inside < 1.0)]
+    before, after = (nominal.extremal.controls_at(inside, before=side) for side in (True, False))
+    jumps = inside[(before != after).any(axis=1)]
+    once = distinct(together)
+    twice = once[near(once, jumps)]
+    return np.sort(np.concatenate([together, [place for place in twice if np.sum(together == place) == 1]]))
+
+
+def run_along(
+    statement: Statement, nominal: Given, options: Options, parameters: Array, linked: Mapping[int, float] | None = None
+) -> Outcome:
+    """One run along a nominal.
+
+    Args:
+        statement: the problem.
+        nominal: as `evaluate` takes it.
+        options: of the mesh, graded.
+        parameters: of the statement.
+        linked: entries of the initial state that a phase before gives.
+    """
+    mesh = evaluation_mesh(statement, options, parameters)
+    u, duration = _controls(statement, mesh, nominal, options.grading.get("intervals_asked", 0))
+    x0, e0 = starts(statement, mesh, parameters)
+    given = _started_like(statement, nominal, x0, parameters, linked or {})
+    x0, e0 = statement.started(given, parameters, e0)
+    check_model(statement, x0, u[:1].ravel(), e0, duration, parameters)
+    return evaluate_controls(statement, mesh, u, duration, parameters, x0)
+
+
+def _started_like(
+    statement: Statement, nominal: Given, x0: Array, parameters: Array, linked: Mapping[int, float]
+) -> Array:
+    """The initial state, with the decisions of the nominal and, of a solution, what else is free there.
+
+    Raises:
+        ProblemError: the nominal does not give a decision: a guess is no choice; or another one than a phase before.
+    """
+    result = x0.copy()
+    decisions = [block for block in statement.states if block.role == "decision"]
+    if isinstance(nominal, Solution):
+        _take_free(statement, nominal, result, parameters, linked)
+        decisions = [block for block in decisions if block.name in {own.name for own in nominal.blocks}]
+    elif nominal is not None:
+        given, gain = _by_name(statement, nominal), free_gain_block(statement)
+        for block in decisions:
+            if block.name in given:
+                result[block.span] = column(block.name, "value", given[block.name], block.size)
+            elif block != gain and block.span.start not in linked:  # Gain(guess=) says what it is
+                raise _not_given("decision", block.name, ", ".join(given) or "nothing")
+        decisions = [block for block in decisions if block.name in given]
+    for block in decisions if nominal is not None else ():
+        _check_goes_on(block.name, result, block.span, linked)
+    result[list(linked)] = list(linked.values())
+    return result
+
+
+def _take_free(
+    statement: Statement, nominal: Solution, x: Array, parameters: Array, linked: Mapping[int, float]
+) -> None:
+    """Put what is free in an initial state as a solution has it.
+
+    Raises:
+        ProblemError: the solution has no value of a decision.
+    """
+    known = statement.boundary_values(parameters)[0]
+    gain = free_gain_block(statement)
+    own = {block.name: block for block in nominal.blocks if block.kind == "state"}
+    for block in statement.states:
+        if block.name in own and own[block.name].size == block.size:
+            first = nominal.trajectory.x[0, own[block.name].span]
+            x[block.span] = np.where(np.isnan(known[block.span]), first, x[block.span])
+        elif block == gain and nominal.loop is not None:
+            x[block.span] = gain_entries(statement, block, nominal, nominal.t / nominal.duration)[0]
+        elif block.role == "decision" and block.span.start not in linked:
+            raise _not_given("decision", block.name, f"a solution of '{nominal.name}' without it")
+
+
+def _check_goes_on(name: str, values: Array, span: slice, linked: Mapping[int, float]) -> None:
+    """A decision that a phase before has is the same constant.
+
+    Raises:
+        ProblemError: the nominal has another value of it.
+    """
+    for entry in range(span.start, span.stop):
+        before = linked.get(entry, values[entry])
+        if abs(values[entry] - before) > SAME * abs(before):
+            raise ProblemError(
+                f"The nominal gives the decision '{name}' two values.",
+                expected="one value in all phases that have it",
+                received=f"{before:g} and {values[entry]:g}",
+                remedy=f"give '{name}' in the first phase that has it, and leave it out in the others",
+            )
+
+
+def _by_name(statement: Statement, nominal: Mapping[Any, Any]) -> dict[str, Any]:
+    """What a dict gives of controls and decisions, by name.
+
+    Raises:
+        ProblemError: the problem has none of that name.
+    """
+    decisions = tuple(block.name for block in statement.states if block.role == "decision")
+    names = (*(block.name for block in statement.controls), *decisions)
+    result: dict[str, Any] = {}
+    for key, value in nominal.items():
+        name = name_of(key, statement.symbols, names, missing_ok=True)
+        if not name:
+            kinds = "control or decision" if decisions else "control"
+            named = f"'{statement.name}'" if statement.name else "the problem"
+            raise ProblemError(
+                f"The nominal gives '{key}'"[:100] + f", and {named} has no {kinds} of that name.",
+                expected=f"a symbol or name of {', '.join(names)}" if names else f"nothing: it has no {kinds}",
+                received=repr(key)[:100],
+                remedy=spelling(key, names, "correct or remove it"),
+            )
+        result[name] = value
+    return result
+
+
+def _known(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of the mesh; others mean nothing here."""
+    known = {field.name for field in fields(Options)} - {
+        "intervals",
+        "points",
+        "refine",
+    }  # nothing is imposed or solved here
+    for name in options:
+        if name not in known:
+            raise no_option("evaluate()", name, options[name], {*known, *ARGUMENTS})
+    return options
+
+
+def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> tuple[Array, float]:
+    """Control values on a mesh, and the terminal time, as given; `asked`: intervals before grading, or 0."""
+    nodes, duration = mesh.nodes, statement.duration.guess
+    at = control_places(nodes, mesh.control)
+    if nominal is None:
+        return controls_guess(statement, nodes, mesh.control, sign=0.0), duration
+    if isinstance(nominal, Solution):
+        duration = nominal.duration if statement.duration.free else duration
+        sampled, columns = _sampled(nominal, mesh), []
+        for block in statement.controls:
+            if block.name not in {b.name for b in nominal.blocks if b.kind == "control"}:
+                if block == free_gain_block(statement) and nominal.loop is not None:
+                    columns.append(gain_entries(statement, block, nominal, at))
+                    continue
+                raise _not_given("control", block.name, f"a solution of '{nominal.name}' without it")
+            columns.append(sampled[:, nominal.block(block.name).span])
+        return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
+    if not isinstance(nominal, Mapping):
+        raise ProblemError(
+            "The nominal is of an unknown kind.",
+            expected="a Solution, or a dict of control to number, array over the nodes or function of s = t/T",
+            received=repr(nominal)[:100],
+            remedy="correct nominal=",
+        )
+    given = _by_name(statement, nominal)
+    columns = []
+    for block in statement.controls:
+        if block.name not in given:
+            raise _not_given("control", block.name, ", ".join(given) or "nothing")
+        value = given[block.name]
+        value = value if callable(value) else as_number(block.name, "guess", value)
+        if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
+            value = value[(at * asked).astype(int)]  # one for each interval that was asked for
+        columns.append(evaluate_guess(block, value, at))
+    return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
+
+
+def _sampled(nominal: Solution, mesh: Mesh) -> Array:
+    """Controls of a solution at the places of those of a mesh, (nodes, controls of the solution)."""
+    if nominal.mesh.control == mesh.control and np.array_equal(nominal.mesh.nodes, mesh.nodes):
+        return nominal.trajectory.u
+    at = nominal.mesh.placed(control_places(mesh.nodes, mesh.control))
+    u = nominal.extremal.controls_at(at)
+    if mesh.control == "linear":  # what comes before a jump, and before the end
+        ahead = [*mesh.instants, at.size - 1]
+        u[ahead] = nominal.extremal.controls_at(at[ahead], before=True)
+    return u
+
+
+def _not_given(kind: str, name: str, received: str) -> ProblemError:
+    return ProblemError(
+        f"The nominal does not give the {kind} '{name}'.",
+        expected="a history of every control" if kind == "control" else "a value of every decision",
+        received=received,
+        remedy=f"add '{name}' to nominal=" if "solution" not in received else f"give a dict with '{name}' as nominal=",
+    )
