@@ -305,6 +305,21 @@ def test_nothing_missed():
     )
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1.0, 1e6])
+def test_what_is_missed_does_not_depend_on_the_unit(unit):
+    """A bound of 1e-9 and a limit of 1e-7 were passed by a tenth and more without a word."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, upper=0.5 * unit), ocp.control("u", upper=0.9 * unit)
+    ocp.dynamics(x, u)
+    ocp.subject_to(x, upper=0.7 * unit, name="wall")
+    ocp.subject_to(x, at=0.5, upper=0.3 * unit, name="gate")
+    ocp.minimize(running=(u / unit) ** 2, terminal=((x - unit) / unit) ** 2)
+    missed = co.evaluate(ocp, nominal={"u": unit}, intervals=4).violations
+    expected = {"bounds of x": 0.5, "bounds of u": 0.1, "wall": 0.3, "gate": 0.2}
+    assert missed == pytest.approx({name: value * unit for name, value in expected.items()})
+    assert co.evaluate(ocp, nominal=co.solve(ocp, intervals=4, progress=False)).violations == {}
+
+
 def test_a_nominal_that_diverges():
     ocp = co.Problem(5.0)
     x, u = ocp.state("x", initial=1.0, variance=1.0), ocp.control("u")

@@ -13,13 +13,15 @@ from covocp.statement.conditions import beyond
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.scales import choose_scales, limit_units
 from covocp.transcription.shooting import single_shooting
 from covocp.transcription.stiffness import resolve_mesh
 from covocp.transcription.trajectory import Multipliers, Trajectory
 
-# Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions absolute.
+# Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions in the unit
+# of their limits.
 MISS = 1e-6
-# By how much Ipopt may pass a bound of a variable of the order of 1: a nominal of its is no miss.
+# By how much Ipopt may pass a bound of a variable, in its scale: a nominal of its is no miss.
 RELAXED = 1e-8
 
 
@@ -87,16 +89,18 @@ def missed(extremal: Extremal) -> dict[str, float]:
     for name, value, goal, size in zip(st.state_names, t.x[-1], target, scale, strict=True):
         if abs(value - goal) > MISS * size:  # NaN where it is free
             result[f"final value of {name}"] = float(abs(value - goal))
-    for names, rows, (lower, upper) in (
-        (st.state_names, t.x, st.state_bounds),
-        (st.control_names, t.u, st.control_bounds),
+    units = choose_scales(st, extremal.mesh, t, extremal.parameters)
+    for names, rows, (lower, upper), unit in (
+        (st.state_names, t.x, st.state_bounds, units.x),
+        (st.control_names, t.u, st.control_bounds, units.u),
     ):
         excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=0.0)
-        allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED
+        allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED * unit
         result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
     for conditions, _, rows in extremal.inequalities():
         excess = beyond(rows, conditions.lower, conditions.upper).max(axis=0)
-        result |= {n: float(v) for n, v in zip(conditions.names, excess, strict=True) if v > MISS}
+        allowed = MISS * limit_units(conditions.lower, conditions.upper)
+        result |= {n: float(v) for n, v, a in zip(conditions.names, excess, allowed, strict=True) if v > a}
     return result
 
 
