@@ -241,7 +241,7 @@ def stabilising(
     if reached.size:
         raise lost_mode(reached, *words.reach)
     back = np.linalg.solve(R, N.T)
-    seen = weighted_directions(symmetrised(Q - N @ back))
+    seen = weighted_directions(symmetrised(Q - N @ back), np.abs(Q) + np.abs(N) @ np.abs(back))
     unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable)
     if unseen.size:
         raise lost_mode(unseen, *words.see)
