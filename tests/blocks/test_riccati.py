@@ -485,6 +485,22 @@ BAD_PAIRS = [
     (lambda: riccati.lqr(PHI, np.ones((3, 1)), Q_1, Q_2), "'B'(?s:.)*3 x 1"),
     (lambda: riccati.lqr(ca.SX.sym("A"), 1, 1, 1), "'A'(?s:.)*numbers"),
     (lambda: riccati.rate(np.eye(2), PHI, GAMMA, Q_1, 0.0), "'R'(?s:.)*definite"),
+    (lambda: riccati.rate(np.eye(3), PHI, GAMMA, Q_1, 1.0), "'S'(?s:.)*2 x 2(?s:.)*3 x 3"),
+    (lambda: riccati.rate(np.ones((2, 3)), PHI, GAMMA, Q_1, 1.0), "'S'(?s:.)*2 x 3"),
+    (lambda: riccati.rate(np.eye(2), PHI, GAMMA, Q_1, 1.0, cross=[1.0, 2.0]), r"cross', R\]'"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, R_V, Q_1, 0.0), "'control_weight'(?s:.)*definite"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, R_V, -Q_1, Q_2), "'state_weight'(?s:.)*semidefinite"),
+    (lambda: riccati.lqg(np.ones((2, 3)), GAMMA, H, NOISE, R_V, Q_1, Q_2), "'transition'(?s:.)*square"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, 0.0, Q_1, Q_2), "'R'(?s:.)*definite"),
+    (lambda: riccati.lqg(PHI, GAMMA, H.T, NOISE, R_V, Q_1, Q_2), "'H'(?s:.)*2 x 1"),
+    (
+        lambda: riccati.lqg(np.diag([0.5, 1.5]), [1, 0], [1, 1], np.eye(2), 1, np.eye(2), 1),
+        r"\(transition, B\) is not stabilisable(?s:.)*1.5",
+    ),
+    (lambda: kalman.steady_state(PHI, H.T, NOISE, R_V), "'H'(?s:.)*2 x 1"),
+    (lambda: kalman.steady_state(PHI, "H", NOISE, R_V), "'H'(?s:.)*numbers"),
+    (lambda: kalman.steady_state(PHI, H, NOISE, "R"), "'R'(?s:.)*numbers"),
+    (lambda: kalman.steady_state(PHI, ca.SX.sym("H", 1, 2), NOISE, R_V), "'H'(?s:.)*numbers"),
 ]
 
 

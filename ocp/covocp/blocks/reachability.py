@@ -76,15 +76,22 @@ def balance(A: Array) -> tuple[Array, Array]:
     links = np.where(together & ~np.eye(len(A), dtype=bool), A, 0.0)
     routines: Any = linalg.get_lapack_funcs(("gebal",), (links,))
     units = routines[0](links, scale=True, permute=False)[3]
-    with np.errstate(divide="ignore"):
-        links = np.log2(np.abs(A / units[:, None] * units))
-    links = np.where(together, -np.inf, links - _cycle_mean(links))
+    units = np.exp2(np.clip(np.log2(units) + _apart(A / units[:, None] * units, together), -FARTHEST, FARTHEST))
+    return np.asarray(A / units[:, None] * units), np.asarray(units)
+
+
+def _apart(A: Array, together: NDArray[np.bool_]) -> Array:
+    """Logarithms of the units in which no link between parts that drive each other one way only is above A's size."""
     parts = np.zeros(len(A))
+    if together.all():
+        return parts
+    with np.errstate(divide="ignore"):
+        links = np.log2(np.abs(A))
+    links = np.where(together, -np.inf, links - _cycle_mean(links))
     for _ in range(len(A)):
         driven = np.maximum(parts, np.max(links + parts, axis=1))
         parts = np.max(np.where(together, driven, 0.0), axis=1)
-    units = np.exp2(np.clip(np.log2(units) + np.ceil(parts), -FARTHEST, FARTHEST))
-    return np.asarray(A / units[:, None] * units), np.asarray(units)
+    return np.ceil(parts)
 
 
 def _together(A: Array) -> NDArray[np.bool_]:
