@@ -124,3 +124,19 @@ def test_stable_modes_far_apart_that_a_large_number_links():
     certificate = riccati.lyapunov_certificate([[-1e-3, 1e12], [0.0, -1.0]])
     assert certificate.proves
     assert riccati.unstabilisable([[-1e-3, 1e12], [0.0, -1.0]], [0.0, 0.0]).size == 0
+
+
+@pytest.mark.parametrize("far", [0, 6])
+@pytest.mark.parametrize("seed", range(20))
+def test_sampled_noise_that_misses_an_integrator(seed, far):
+    """In turned coordinates and mixed units: its variance is the rounding of the terms that it is the sum of."""
+    generator = np.random.default_rng(seed)
+    size, step = int(generator.integers(2, 7)), 10.0 ** generator.uniform(-3, 0)
+    A, G = 0.4 * generator.standard_normal((size, size)), generator.standard_normal((size, 1))
+    A[-1], G[-1] = 0.0, 0.0
+    T = np.linalg.qr(generator.standard_normal((size, size)))[0]
+    units = 2.0 ** generator.integers(-3 * far, 3 * far + 1, size)
+    transition, noise = kalman.discretise(T @ A @ T.T, T @ G @ G.T @ T.T, step)
+    transition, noise = transition * units / units[:, None], noise / units / units[:, None]
+    with pytest.raises(ProblemError, match="does not excite"):
+        kalman.steady_state(transition, generator.standard_normal(size), noise, 1.0)

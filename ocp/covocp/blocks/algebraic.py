@@ -242,8 +242,9 @@ def stabilising(
     if reached.size:
         raise lost_mode(reached, *words.reach)
     back = np.linalg.solve(R, N.T)
-    seen = weighted_directions(symmetrised(Q - N @ back), np.abs(Q) + np.abs(N) @ np.abs(back))
-    unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable)
+    rest = symmetrised(Q - N @ back)
+    seen = weighted_directions(rest, np.abs(Q) + np.abs(N) @ np.abs(back))
+    unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable, weights=rest)
     if unseen.size:
         raise lost_mode(unseen, *words.see)
     # In units of R: scipy's pencil, with R beside A and Q, is off by up to a tenth where their sizes are far apart, and

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from covocp.blocks.scaling import RUBBLE, semidefinite_root
+from covocp.blocks.scaling import RUBBLE, over, semidefinite_root
 
 Array = NDArray[np.float64]
 Modes = NDArray[np.complex128]
@@ -25,12 +25,19 @@ NOTHING = 64.0
 FARTHEST = 200.0
 
 
-def lost_modes(A: Array, B: Array, *, discrete: bool, marginal: bool = False) -> Modes:
+def lost_modes(A: Array, B: Array, *, discrete: bool, marginal: bool = False, weights: Array | None = None) -> Modes:
     """Modes of A that are not stable (`marginal`: on the boundary) and that B does not reach, whatever the units.
 
     What no path of entries leads to from B is out of reach as it stands. For the others Hautus' test at each mode, and
     the modes of what a staircase of orthogonal changes of the state finds out of reach: of a multiple mode only the
     mean is known to rounding, and a rank at a mode that is off says nothing.
+
+    Args:
+        A: (n, n).
+        B: (n, m).
+        discrete: stable means inside the unit circle.
+        marginal: on the boundary of stability only.
+        weights: what B is a root of, (n, n): a root of rounding is none, 1e-8 of 1e-16.
     """
     if not len(A):
         return np.zeros(0, dtype=complex)
@@ -39,7 +46,13 @@ def lost_modes(A: Array, B: Array, *, discrete: bool, marginal: bool = False) ->
     size, there, part, columns = _driven_part(balanced, B / units[:, None])
     apart = _chosen(balanced[np.ix_(~there, ~there)], known, largest, discrete, marginal)
     values = _chosen(balanced[np.ix_(there, there)], known, largest, discrete, marginal)
-    lost = [value for value in values if _distance(part, columns, value / size) <= UNREACHABLE]
+    spread = None if weights is None else over(weights, units)[np.ix_(there, there)]
+    lost = [
+        value
+        for value in values
+        if _distance(part, columns, value / size) <= UNREACHABLE
+        or (spread is not None and _is_weightless(balanced[np.ix_(there, there)], spread, value))
+    ]
     rest = _chosen(balance(_out_of_reach(part, columns))[0] * size, known, largest, discrete, marginal)
     return np.concatenate([apart, rest if rest.size > len(lost) else np.asarray(lost, dtype=complex)])
 
@@ -209,6 +222,18 @@ def _chosen(A: Array, known: float, largest: float, discrete: bool, marginal: bo
 def _normalised(columns: Array) -> Array:
     norms = np.linalg.norm(columns, axis=0)
     return np.asarray(columns / np.where(norms > 0.0, norms, 1.0))
+
+
+def _is_weightless(A: Array, weights: Array, mode: complex) -> bool:
+    """Whether the weight of a mode is rounding of the terms that it is the sum of, whatever the units."""
+    sizes = np.linalg.norm(np.abs(A) + abs(mode) * np.eye(len(A)), axis=0)
+    vectors, values, _ = np.linalg.svd((A - mode * np.eye(len(A))) / np.where(sizes > 0.0, sizes, 1.0))
+    # of a multiple mode all its left eigenvectors, and the one of these with the least weight
+    basis = vectors[:, values <= max(UNREACHABLE, values[-1])]
+    least = basis @ np.linalg.eigh(basis.conj().T @ weights @ basis)[1][:, 0]
+    terms = np.abs(least) @ np.abs(weights) @ np.abs(least)
+    rounding = NOTHING * len(A) * float(np.finfo(float).eps)
+    return bool((least.conj() @ weights @ least).real <= rounding * terms)
 
 
 def _out_of_reach(A: Array, B: Array) -> Array:
