@@ -63,6 +63,14 @@ def test_chains_of_lags_are_reached(seed, size, step):
     assert modes.size == 0
 
 
+@pytest.mark.parametrize("link", [1e-30, 1e4])
+def test_a_long_chain_whose_units_are_beyond_all_numbers(link):
+    A, B = link * np.eye(40, k=1) - np.diag(np.arange(40.0)), np.eye(40)[:, -1:]
+    assert riccati.unstabilisable(A, B).size == 0
+    A[20] *= np.arange(40) == 20
+    np.testing.assert_array_equal(riccati.unstabilisable(A, B), [0.0])
+
+
 @pytest.mark.parametrize("fast", [1e3, 1e8, 1e13])
 def test_two_modes_behind_one_fast_actuator(fast):
     """They are reached both where they differ, and where they are equal only their sum is."""

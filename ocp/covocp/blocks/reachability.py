@@ -116,11 +116,12 @@ def _together(A: Array) -> NDArray[np.bool_]:
 
 
 def driven_units(A: Array, B: Array) -> tuple[float, Array]:
-    """Size of A, the largest mean of a cycle of its entries, and units of the states from what drives them.
+    """Size of A, the largest mean of a cycle of its entries, and units of what inputs drive, as logarithms to base 2.
 
     The unit of a state is the largest product of entries, each over the size of A, along a path from an input to it
-    (0: there is none). In these units no entry of A is above its size, no entry of B above that of an input, and to
-    each state leads a chain of entries of full size. They change with the units of the data as these do.
+    (-inf: there is none); along a long one it may be beyond all numbers. In these units no entry of A is above its
+    size, no entry of B above that of an input, and to each state leads a chain of entries of full size. They change
+    with the units of the data as these do.
     """
     with np.errstate(divide="ignore"):
         links, inputs = np.log2(np.abs(A)), np.log2(np.abs(B))
@@ -131,7 +132,7 @@ def driven_units(A: Array, B: Array) -> tuple[float, Array]:
     reached = np.isfinite(inputs)
     means = np.where(reached, inputs, 0.0).sum(axis=0) / np.maximum(reached.sum(axis=0), 1)
     driven = np.max(inputs - means, axis=1, initial=-np.inf)
-    return float(np.exp2(size)), np.asarray(np.where(np.isfinite(driven), np.exp2(np.round(driven)), 0.0))
+    return float(np.exp2(size)), np.asarray(np.round(driven))
 
 
 def _cycle_mean(links: Array) -> float:
@@ -163,9 +164,15 @@ def _driven_part(A: Array, B: Array) -> tuple[float, NDArray[np.bool_], Array, A
     """Of a balanced pair: its size, which states are driven, and A and B of these in units of what drives them."""
     A, B = _without_rounding(A, B)
     size, units = driven_units(A, B)
-    there = units > 0.0
+    there = np.isfinite(units)
     units = units[there]
-    return size, there, A[np.ix_(there, there)] / units[:, None] * units / size, _normalised(B[there] / units[:, None])
+    part, columns = A[np.ix_(there, there)] / size, B[there]
+    with np.errstate(divide="ignore"):
+        links, inputs = np.log2(np.abs(part)), np.log2(np.abs(columns)) - units[:, None]
+    links = np.sign(part) * np.exp2(links + (units - units[:, None]))
+    largest = np.max(inputs, axis=0, initial=-np.inf)
+    inputs = np.sign(columns) * np.exp2(inputs - np.where(np.isfinite(largest), largest, 0.0))
+    return size, there, links, _normalised(inputs)
 
 
 def _distance(A: Array, B: Array, mode: complex) -> float:
