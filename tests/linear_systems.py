@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -56,3 +58,30 @@ def least_squares(estimate, covariance, reading, rows, noise):
     triangle = np.linalg.qr(equations, mode="r")
     inverse = np.linalg.inv(triangle)
     return np.linalg.lstsq(equations, right, rcond=None)[0], inverse @ inverse.T
+
+
+def by_doubling(A, B, Q, R):
+    """The stabilising solution by the structure-preserving doubling algorithm, in 60 digits, without eigenvectors."""
+    exact = np.vectorize(Decimal, otypes=[object])
+    with localcontext(prec=60):
+        A, B, S, R = (exact(np.asarray(matrix, dtype=float)) for matrix in (A, B, Q, R))
+        unit, G = exact(np.eye(len(A))), B @ inverse(R) @ B.T
+        for _ in range(60):
+            W = inverse(unit + G @ S)
+            A, G, S, before = A @ W @ A, G + A @ W @ G @ A.T, S + A.T @ S @ W @ A, S
+            if abs(S - before).max() <= abs(S).max() * Decimal("1e-30"):
+                break
+    return S.astype(float)
+
+
+def inverse(matrix):
+    """By elimination with pivots, of a matrix of decimals."""
+    size = len(matrix)
+    rows = np.hstack([matrix, np.vectorize(Decimal, otypes=[object])(np.eye(size))])
+    for j in range(size):
+        pivot = j + int(np.argmax(abs(rows[j:, j])))
+        rows[[j, pivot]] = rows[[pivot, j]]
+        rows[j] = rows[j] / rows[j, j]
+        others = np.arange(size) != j
+        rows[others] = rows[others] - rows[others, j : j + 1] * rows[j]
+    return rows[:, size:]

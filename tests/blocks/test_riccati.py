@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, localcontext
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -28,6 +26,7 @@ from linear_systems import (
     H,
     K,
     T,
+    by_doubling,
     definite,
 )
 from scipy.integrate import quad_vec, solve_ivp
@@ -73,33 +72,6 @@ HARD = [
     ([[-1.7, 0.5, -0.1], [-0.2, 0.6, 1.3], [0.4, 0.4, -2.3]], [[0.6], [-0.3], [1.0]]),
     ([[-2.8, -2.4, -2.6], [-1.2, 2.9, -3.2], [1.9, 2.5, -0.7]], [[-0.7], [0.5], [1.2]]),
 ]
-
-
-def by_doubling(A, B, Q, R):
-    """The stabilising solution by the structure-preserving doubling algorithm, in 60 digits, without eigenvectors."""
-    exact = np.vectorize(Decimal, otypes=[object])
-    with localcontext(prec=60):
-        A, B, S, R = (exact(np.asarray(matrix, dtype=float)) for matrix in (A, B, Q, R))
-        unit, G = exact(np.eye(len(A))), B @ inverse(R) @ B.T
-        for _ in range(60):
-            W = inverse(unit + G @ S)
-            A, G, S, before = A @ W @ A, G + A @ W @ G @ A.T, S + A.T @ S @ W @ A, S
-            if abs(S - before).max() <= abs(S).max() * Decimal("1e-30"):
-                break
-    return S.astype(float)
-
-
-def inverse(matrix):
-    """By elimination with pivots, of a matrix of decimals."""
-    size = len(matrix)
-    rows = np.hstack([matrix, np.vectorize(Decimal, otypes=[object])(np.eye(size))])
-    for j in range(size):
-        pivot = j + int(np.argmax(abs(rows[j:, j])))
-        rows[[j, pivot]] = rows[[pivot, j]]
-        rows[j] = rows[j] / rows[j, j]
-        others = np.arange(size) != j
-        rows[others] = rows[others] - rows[others, j : j + 1] * rows[j]
-    return rows[:, size:]
 
 
 @pytest.mark.parametrize(("A", "B"), HARD)
@@ -513,6 +485,22 @@ BAD_PAIRS = [
     (lambda: riccati.lqr(PHI, np.ones((3, 1)), Q_1, Q_2), "'B'(?s:.)*3 x 1"),
     (lambda: riccati.lqr(ca.SX.sym("A"), 1, 1, 1), "'A'(?s:.)*numbers"),
     (lambda: riccati.rate(np.eye(2), PHI, GAMMA, Q_1, 0.0), "'R'(?s:.)*definite"),
+    (lambda: riccati.rate(np.eye(3), PHI, GAMMA, Q_1, 1.0), "'S'(?s:.)*2 x 2(?s:.)*3 x 3"),
+    (lambda: riccati.rate(np.ones((2, 3)), PHI, GAMMA, Q_1, 1.0), "'S'(?s:.)*2 x 3"),
+    (lambda: riccati.rate(np.eye(2), PHI, GAMMA, Q_1, 1.0, cross=[1.0, 2.0]), r"cross', R\]'"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, R_V, Q_1, 0.0), "'control_weight'(?s:.)*definite"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, R_V, -Q_1, Q_2), "'state_weight'(?s:.)*semidefinite"),
+    (lambda: riccati.lqg(np.ones((2, 3)), GAMMA, H, NOISE, R_V, Q_1, Q_2), "'transition'(?s:.)*square"),
+    (lambda: riccati.lqg(PHI, GAMMA, H, NOISE, 0.0, Q_1, Q_2), "'R'(?s:.)*definite"),
+    (lambda: riccati.lqg(PHI, GAMMA, H.T, NOISE, R_V, Q_1, Q_2), "'H'(?s:.)*2 x 1"),
+    (
+        lambda: riccati.lqg(np.diag([0.5, 1.5]), [1, 0], [1, 1], np.eye(2), 1, np.eye(2), 1),
+        r"\(transition, B\) is not stabilisable(?s:.)*1.5",
+    ),
+    (lambda: kalman.steady_state(PHI, H.T, NOISE, R_V), "'H'(?s:.)*2 x 1"),
+    (lambda: kalman.steady_state(PHI, "H", NOISE, R_V), "'H'(?s:.)*numbers"),
+    (lambda: kalman.steady_state(PHI, H, NOISE, "R"), "'R'(?s:.)*numbers"),
+    (lambda: kalman.steady_state(PHI, ca.SX.sym("H", 1, 2), NOISE, R_V), "'H'(?s:.)*numbers"),
 ]
 
 

@@ -16,6 +16,7 @@ from covocp.base.arguments import checked, truth
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.blocks.arithmetic import apply
+from covocp.blocks.doubling import doubled
 from covocp.blocks.reachability import balance, lost_modes, nearness, slow_modes, weighted_directions
 from covocp.blocks.scaling import diagonal_scales, over, semidefinite_part, semidefinite_root
 from covocp.blocks.updates import row_matrix
@@ -241,20 +242,19 @@ def stabilising(
     if reached.size:
         raise lost_mode(reached, *words.reach)
     back = np.linalg.solve(R, N.T)
-    seen = weighted_directions(symmetrised(Q - N @ back))
-    unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable)
+    rest = symmetrised(Q - N @ back)
+    seen = weighted_directions(rest, np.abs(Q) + np.abs(N) @ np.abs(back))
+    unseen = lost_modes((A - B @ back).T, seen, discrete=discrete, marginal=not detectable, weights=rest)
     if unseen.size:
         raise lost_mode(unseen, *words.see)
-    # In units of R: scipy's pencil, with R beside A and Q, is off by up to a tenth where their sizes are far apart.
-    # A power of two changes no digit of the numbers.
+    # In units of R: scipy's pencil, with R beside A and Q, is off by up to a tenth where their sizes are far apart, and
+    # takes an R for singular whose entries are. Powers of two change no digit of the numbers.
     unit = 2.0 ** np.round(np.log2(np.linalg.norm(R, 2))) if R.size else 1.0
-    Q, R, N = Q / unit, R / unit, N / unit
+    inputs = diagonal_scales(R / unit)
+    B, Q, R, N = B / inputs, Q / unit, over(R / unit, inputs), N / unit / inputs
     if not len(A):
         return np.zeros((0, 0))
-    try:
-        solution, residual = _corrected(A, B, Q, R, N, discrete)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise _unsolved(str(error)) from error
+    solution, residual, received = _solved(A, B, Q, R, N, discrete)
     closed = A - B @ gain_of(A, B, R, N, solution, discrete=discrete)
     left = slow_modes(closed, discrete=discrete)
     if left.size and np.abs(np.linalg.eigvals(A) - left[0]).min() <= NEAR * np.linalg.norm(A, 2):
@@ -262,19 +262,43 @@ def stabilising(
         hardly = nearness(A, B, left[0]) <= nearness((A - B @ back).T, seen, left[0])
         raise lost_mode(left, *(words.reach if hardly else words.see))
     if left.size or not residual <= RESIDUAL:
-        raise _unsolved("the closed loop is not stable" if left.size else f"a relative residual of {residual:.3g}")
+        stable = received or f"a relative residual of {residual:.3g}"
+        raise _unsolved("the closed loop is not stable" if left.size and not received else stable)
     return semidefinite_part(solution) * unit
 
 
-def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool) -> tuple[Array, float]:
-    """Scipy's solution and its relative residual, corrected by Newton's method with the diagonal scaled to one."""
+def _solved(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool) -> tuple[Array, float, str]:
+    """The solution, its relative residual (infinite: none), and what the last of the methods said that failed.
+
+    Scipy's solver orders the eigenvalues of a pencil, which fails where some are close to the boundary or rounding
+    moves them over it. Doubling knows none of them.
+    """
+    best, least, received = np.zeros(A.shape), np.inf, ""
+    for start in (_by_pencil, doubled):
+        try:
+            solution, residual = _corrected(A, B, Q, R, N, start(A, B, Q, R, N, discrete=discrete), discrete)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            received = str(error)
+            continue
+        if residual < least:
+            best, least, received = solution, residual, ""
+        if least <= RESIDUAL:
+            break
+    return best, least, received
+
+
+def _by_pencil(A: Array, B: Array, Q: Array, R: Array, N: Array, *, discrete: bool) -> Array:
+    """Scipy's solution; without inputs that of the linear equation."""
     from scipy import linalg
 
+    if not B.shape[1]:
+        return np.asarray(np.atleast_2d(lyapunov(A.T, Q, discrete=discrete)))
     solve = linalg.solve_discrete_are if discrete else linalg.solve_continuous_are
-    if B.shape[1]:
-        start = symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float))
-    else:  # no input: the equation is linear
-        start = np.atleast_2d(lyapunov(A.T, Q, discrete=discrete))
+    return np.asarray(symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float)))
+
+
+def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, start: Array, discrete: bool) -> tuple[Array, float]:
+    """A solution and its relative residual, corrected by Newton's method with the diagonal scaled to one."""
     units = diagonal_scales(start)
     A, B = A * units[:, None] / units, B * units[:, None]
     Q, N, start = over(Q, units), N / units[:, None], over(start, units)

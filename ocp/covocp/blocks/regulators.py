@@ -14,7 +14,7 @@ from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.short_repr import short_repr
 from covocp.blocks import bucy
-from covocp.blocks.algebraic import frozen, gain_of, sorted_modes, stabilising, weights
+from covocp.blocks.algebraic import CONTROL, Words, frozen, gain_of, sorted_modes, stabilising, weights
 from covocp.blocks.arithmetic import apply, definite_solve, precision, symmetric
 from covocp.blocks.duality import Control, dual
 from covocp.blocks.scaling import scales
@@ -29,6 +29,13 @@ Modes = NDArray[np.complex128]
 STEADY = 1e-9
 EQUILIBRATIONS = 30
 REFINEMENTS = 4
+
+# What the regulator of `lqg` is called, which has a filter beside it.
+GAUSSIAN = Words(
+    names=("transition", "B", "state_weight", "control_weight"),
+    reach=("(transition, B)", *CONTROL.reach[1:]),
+    see=("(transition, state_weight^1/2)", *CONTROL.see[1:3], "state_weight gives no weight"),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,8 +137,13 @@ def lqr(A: Expr, B: Expr, Q: Expr, R: Expr, *, cross: Expr = None, discrete: boo
         ProblemError: expressions, shapes that do not fit, indefinite weights; (A, B) not stabilisable or (A, Q^1/2) not
             detectable: names the mode.
     """
-    a, b, q, r, n = weights(A, B, Q, R, cross)
-    cost = stabilising(a, b, q, r, n, discrete=discrete, detectable=True)
+    return _regulator(weights(A, B, Q, R, cross), discrete, CONTROL)
+
+
+def _regulator(matrices: tuple[Array, ...], discrete: bool, words: Words) -> Regulator:
+    """The regulator of checked matrices A, B, Q, R, N, and what the user calls them."""
+    a, b, q, r, n = matrices
+    cost = stabilising(a, b, q, r, n, discrete=discrete, detectable=True, words=words)
     gain = gain_of(a, b, r, n, cost, discrete=discrete)
     return Regulator(gain=frozen(gain), cost=frozen(cost), eigenvalues=sorted_modes(a - b @ gain))
 
@@ -156,10 +168,11 @@ def lqg(
     Raises:
         ProblemError: as for `lqr` and `kalman.steady_state`.
     """
-    regulator = lqr(transition, B, state_weight, control_weight, discrete=True)
+    matrices = weights(transition, B, state_weight, control_weight, None, GAUSSIAN)
+    regulator = _regulator(matrices, True, GAUSSIAN)
     observer = steady_state(transition, H, noise, R)
-    b, q = numeric("B", matrix("B", B)), numeric("noise", matrix("noise", noise))
-    steps = numeric("control_weight", matrix("control_weight", control_weight)) + b.T @ regulator.cost @ b
+    q = numeric("noise", matrix("noise", noise))
+    steps = matrices[3] + matrices[1].T @ regulator.cost @ matrices[1]
     K = regulator.gain
     return GaussianRegulator(
         regulator=regulator,
@@ -191,11 +204,15 @@ def rate(S: Expr, A: Expr, B: Expr, Q: Expr, R: Expr, *, gain: Expr = None, cros
     """
     a = square("A", A)
     b = matrix("B", B, (a.shape[0], None))
-    weight("Q", Q, a.shape[0]), weight("R", R, b.shape[1], definite=gain is None)
+    q, r = weight("Q", Q, a.shape[0]), weight("R", R, b.shape[1], definite=gain is None)
+    end = square("S", S, a.shape[0])
+    n = None if cross is None else matrix("cross", cross, b.shape)
+    if n is not None and not is_symbolic(q, r, n):
+        weight("[Q, cross; cross', R]", ca.blockcat([[q, n], [n.T, r]]))
     filtering = dual(Control(transition=a, input=b, state_weight=Q, control_weight=R, cross=cross))
     backward = None if gain is None else matrix("gain", gain, (b.shape[1], a.shape[0])).T
     slope = bucy.rate(
-        matrix("S", S),
+        end,
         filtering.transition,
         filtering.measurement,
         filtering.noise,

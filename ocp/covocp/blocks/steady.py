@@ -13,12 +13,13 @@ from covocp.base.gains import innovation_gain, kalman_gain
 from covocp.base.short_repr import short_repr
 from covocp.blocks.algebraic import Words, frozen, sorted_modes, stabilising, weights
 from covocp.blocks.duality import Estimation, dual
-from covocp.blocks.updates import joseph_form
+from covocp.blocks.updates import joseph_form, row_matrix
+from covocp.blocks.values import matrix, square
 
 Array = NDArray[np.float64]
 
 WORDS = Words(
-    names=("transition", "H'", "noise", "R"),
+    names=("transition", "H", "noise", "R"),
     reach=(
         "(transition, H)",
         "detectable",
@@ -71,7 +72,9 @@ def steady_state(transition: Expr, H: Expr, noise: Expr, R: Expr, *, discrete: b
         ProblemError: expressions, shapes that do not fit, indefinite noise, singular R; (transition, H) not detectable
             or (transition, noise^1/2) not stabilisable: names the mode.
     """
-    problem = dual(Estimation(transition=transition, measurement=H, noise=noise, measurement_noise=R))
+    rows = row_matrix("H", H, square("transition", transition).shape[0])
+    density, spread = matrix("noise", noise), matrix("R", R)
+    problem = dual(Estimation(transition=transition, measurement=rows, noise=density, measurement_noise=spread))
     matrices = weights(
         problem.transition, problem.input, problem.state_weight, problem.control_weight, problem.cross, WORDS
     )
