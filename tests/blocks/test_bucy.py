@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import factorial
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -122,6 +124,47 @@ def test_discretisation_of_a_stiff_system():
     transition, noise = kalman.discretise(np.diag([-1000.0, -1.0]), np.eye(2), 1.0)
     np.testing.assert_allclose(transition, np.diag([0.0, np.exp(-1.0)]), atol=1e-15)
     np.testing.assert_allclose(noise, np.diag([1 / 2000.0, (1 - np.exp(-2.0)) / 2]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [2, 4, 7, 12])
+@pytest.mark.parametrize("step", [1e-4, 0.01, 1.0])
+@pytest.mark.parametrize("unit", [1.0, 1e-5])
+def test_chain_of_integrators_in_every_entry(size, step, unit):
+    """Noise into the last of n integrators: h^(2n-1-i-j) / ((2n-1-i-j) (n-1-i)! (n-1-j)!), state i in units^i."""
+    left = np.arange(size)[::-1]
+    powers, sizes = left[:, None] + left + 1, np.array([factorial(k) for k in left.tolist()], dtype=float)
+    units = unit ** np.arange(size)
+    A, density = np.eye(size, k=1) * units[:, None] / units, np.zeros((size, size))
+    density[-1, -1] = units[-1] ** 2
+    transition, noise = kalman.discretise(A, density, step)
+    expected = step**powers / powers / np.outer(sizes, sizes)
+    np.testing.assert_allclose(noise / np.outer(units, units), expected, rtol=3e-14)
+    lags = np.arange(size) - np.arange(size)[:, None]
+    wanted = [[step**k / factorial(k) if k >= 0 else 0.0 for k in row] for row in lags.tolist()]
+    np.testing.assert_allclose(transition / units[:, None] * units, wanted, rtol=1e-14)
+
+
+@pytest.mark.parametrize("step", [1e-3, 0.1, 2.0])
+def test_noise_through_a_lag_and_an_integrator(step):
+    """dx = v, dv = -a v + n in closed form, by differences that are computed without cancellation."""
+    a = 3.0
+    z = a * step
+    _, noise = kalman.discretise([[0.0, 1.0], [0.0, -a]], np.diag([0.0, 2.0]), step)
+    series = [((-z) ** k * (4 - 2**k) / factorial(k)) for k in range(3, 60)]  # 2 z - 3 + 4 exp(-z) - exp(-2 z)
+    position = sum(series) / a**3
+    np.testing.assert_allclose(
+        noise, [[position, (np.expm1(-z) / a) ** 2], [(np.expm1(-z) / a) ** 2, -np.expm1(-2 * z) / a]], rtol=1e-11
+    )
+
+
+def test_discretisation_does_not_depend_on_units():
+    generator = np.random.default_rng(8)
+    A, Q = generator.standard_normal((4, 4)), definite(generator, 4)
+    units = 10.0 ** np.array([-6.0, 5.0, 0.0, -3.0])
+    transition, noise = kalman.discretise(A, Q, 0.3)
+    moved, other = kalman.discretise(A * units[:, None] / units, Q * np.outer(units, units), 0.3)
+    np.testing.assert_allclose(moved, transition * units[:, None] / units, rtol=1e-12)
+    np.testing.assert_allclose(other, noise * np.outer(units, units), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "error"), [(1.0, 1e-15), (4.0, 2e-10), (16.0, 1e-4)])

@@ -231,6 +231,64 @@ def test_refusal_of_two_accurate_sensors_names_the_form_that_takes_them(form):
     assert estimate[0] == pytest.approx(float(6 / Fraction(noise) / inverse), rel=1e-12)
 
 
+@pytest.mark.parametrize("noise", [1e-8, 1e-12, 1e-16])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e6, 1e-9)])
+def test_information_form_with_an_accurate_sensor(noise, units):
+    """M = I, h = (1, 0.7): the residual after the update is y R / (h h' + R), P = I - h' h / (h h' + R)."""
+    h, y, change = np.array([1.0, 0.7]), 0.3, np.array(units)
+    arguments = (np.zeros(2), np.diag(change**2), y, h / change, noise)
+    kinds = symbols(ca.SX, 2, 1)
+    update = ca.Function("update", kinds, list(kalman.update(*kinds, form="information")))
+    expected = np.eye(2) - np.outer(h, h) / (h @ h + noise)
+    for estimate, covariance in (
+        kalman.update(*arguments, form="information"),
+        (value.full() for value in update(*arguments[:3], arguments[3][None, :], noise)),
+    ):
+        estimate, covariance = np.ravel(estimate) / change, covariance / np.outer(change, change)
+        assert abs(y - h @ estimate - y * noise / (h @ h + noise)) <= 2e-16
+        np.testing.assert_allclose(estimate, h * y / (h @ h + noise), rtol=1e-14)
+        np.testing.assert_allclose(covariance, expected, rtol=0, atol=1e-15)
+
+
+def test_information_form_keeps_coarse_readings_beside_many_accurate_ones():
+    """Ten accurate readings of one combination, two coarse ones of the rest: against rational numbers."""
+    generator = np.random.default_rng(3)
+    rows = np.vstack([np.outer(generator.uniform(0.5, 2.0, 10), [1.0, 0.7]), [[0.3, 1.0], [1.0, -0.5]]])
+    variances, y = np.append(np.full(10, 1e-14), [1.0, 2.0]), np.append(rows[:10, 0], [0.4, 2.0])
+    information = [[Fraction(int(i == j)) for j in range(2)] for i in range(2)]
+    known = [Fraction(0), Fraction(0)]
+    for row, variance, value in zip(rows.tolist(), variances.tolist(), y.tolist(), strict=True):
+        for i in range(2):
+            known[i] += Fraction(row[i]) * Fraction(value) / Fraction(variance)
+            for j in range(2):
+                information[i][j] += Fraction(row[i]) * Fraction(row[j]) / Fraction(variance)
+    (a, b), (_, d) = information
+    expected = [(d * known[0] - b * known[1]) / (a * d - b * b), (a * known[1] - b * known[0]) / (a * d - b * b)]
+    spreads = [float(d / (a * d - b * b)), float(a / (a * d - b * b))]
+    estimate, P = kalman.update(np.zeros(2), np.eye(2), y, rows, np.diag(variances), form="information")
+    np.testing.assert_allclose(estimate, [float(value) for value in expected], rtol=1e-13)
+    np.testing.assert_allclose(np.diag(P), spreads, rtol=1e-7)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("noise", [1e-10, 1e-13, 3e-15])
+def test_two_sensors_of_nearly_the_same(form, noise):
+    """H M H' + R holds little of R any more: the difference of the readings, against a solution in rational numbers."""
+    rows, y = np.array([[1.0, 0.5], [1.0, 0.5 + 1e-7]]), np.array([0.3, 0.3 + 2e-7])
+    a, b = (Fraction(value) for value in rows[0].tolist())
+    c = Fraction(float(rows[1, 1]))
+    r, (y1, y2) = Fraction(noise), (Fraction(value) for value in y.tolist())
+    information = (1 + 2 * a * a / r, a * (b + c) / r, 1 + (b * b + c * c) / r)
+    known = (a * (y1 + y2) / r, (b * y1 + c * y2) / r)
+    size = information[0] * information[2] - information[1] ** 2
+    x = (information[2] * known[0] - information[1] * known[1]) / size
+    z = (information[0] * known[1] - information[1] * known[0]) / size
+    estimate, covariance = kalman.update(np.zeros(2), np.eye(2), y, rows, noise * np.eye(2), form=form)
+    np.testing.assert_allclose(estimate, [float(x), float(z)], rtol=0, atol=2e-7)
+    spreads = [float(information[2] / size), float(information[0] / size)]
+    np.testing.assert_allclose(np.diag(covariance), spreads, rtol=1e-6)
+
+
 def test_factor_update_in_turn_names_the_array_form_where_noises_depend():
     root = np.array([[1.0, 0.0], [1.0, 0.0]])
     with pytest.raises(ProblemError, match=r"singular(?s:.)*form='array'"):

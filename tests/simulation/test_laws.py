@@ -102,6 +102,59 @@ def test_a_run_that_diverges_says_so():
     assert noisy.diverged.all()
 
 
+SCALAR, RATE = ca.SX.sym("x"), ca.SX.sym("u")
+NOTHING = ca.Function("law", [SCALAR, T], [0.0])
+
+
+@pytest.mark.parametrize("start", [1.0, 1e5, 2e9, 1e40])
+@pytest.mark.parametrize("runs", [None, 2])
+def test_a_stable_loop_from_far_away_has_not_diverged(start, runs):
+    """x' = -0.1 x: neither the size of the start nor that of the cost says anything about divergence."""
+    plant = ca.Function("plant", [SCALAR, RATE], [-0.1 * SCALAR + RATE])
+    cost = ca.Function("cost", [SCALAR, RATE], [SCALAR**2])
+    run = simulate_law(plant, NOTHING, initial=[start], duration=20.0, samples=5, running=cost, runs=runs)
+    assert not run.diverged.any()
+    np.testing.assert_allclose(
+        run.x[..., 0], np.broadcast_to(start * np.exp(-0.1 * run.t), run.x.shape[:-1]), rtol=1e-6
+    )
+    np.testing.assert_allclose(run.cost[..., -1], 5.0 * start**2 * -np.expm1(-4.0), rtol=1e-6)
+
+
+def test_a_plant_that_starts_at_zero_may_go_far_in_its_units():
+    """x' = 1e22 - x, as a density that is filled."""
+    plant = ca.Function("plant", [SCALAR, RATE], [1e22 - SCALAR + RATE])
+    for runs in (None, 2):
+        run = simulate_law(plant, NOTHING, initial=[0.0], duration=4.0, samples=5, runs=runs)
+        assert not run.diverged.any()
+        np.testing.assert_allclose(run.x[..., -1, 0], -1e22 * np.expm1(-4.0), rtol=1e-7)
+
+
+def test_a_filter_that_knows_nothing_yet_has_not_diverged():
+    """P' = -0.2 P - P^2 / V from P(0) = (100 km)^2: 1/P grows as exp(0.2 t) and its integral."""
+    plant = ca.Function("plant", [SCALAR, RATE], [-0.1 * SCALAR + RATE])
+    observer = extended_filter(plant, [1.0], [[0.0]], [[1e4]], [0.0], [[1e10]])
+    run = simulate_law(plant, NOTHING, initial=[1e5], duration=20.0, samples=5, observer=observer)
+    assert not run.diverged
+    inverse = np.exp(0.2 * run.t) * 1e-10 + np.expm1(0.2 * run.t) / 0.2 / 1e4
+    np.testing.assert_allclose(run.filter_state[:, 1], 1.0 / inverse, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("start", "samples"), [(10.0, 61), (0.05, 61), (1e-4, 3)])
+@pytest.mark.parametrize("runs", [None, 2])
+def test_a_finite_escape_is_a_divergence(start, samples, runs):
+    """x' = x^2: x = 1 / (1 / x(0) - t), also where it escapes before the first sample."""
+    plant = ca.Function("plant", [SCALAR, RATE], [SCALAR**2 + RATE])
+    duration = max(60.0, 3.0 / start)
+    run = simulate_law(
+        plant, NOTHING, initial=[start], duration=duration, samples=samples, runs=runs, step=duration / 6000
+    )
+    assert run.diverged.all()
+    before = run.t < 0.95 / start
+    wanted = 1.0 / (1.0 / start - run.t[before])
+    np.testing.assert_allclose(run.x[..., before, 0], np.broadcast_to(wanted, run.x[..., before, 0].shape), rtol=1e-5)
+    assert np.isnan(run.x[..., run.t > 1.0 / start, 0]).all()
+
+
 def test_runs_without_noise_are_the_accurate_run():
     observer = gain_filter(PLANT, CONSTANT, H, ESTIMATE)
     wanted = simulate_law(PLANT, LAW, initial=START, duration=3.0, observer=observer, samples=31)

@@ -169,3 +169,12 @@ def test_readings_that_do_not_fit_are_named():
     for wrong in (ca.Function("reading", [memory, measured, t], [memory]), lambda *given: given[0], 3):
         with pytest.raises(ProblemError, match="'reading'"):
             simulated(reading=wrong)
+
+
+def test_a_run_that_falls_from_far_away_has_not_diverged():
+    plant, sensor, law = parts()
+    memory, measured, t = ca.SX.sym("memory", 2), ca.SX.sym("measured", 2), ca.SX.sym("t")
+    idle = ca.Function("law", [memory, measured, t], [memory, 0.0])
+    found = simulated(functions=(plant, sensor, idle), runs=3, initial=[[1.0], [5e13], [1e40]])
+    assert not found.diverged.any()
+    np.testing.assert_allclose(found.x[1:, -1, 0], np.array([5e13, 1e40]) * 0.9**16, rtol=1e-10)

@@ -129,6 +129,19 @@ def definite_solve(matrix: Expr, right: Expr, what: str, remedy: str = SOME_NOIS
     return ca.ldl_solve(ca.densify(right), entries, upper, order)
 
 
+def definite_root(matrix: Array, what: str, remedy: str = SOME_NOISE) -> Array:
+    """Lower triangular L with L L' = matrix, of positive definite numbers; the words are for the message.
+
+    Raises:
+        ProblemError: not positive definite.
+    """
+    units = diagonal_scales(matrix)
+    try:
+        return np.asarray(units[:, None] * np.linalg.cholesky(over(matrix, units)))
+    except np.linalg.LinAlgError as error:
+        raise _indefinite(what, matrix, remedy) from error
+
+
 def unit_triangular(matrix: Expr, what: str, remedy: str = SOME_NOISE) -> tuple[Any, Any]:
     """L and the column D of matrix = L diag(D) L', L unit lower triangular; the words are for the message.
 

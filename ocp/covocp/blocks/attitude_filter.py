@@ -19,8 +19,8 @@ from covocp.base.matrices import half_indices, half_length, standard_deviations
 from covocp.base.short_repr import short_repr
 from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.differences import independent, is_usable
+from covocp.blocks.factors import in_turn_with_surprise, triangular
 from covocp.blocks.quaternions import quaternion_product
-from covocp.blocks.square_root import in_turn_with_surprise, triangular
 from covocp.blocks.values import matrix
 
 Array = NDArray[np.float64]

@@ -24,8 +24,8 @@ from covocp.blocks.attitude_filter import Correction, GradientEstimate, Memory
 from covocp.blocks.attitude_options import Options, Settings, settings_of
 from covocp.blocks.checked_function import CheckedFunction
 from covocp.blocks.excitation import sine
+from covocp.blocks.factors import triangular
 from covocp.blocks.quaternions import from_quaternion, quaternion_step
-from covocp.blocks.square_root import triangular
 from covocp.blocks.values import array, wrong_argument
 from covocp.blocks.zone_programs import MOST_ROWS, SILENT, projection, projection_by_solver, reduced
 from covocp.blocks.zones import Zone, ZoneLike, zone_rows, zones_of

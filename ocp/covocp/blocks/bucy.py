@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from math import factorial
 from typing import Any
 
@@ -19,6 +19,10 @@ from covocp.blocks.arithmetic import apply, definite_solve, precision, semidefin
 from covocp.blocks.updates import row_matrix
 from covocp.blocks.values import is_symbolic, matrix, restored, square, weight
 
+Array = NDArray[np.float64]
+
+# A term of the series for numbers that is this small beside the sum, entry by entry, is the last.
+ROUNDING = 1e-17
 # Symbolic discretisation: a series over step / 2^DOUBLINGS, then doublings. For |A| step = 1, 4, 16 its error relative
 # to exp is below 1e-15, 2e-10, 1e-4.
 DOUBLINGS = 4
@@ -80,8 +84,10 @@ def _given(E: Expr, F: Expr, M: Expr, Q: Expr, U: Expr, C: Expr, K: Expr) -> tup
 def discretise(A: Expr, Q: Expr, step: Expr) -> tuple[Any, Any]:
     """Transition matrix exp(A h) and noise covariance of a step: the integral of exp(A s) Q exp(A' s) over [0, h].
 
-    Numbers: exact to rounding, by Van Loan's exponential of [-A Q; 0 A'] over a step so short that the exponential is
-    near one, then doublings Q_2h = Q_h + Phi_h Q_h Phi_h', which cannot lose definiteness or overflow for stiff A.
+    Numbers: exact to rounding, each entry of itself where its terms have one sign, in any units: the series of exp(A s)
+    until no term counts in any entry, and a Gauss rule of as many points, over a part of the step as short as the
+    largest eigenvalue of |A| asks for; then doublings Q_2h = Q_h + Phi_h Q_h Phi_h', which cannot lose definiteness or
+    overflow for stiff A.
     Expressions: a series of order 8 and a Gauss rule over h/16, then four doublings; the result is positive
     semidefinite whatever the step, its relative error below 1e-15, 2e-10, 1e-4 for |A| h = 1, 4, 16.
 
@@ -103,7 +109,7 @@ def discretise(A: Expr, Q: Expr, step: Expr) -> tuple[Any, Any]:
         transition, noise = apply(_series, a, q, h)
     else:
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
-            transition, noise = _van_loan(a.full(), q.full(), float(h))
+            transition, noise = _to_rounding(a.full(), q.full(), float(h))
         if not (np.isfinite(transition).all() and np.isfinite(noise).all()):
             raise ProblemError(
                 "The transition over the step is larger than any number.",
@@ -129,16 +135,43 @@ def time_step(value: Expr) -> Any:
     return step
 
 
-def _van_loan(A: NDArray[np.float64], Q: NDArray[np.float64], h: float) -> tuple[Any, Any]:
-    from scipy.linalg import expm
+def _to_rounding(A: Array, Q: Array, h: float) -> tuple[Any, Any]:
+    """The discretisation of numbers, every entry to rounding of the sum of the sizes of its terms.
 
-    size = A.shape[0]
-    length = float(np.linalg.norm(A, 1)) * h
-    doublings = max(0, int(np.ceil(np.log2(length)))) if length > 1.0 else 0
-    block = np.block([[-A, Q], [np.zeros((size, size)), A.T]]) * (h / 2**doublings)
-    exponential = expm(block)
-    transition = exponential[size:, size:].T
-    return _doubled(transition, symmetric(transition @ exponential[:size, size:]), doublings)
+    What is taken from A is the largest eigenvalue of its sizes |A|, and terms are compared entry by entry: neither
+    depends on the units of the states, and a chain of integrators, whose entries are powers of the step, has them all.
+    """
+    largest = np.abs(np.linalg.eigvals(np.abs(A))).max(initial=0.0)
+    rate = min(float(largest), float(np.finfo(float).max))
+    doublings = max(0, int(np.ceil(np.log2(rate) + np.log2(h)))) if rate > 0.0 else 0
+    short = float(np.ldexp(h, -doublings))
+    terms = _exponential_terms(A * short)
+    count = len(terms)
+    nodes, weights = _gauss(count)
+    moved = np.tensordot(((1.0 + nodes) / 2.0)[:, None] ** np.arange(count), terms, 1)
+    noise = np.tensordot(weights / 2.0, moved @ Q @ moved.mT, 1) * short
+    return _doubled(terms.sum(axis=0), symmetric(noise), doublings)
+
+
+def _exponential_terms(B: Array) -> Array:
+    """B^k / k!, (terms, n, n), until no further one changes an entry of their sum, by their sizes.
+
+    Where |B|^k / k! <= e S_k entry by entry, S_k the sum so far, the next one is <= e S_k |B| / (k + 1) <= e S_(k + 1).
+    """
+    terms, sizes = [np.eye(len(B))], np.eye(len(B))
+    size, total = np.abs(B), np.eye(len(B))
+    while (sizes > ROUNDING * total).any():
+        k = len(terms)
+        terms.append(terms[-1] @ B / k)
+        sizes = sizes @ size / k
+        total = total + sizes
+    return np.array(terms)
+
+
+@cache
+def _gauss(points: int) -> tuple[Array, Array]:
+    """Nodes and weights of the Gauss rule on [-1, 1]."""
+    return legendre.leggauss(points)
 
 
 def _doubled(transition: Expr, noise: Expr, doublings: int) -> tuple[Any, Any]:

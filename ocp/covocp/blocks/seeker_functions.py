@@ -17,8 +17,8 @@ from covocp.blocks.arithmetic import beside, where
 from covocp.blocks.checked_function import CheckedFunction
 from covocp.blocks.differences import independent, is_usable
 from covocp.blocks.eigenvalues import is_definite, symmetric_eigen
+from covocp.blocks.factors import in_turn, triangular
 from covocp.blocks.quadratic import gradient, hessian, parameters, regressor_row, transition
-from covocp.blocks.square_root import in_turn, triangular
 
 Array = NDArray[np.float64]
 

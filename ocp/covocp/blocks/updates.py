@@ -1,4 +1,4 @@
-"""The discrete Kalman filter: prediction, and the measurement update in four forms that agree to rounding.
+"""The discrete Kalman filter: prediction, and the measurement update in four forms, equal in exact arithmetic.
 
 x+ = Phi x + Gamma u + Gamma1 w, y = H x + v; M is the covariance before, P that after the measurement (item 3).
 """
@@ -10,25 +10,31 @@ from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.errors import ProblemError
 from covocp.base.expressions import Expr
 from covocp.base.gains import innovation_gain
 from covocp.blocks.arithmetic import (
     apply,
+    definite_root,
     definite_solve,
     diagonal,
     is_there,
     precision,
     semidefinite,
+    substituted,
     symmetric,
     triangular_solve,
     unit,
     unit_triangular,
     where,
 )
+from covocp.blocks.factors import check_divisor, corrected_factor, in_turn
+from covocp.blocks.scaling import diagonal_scales, over, semidefinite_part, semidefinite_root
 from covocp.blocks.values import SYMBOLIC, array, is_symbolic, matrix, restored, square, weight
 
+Array = NDArray[Any]
 Form = Literal["joseph", "standard", "sequential", "information"]
 # Remedies: two accurate sensors of one state leave H P H' + R singular to rounding, each by itself does not.
 IN_TURN = (
@@ -89,7 +95,8 @@ def update(
 
     Forms: "joseph" as above, positive semidefinite whatever the rounding of the gain; "standard" P = M - L H M;
     "sequential" one row of the measurement after the other, by scalar divisions only, rows that are correlated made
-    independent first; "information" P = (M^-1 + H' R^-1 H)^-1, for definite M and R.
+    independent first; "information" P = (M^-1 + H' R^-1 H)^-1 on a root of M, for definite M and R. Numbers of which
+    H M H' + R holds too little of R for a gain are taken on roots of M and R in every form.
 
     Args:
         estimate: before the measurement, shape (n,) or (n, 1).
@@ -226,6 +233,33 @@ def joseph_form(P: Expr, L: Expr, H: Expr, R: Expr) -> Any:
     return symmetric(remaining @ P @ remaining.T + L @ R @ L.T)
 
 
+def corrected_by_factors(P: Array, residual: Array, H: Array, R: Array) -> tuple[Array, Array]:
+    """Step and covariance by a triangularisation of roots, which holds R beside H M H' down to its own rounding."""
+    root, noise = semidefinite_root(semidefinite_part(P)), semidefinite_root(semidefinite_part(R))
+    step, lower = corrected_factor(0 * P[:, :1], root, residual, H, noise)
+    return step, lower @ lower.T
+
+
+def noise_left(P: Expr, H: Expr, R: Expr) -> float:
+    """What of R is left in H M H' + R of numbers: the smallest pivot of that matrix with unit diagonal, 0 where none.
+
+    The gain that it holds has an error of about eps / pivot^1.5 standard deviations of the estimate. One reading
+    alone, and expressions, of which nothing is known: 1.
+    """
+    if not isinstance(P, np.ndarray) or len(R) < 2:
+        return 1.0
+    spread = symmetric(H @ P @ H.T + R)
+    try:
+        return float(np.diag(np.linalg.cholesky(over(spread, diagonal_scales(spread)))).min() ** 2)
+    except np.linalg.LinAlgError:
+        return 0.0
+
+
+def enough(P: Expr) -> float:
+    """The noise that must be left for an error of about 1e-8 standard deviations, of the root of eps in general."""
+    return float(np.finfo(P.dtype).eps) ** (1 / 3) if isinstance(P, np.ndarray) else 0.0
+
+
 def definite_gain(P: Expr, H: Expr, R: Expr) -> Any:
     """L = M H'(H M H' + R)^-1, by a solver for positive definite matrices."""
     what = "covariance of the innovation, H P H' + R,"
@@ -233,21 +267,61 @@ def definite_gain(P: Expr, H: Expr, R: Expr) -> Any:
 
 
 def _joseph(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
+    if 0.0 < noise_left(P, H, R) < enough(P):
+        return corrected_by_factors(P, residual, H, R)
     L = definite_gain(P, H, R)
     return L @ residual, joseph_form(P, L, H, R)
 
 
 def _standard(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
+    if 0.0 < noise_left(P, H, R) < enough(P):
+        return corrected_by_factors(P, residual, H, R)
     L = definite_gain(P, H, R)
     return L @ residual, symmetric(P - L @ (H @ P))
 
 
 def _information(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
-    size = unit(P, P.shape[0])
-    weighted = definite_solve(R, H, "measurement noise R", NOT_DIVIDED).T
-    inverse = definite_solve(P, size, "covariance", NOT_DIVIDED)
-    spread = symmetric(definite_solve(symmetric(inverse + weighted @ H), size, "sum", NOT_DIVIDED))
-    return spread @ (weighted @ residual), spread
+    """On a root of M: the sum of the inverses would round away what is small beside an accurate reading."""
+    if isinstance(P, np.ndarray):
+        noise = definite_root(R, "measurement noise R", NOT_DIVIDED)
+        root = definite_root(P, "covariance", NOT_DIVIDED)
+        rows, residual, variances = condensed(P, *whitened(noise, H, residual))
+    else:
+        lower, variances = unit_triangular(R, "measurement noise R")
+        rows, residual = triangular_solve(lower, H), triangular_solve(lower, residual)
+        lower, entries = unit_triangular(P, "covariance")
+        root = lower @ diagonal(ca.sqrt(entries))
+    step, root = in_turn(0 * P[:, :1], root, residual, rows, variances)
+    return step, symmetric(root @ root.T)
+
+
+def whitened(noise: Array, H: Array, residual: Array) -> tuple[Array, Array]:
+    """Rows and residual in units of independent noises of variance 1; `noise`: a lower triangular root of R."""
+    spreads = np.diag(noise)[:, None]
+    if not np.any(np.tril(noise, -1)):
+        return H / spreads, residual / spreads
+    return substituted(noise, H), substituted(noise, residual)
+
+
+def condensed(P: Array, H: Array, residual: Array) -> tuple[Array, Array, Array]:
+    """Rows, residual and variances of as many measurements of noise 1 as there are states, where there are many more.
+
+    By reflections, the largest rows and columns first in units of the prior: so every row keeps its own digits beside
+    those that are more accurate [Cox and Higham, Stability of Householder QR factorization for weighted least squares
+    problems, 1998].
+    """
+    size = len(P)
+    if len(H) <= 2 * size:
+        return H, residual, np.ones_like(residual)
+    from scipy.linalg import qr_multiply
+
+    units = np.sqrt(np.diag(P))
+    scaled = H * units
+    order = np.argsort(-np.abs(scaled).max(axis=1), kind="stable")
+    left, triangle, columns = qr_multiply(scaled[order], residual[order, 0], mode="right", pivoting=True)
+    rows = np.empty_like(triangle)
+    rows[:, columns] = triangle
+    return rows / units, left[:, None], np.ones_like(left)[:, None]
 
 
 def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
@@ -256,6 +330,9 @@ def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
     lower, variances = unit_triangular(R, "measurement noise R, whose rows are correlated,", remedy)
     rows, residual = triangular_solve(lower, H), triangular_solve(lower, residual)
     step = 0 * P[:, :1]
+    if noise_left(P, H, R) < enough(P) and variances.min() > 0.0:  # rounding between two rows hides the second
+        step, root = in_turn(step, semidefinite_root(semidefinite_part(P)), residual, rows, variances)
+        return step, root @ root.T
     for i in range(rows.shape[0]):
         h, r = rows[i : i + 1, :], variances[i, 0]
         seen = P @ h.T
@@ -266,12 +343,6 @@ def _sequential(P: Expr, residual: Expr, H: Expr, R: Expr) -> tuple[Any, Any]:
         left = P - k @ seen.T
         P = symmetric(left - (left @ h.T) @ k.T + r * (k @ k.T))
     return step, P
-
-
-def check_divisor(spread: Expr) -> None:
-    """A row without noise of something that is known exactly has no update."""
-    if not isinstance(spread, ca.SX) and not spread > 0.0:
-        definite_solve(np.atleast_2d(spread), np.atleast_2d(spread), "covariance of the innovation, H P H' + R,")
 
 
 FORMS: dict[str, Callable[[Any, Any, Any, Any], tuple[Any, Any]]] = {

@@ -5,9 +5,10 @@ For laws that are functions of an estimate and of time, as the blocks make them;
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import Any
 
 import casadi as ca
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from covocp.base.arguments import a, a_function, checked, optional, positive, whole
-from covocp.base.errors import CovocpError, ProblemError, shown
+from covocp.base.errors import CovocpError, ProblemError, shown, warn_user
 from covocp.base.expressions import Given
 from covocp.base.gains import weighted
 from covocp.base.matrices import pack, pack_symbolic, real_numbers, unpack_symbolic
@@ -24,6 +25,7 @@ from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
+from covocp.simulation.divergence import farthest, in_range
 from covocp.simulation.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
@@ -32,8 +34,8 @@ LawFunction = Callable[..., Any]
 
 # Error of a step without noise, relative and, for entries near zero, absolute.
 TOLERANCE = 1e-9
-# A run with an entry beyond this has diverged.
-LARGEST = 1e9
+# Steps in a row that do not move the time: what happens next happens between two numbers, as near a finite escape.
+STALLED = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,9 @@ class LawSimulation:
         u: what the law asked for, (K, m).
         filter_state: state of the filter, (K, ns), the estimate first; x where there is no filter.
         cost: integral of the running cost up to each time, (K,); zero where none is given.
-        diverged: whether a run left the range of numbers before the end; shape () or (runs,).
+        diverged: whether a run left the range of numbers before the end: its plant grew 1e15 times beyond 1, its start
+            and the way that its first rate makes of the duration, or something in the loop is no number any more;
+            shape () or (runs,).
     """
 
     t: Array
@@ -295,35 +299,60 @@ class _Loop:
 
 def _accurate(loop: _Loop, initial: Array, times: Array, breaks: list[float]) -> LawSimulation:
     """One run without noise, piece by piece between the breaks."""
-    from scipy.integrate import solve_ivp
-
     rate, control = loop.functions()
     none = (np.zeros(loop.size), np.zeros(loop.measured))
 
     def slope(t: float, state: Array) -> Array:
         return np.asarray(_value(rate, state, t, *none))
 
-    def room(t: float, state: Array) -> float:
-        return LARGEST - float(np.abs(state).max())
-
-    room.terminal = True  # type: ignore[attr-defined]
     state = loop.start(initial)
+    limit = farthest(initial, slope(0.0, state)[: loop.size], times[-1])
     states = np.full((times.size, state.size), np.nan)
     states[0] = state
     for begin, end in pairwise([0.0, *breaks, float(times[-1])]):
         inside = np.flatnonzero((times > begin) & (times <= end))
         grid = np.unique(np.append(times[inside], end))
-        found = solve_ivp(slope, (begin, end), state, "LSODA", grid, events=room, rtol=TOLERANCE, atol=TOLERANCE)
-        reached = min(found.t.size, inside.size)
-        states[inside[:reached]] = found.y.T[:reached]
-        if found.status != 0:
+        found = _integrated(slope, begin, state, grid, lambda state: bool(in_range(state, loop.size, limit)))
+        reached = min(len(found), inside.size)
+        states[inside[:reached]] = found[:reached]
+        if len(found) < grid.size:
             break
-        state = found.y[:, -1]
+        state = found[-1]
     known = np.isfinite(states).all(axis=1)
     first = np.ravel(_value(control, states[0], 0.0))
     controls = np.full((times.size, first.size), np.nan)
     controls[known] = [np.ravel(_value(control, z, t)) for t, z in zip(times[known], states[known], strict=True)]
     return loop.simulation(times, states, controls)
+
+
+def _integrated(
+    slope: Callable[[float, Array], Array], begin: float, state: Array, grid: Array, goes_on: Callable[[Array], bool]
+) -> Array:
+    """States at the times of a grid, (K, total), by LSODA; fewer rows where the run ends before."""
+    from scipy.integrate import LSODA
+
+    solver = LSODA(slope, begin, state, float(grid[-1]), rtol=TOLERANCE, atol=TOLERANCE)
+    found: list[Array] = []
+    stalled = 0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "lsoda", UserWarning)  # told below, with the time
+        while solver.status == "running" and stalled < STALLED:
+            message = solver.step()
+            if solver.status == "failed" or not np.isfinite(solver.y).all():
+                break
+            stalled = stalled + 1 if solver.t == solver.t_old else 0
+            due = grid[len(found) :]
+            due = due[due <= solver.t]
+            rows = list(solver.dense_output()(due).T) if due.size else []
+            found += takewhile(goes_on, rows)
+            if not goes_on(solver.y):
+                break
+    if solver.status == "failed":
+        warn_user(
+            f"The run ends at {solver.t:.6g} s, where the integration fails: {message or 'no step is small enough'} "
+            "What follows is NaN and counts as diverged; call the functions of the loop near that time by themselves."
+        )
+    return np.array(found).reshape(-1, state.size)
 
 
 def _noisy(
@@ -342,12 +371,15 @@ def _noisy(
     advance = vectorise(_function(_runge_kutta(rate, h), sizes), padded(runs), (1,))
     controls = vectorise(control, padded(runs), (1,))
     generator = np.random.default_rng(seed)
+    first = rate(state[:, 0], 0.0, *(np.zeros(size) for size in sizes[2:])).full().ravel()[: loop.size]
+    paces = np.append(first, noises[0].ravel() / np.sqrt(times[-1]))  # of the drift and of the noise
+    limit = farthest(state[: loop.size, 0], paces, times[-1])
     states, given = [state], [_columns(controls, state, times[0])]
     for start in times[:-1]:
         for i in range(steps):
             shocks = [root @ generator.standard_normal((len(root), runs)) / np.sqrt(h) for root in noises]
             state = _columns(advance, state, start + i * h, *shocks)
-        state[:, ~(np.abs(state).max(axis=0) < LARGEST)] = np.nan
+        state[:, ~in_range(state, loop.size, limit)] = np.nan
         states.append(state)
         given.append(_columns(controls, state, start + steps * h))
     return loop.simulation(times, np.array(states).transpose(2, 0, 1), np.array(given).transpose(2, 0, 1))

@@ -21,14 +21,13 @@ from covocp.base.expressions import Given
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import one_at_a_time
 from covocp.blocks import values
+from covocp.simulation.divergence import farthest, in_range
 from covocp.simulation.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
 # (memory, measured, t) -> (memory, held): a casadi.Function, or a Python function of arrays.
 SampledLaw = Callable[..., Any]
 
-# A run with an entry beyond this has diverged.
-LARGEST = 1e12
 # Periods in a run, and steps in a period, at most.
 MOST = 1e7
 # Relative deviation of a ratio of times from a whole number that is rounding.
@@ -46,7 +45,8 @@ class SampledSimulation:
         samples: times at which the law ran, (L,) [s].
         measured: what it was given, (runs, L, p).
         memory: its memory afterwards, (runs, L, size).
-        diverged: whether a run left the range of numbers, (runs,).
+        diverged: whether a run left the range of numbers, (runs,): its state grew 1e15 times beyond 1, its start and
+            the way that its first step makes of the duration, or is no number any more.
     """
 
     t: Array
@@ -137,7 +137,7 @@ def simulate_sampled(
     _check_sizes(plant, sensor, law, own.size, first.size)
     if reading is not None:
         _check_reading(reading, own.size, sensor.size1_out(0))
-    loop = _Loop(plant, sensor, law, int(runs), start, own, first, reading)
+    loop = _Loop(plant, sensor, law, int(runs), start, own, first, reading, slow)
     streams = [
         np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(seed), spawn_key=(i,))))
         for i in range(int(runs))
@@ -161,14 +161,16 @@ class _Loop:
         memory: Array,
         held: Array,
         reading: ca.Function | None,
+        periods: int,
     ) -> None:
-        self.runs = runs
+        self.runs, self.periods = runs, periods
         width = padded(runs)
         self.plant, self.sensor = vectorise(plant, width, (2,)), vectorise(sensor, width, (1,))
         self.law: Columns | SampledLaw = vectorise(law, width, (2,)) if isinstance(law, ca.Function) else law
         self.reading = None if reading is None else vectorise(reading, width, (2,))
         self.state = np.repeat(start[:, :1], width, axis=1)
         self.state[:, :runs] = start
+        self.limit: Any = np.inf
         self.held, self.memory = np.repeat(held[:, None], width, axis=1), np.repeat(memory[:, None], width, axis=1)
         self.total, self.last = np.zeros(self.sensor.outputs[0].shape), np.zeros(self.sensor.outputs[0].shape)
         self.times, self.states, self.holds = [0.0], [self._kept(self.state)], [self._kept(self.held)]
@@ -189,8 +191,11 @@ class _Loop:
         for j in range(steps):
             number = period * steps + j
             process, noise = drawn[j, : shocks[0]], drawn[j, shocks[0] :]
-            self.state = _evaluated(self.plant, self.state, self.held, number * step, process)
-            self.state[:, ~(np.abs(self.state).max(axis=0, initial=0.0) < LARGEST)] = np.nan
+            before, self.state = self.state, _evaluated(self.plant, self.state, self.held, number * step, process)
+            if number == 0:
+                with np.errstate(all="ignore"):  # a step to what is no number any more
+                    self.limit = farthest(before, self.state - before, steps * self.periods)
+            self.state[:, ~in_range(self.state, len(self.state), self.limit)] = np.nan
             self.last = _evaluated(self.sensor, self.state, (number + 1) * step, noise)
             self.total += self.last
             if self.reading is not None and j + 1 < steps:
