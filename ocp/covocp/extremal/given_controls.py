@@ -9,10 +9,12 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
-from covocp.statement.conditions import beyond
+from covocp.statement.conditions import Conditions, Inside, beyond
+from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
+from covocp.transcription.nlp import Scales
 from covocp.transcription.scales import choose_scales, limit_units
 from covocp.transcription.shooting import single_shooting
 from covocp.transcription.stiffness import resolve_mesh
@@ -21,6 +23,9 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 # Miss of a prescribed final value or a bound that is reported, relative to the largest value; of conditions in the unit
 # of their limits.
 MISS = 1e-6
+# Limits of zero have no unit: theirs is at most so many times what the row varies by, which solvers do not see. By a
+# small share of that a limit which is rounding itself (sin(pi)) may be missed.
+FAR, ROUNDING = 1e3, 1e-14
 # By how much Ipopt may pass a bound of a variable, in its scale: a nominal of its is no miss.
 RELAXED = 1e-8
 
@@ -99,9 +104,28 @@ def missed(extremal: Extremal) -> dict[str, float]:
         result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
     for conditions, _, rows in extremal.inequalities():
         excess = beyond(rows, conditions.lower, conditions.upper).max(axis=0)
-        allowed = MISS * limit_units(conditions.lower, conditions.upper)
+        allowed = _allowed(extremal, conditions, units)
         result |= {n: float(v) for n, v, a in zip(conditions.names, excess, allowed, strict=True) if v > a}
     return result
+
+
+def _allowed(extremal: Extremal, conditions: Conditions | Inside, units: Scales) -> Array:
+    """By how much each row of some conditions may be passed and is called met."""
+    if isinstance(conditions, Inside):
+        return np.concatenate([_allowed(extremal, part.conditions, units) for part in conditions.parts])
+    limits = limit_units(conditions.lower, conditions.upper)
+    varied = _varied(extremal, conditions.function, np.concatenate([units.x, units.u, units.e]))
+    known = np.isfinite(varied) & (varied > 0.0)
+    own = np.where(known, np.minimum(limits, FAR * varied), limits)
+    return np.asarray(np.maximum(MISS * own, np.where(known, ROUNDING * varied, 0.0)))
+
+
+def _varied(extremal: Extremal, function: ca.Function, units: Array) -> Array:
+    """What each row of a function varies by at most if all variables change by their units, to first order."""
+    symbols = model_symbols(extremal.statement)
+    by_unit = ca.fabs(ca.jacobian(function(*symbols), ca.vertcat(*symbols[:3]))) @ ca.DM(units)
+    varied = ca.Function("varied", symbols, [by_unit]).map(extremal.mesh.nodes.size)(*extremal.columns())
+    return np.asarray(np.asarray(ca.DM(varied).full()).max(axis=1))
 
 
 def without_value(extremal: Extremal) -> dict[str, float]:

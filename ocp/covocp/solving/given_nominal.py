@@ -11,7 +11,7 @@ import numpy as np
 from covocp.base.checks import as_number, column
 from covocp.base.errors import ProblemError, no_option, spelling
 from covocp.base.expressions import Given
-from covocp.base.matrices import SAME, Array, distinct, near
+from covocp.base.matrices import Array, distinct, near
 from covocp.extremal.extremal import Outcome
 from covocp.extremal.given_controls import evaluate_controls, evaluation_mesh
 from covocp.solution.solution import Solution
@@ -22,6 +22,10 @@ from covocp.transcription.first_guess import check_model, controls_guess, evalua
 from covocp.transcription.grading import graded
 from covocp.transcription.mesh import INTERVALS, Graded, Mesh, Options, control_places
 
+# Share of a control by which it may differ before and after a node and not jump.
+ROUNDING = 1e-12
+# Relative difference of two values of a decision that are one.
+SAME_VALUE = 1e-9
 # Arguments of `evaluate` beside the options of the mesh.
 ARGUMENTS = ("nominal", "truth", "intervals", "parameters")
 
@@ -31,7 +35,7 @@ def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> 
     known = _known(options)
     if isinstance(nominal, Solution):
         known = {"control": nominal.mesh.control, **known}
-        if intervals is None:
+        if intervals is None and not _loses(nominal, known["control"]):
             known = {"grid": distinct(nominal.mesh.nodes), **known}
     return Options(intervals=INTERVALS if intervals is None else intervals, **known)
 
@@ -39,7 +43,8 @@ def first_options(nominal: Given, intervals: Given, options: dict[str, Any]) -> 
 def options_along(statement: Statement, nominal: Given, options: Options, parameters: Array) -> Options:
     """The options with the graded mesh, to which the nodes of a nominal that is a solution are added.
 
-    Its control bends there, and where it jumps there are two: between other nodes it would be another control.
+    Its control bends there, and where it jumps there are two: between other nodes it would be another control. Held, a
+    linear one is another in any case.
 
     Args:
         statement: the problem.
@@ -50,7 +55,7 @@ def options_along(statement: Statement, nominal: Given, options: Options, parame
     given = graded(statement, options, parameters)
     if not isinstance(nominal, Solution):
         return given
-    nodes = _with_its_nodes(given.nodes(), nominal)
+    nodes = _with_its_nodes(given.nodes(), nominal, given.control == "linear")
     if nodes.size == given.nodes().size:
         return given
     if isinstance(given.grid, Graded):
@@ -59,20 +64,24 @@ def options_along(statement: Statement, nominal: Given, options: Options, parame
     return replace(given, grid=Graded(nodes=nodes, asked=asked))
 
 
-def _with_its_nodes(nodes: Array, nominal: Solution) -> Array:
-    """Some nodes and those of a solution, twice where its linear control jumps."""
-    own = nominal.mesh
-    there = distinct(own.nodes)
+def _loses(nominal: Solution, control: str) -> bool:
+    """Whether controls of this form cannot be those of a solution: held ones, where these are linear."""
+    return control == "constant" and nominal.mesh.control == "linear"
+
+
+def _with_its_nodes(nodes: Array, nominal: Solution, linear: bool) -> Array:
+    """Some nodes and those of a solution, for a linear control twice where it jumps."""
+    there = distinct(nominal.mesh.nodes)
     together = np.sort(np.concatenate([nodes, there[~near(there, distinct(nodes))]]))
-    if own.control != "linear":
+    if not linear:
         return together
-    inside = there[np.isin(there, own.nodes[own.instants])]
-    inside = inside[(inside > 0.0) & (inside < 1.0)]
+    inside = there[1:-1]
     before, after = (nominal.extremal.controls_at(inside, before=side) for side in (True, False))
-    jumps = inside[(before != after).any(axis=1)]
-    once = distinct(together)
-    twice = once[near(once, jumps)]
-    return np.sort(np.concatenate([together, [place for place in twice if np.sum(together == place) == 1]]))
+    least = ROUNDING * np.abs(nominal.trajectory.u).max(axis=0, initial=0.0)
+    jumps = inside[(np.abs(after - before) > least).any(axis=1)]
+    places = distinct(together)
+    once = [place for place in places[near(places, jumps)] if np.sum(together == place) == 1]
+    return np.sort(np.concatenate([together, once]))
 
 
 def run_along(
@@ -152,7 +161,7 @@ def _check_goes_on(name: str, values: Array, span: slice, linked: Mapping[int, f
     """
     for entry in range(span.start, span.stop):
         before = linked.get(entry, values[entry])
-        if abs(values[entry] - before) > SAME * abs(before):
+        if abs(values[entry] - before) > SAME_VALUE * abs(before):
             raise ProblemError(
                 f"The nominal gives the decision '{name}' two values.",
                 expected="one value in all phases that have it",

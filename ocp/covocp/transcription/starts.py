@@ -108,9 +108,11 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     """Controls from their guesses, steered and bent where these are numbers; states from theirs, or simulated.
 
     Where the nominal is unstable and would stay so a feedback holds it, unless it is asked to be left to itself.
-    The last ones are kept: a solver that is asked again for the same parameters starts from the same.
+    The last ones are kept, unless a guess may have changed since (a function, an array that is filled anew): a solver
+    that is asked again for the same parameters starts from the same.
     """
-    return _own_start(statement, mesh, tuple(parameters), hold)
+    fixed = all(is_plain(guess) for guess in statement.guesses.values())
+    return (_own_start if fixed else _own_start.__wrapped__)(statement, mesh, tuple(parameters), hold)
 
 
 @lru_cache(maxsize=2)
