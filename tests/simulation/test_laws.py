@@ -155,6 +155,24 @@ def test_a_finite_escape_is_a_divergence(start, samples, runs):
     assert np.isnan(run.x[..., run.t > 1.0 / start, 0]).all()
 
 
+@pytest.mark.parametrize("jump", [1e3, 1e12])
+def test_a_jump_that_is_not_named_is_found_to_the_rounding_of_time(jump):
+    plant = ca.Function("plant", [SCALAR, RATE], [RATE])
+    run = simulate_law(plant, lambda x, t: np.array([jump * (t > 0.5)]), initial=[0.0], duration=1.0, samples=11)
+    assert not run.diverged
+    np.testing.assert_allclose(run.x[:, 0], jump * np.clip(run.t - 0.5, 0.0, None), rtol=1e-9, atol=1e-8)
+
+
+def test_a_loop_that_cannot_be_followed_is_told():
+    """x' = 1 / (1 - x) has no solution beyond t = 1/2, where it would jump to and fro about 1."""
+    plant = ca.Function("plant", [SCALAR, RATE], [1.0 / (1.0 - SCALAR) + RATE])
+    with pytest.warns(co.CovocpWarning, match="ends at 0.5"):
+        run = simulate_law(plant, NOTHING, initial=[0.0], duration=2.0, samples=9)
+    assert run.diverged
+    np.testing.assert_allclose(run.x[:2, 0], 1.0 - np.sqrt(1.0 - 2.0 * run.t[:2]), rtol=1e-7)
+    assert np.isnan(run.x[3:]).all()
+
+
 def test_runs_without_noise_are_the_accurate_run():
     observer = gain_filter(PLANT, CONSTANT, H, ESTIMATE)
     wanted = simulate_law(PLANT, LAW, initial=START, duration=3.0, observer=observer, samples=31)

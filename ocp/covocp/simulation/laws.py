@@ -34,8 +34,12 @@ LawFunction = Callable[..., Any]
 
 # Error of a step without noise, relative and, for entries near zero, absolute.
 TOLERANCE = 1e-9
-# Steps in a row that do not move the time: what happens next happens between two numbers, as near a finite escape.
-STALLED = 100
+# After so many steps in a row that do not move the time, it is moved by its rounding: a jump of the law lies there, or
+# a finite escape. So often at most, which a law that always jumps would go on for ever.
+STALLED, MOVED = 100, 100
+# A rate that changes by this share over the rounding of the time cannot be followed; it belongs to a finite escape
+# where the state grows by this share over it.
+TURNED, ESCAPING = 0.5, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,26 +335,37 @@ def _integrated(
     """States at the times of a grid, (K, total), by LSODA; fewer rows where the run ends before."""
     from scipy.integrate import LSODA
 
-    solver = LSODA(slope, begin, state, float(grid[-1]), rtol=TOLERANCE, atol=TOLERANCE)
+    end = float(grid[-1])
+    solver = LSODA(slope, begin, state, end, rtol=TOLERANCE, atol=TOLERANCE)
     found: list[Array] = []
-    stalled = 0
+    stalled, moved, failed = 0, 0, False
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "lsoda", UserWarning)  # told below, with the time
-        while solver.status == "running" and stalled < STALLED:
-            message = solver.step()
-            if solver.status == "failed" or not np.isfinite(solver.y).all():
+        while solver.status == "running" and not failed:
+            failed = solver.step() is not None  # a message
+            if failed or not np.isfinite(solver.y).all():
                 break
-            stalled = stalled + 1 if solver.t == solver.t_old else 0
             due = grid[len(found) :]
             due = due[due <= solver.t]
             rows = list(solver.dense_output()(due).T) if due.size else []
             found += takewhile(goes_on, rows)
             if not goes_on(solver.y):
                 break
-    if solver.status == "failed":
+            stalled = stalled + 1 if solver.t == solver.t_old else 0
+            if stalled == STALLED:
+                after = float(np.nextafter(solver.t, end))
+                rate = slope(after, solver.y)
+                start = solver.y + (after - solver.t) * rate
+                if not np.abs(slope(after, start) - rate).max() <= TURNED * np.abs(rate).max():
+                    failed = not np.abs(start).max() > (1.0 + ESCAPING) * np.abs(solver.y).max()
+                    break
+                solver = LSODA(slope, after, start, end, rtol=TOLERANCE, atol=TOLERANCE)
+                stalled, moved = 0, moved + 1
+                failed = moved == MOVED
+    if failed:
         warn_user(
-            f"The run ends at {solver.t:.6g} s, where the integration fails: {message or 'no step is small enough'} "
-            "What follows is NaN and counts as diverged; call the functions of the loop near that time by themselves."
+            f"The run ends at {solver.t:.6g} s: no step is small enough for the loop that follows. The rest is NaN and "
+            "counts as diverged; call the functions of the loop near that time, or name its jumps in 'breaks'."
         )
     return np.array(found).reshape(-1, state.size)
 
