@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -192,7 +193,13 @@ class Runs:
         first = self._first_order()
         found = residuals(first, point, parameters, where, None)
         if not found.hold(self._limit):  # an upper bound so far
-            found = residuals(first, point, parameters, where, reached_scales(nlp, where[0], parameters, again=again))
+            scales = reached_scales(nlp, where[0], parameters, again=again)
+            found = residuals(first, point, parameters, where, scales)
+            if not found.hold(self._limit):
+                inside = _within(nlp, point, parameters)
+                its = residuals(first, inside, parameters, inside.where, scales)
+                if its.hold(self._limit):
+                    point, where, found = inside, inside.where, its
         return Round(nlp=nlp, point=point, where=where, residuals=found, converged=found.hold(self._limit))
 
     def _rescaled(
@@ -435,6 +442,13 @@ def _numbers(value: Any) -> Array:
 def share_for(times: float) -> float:
     """How much less is asked for, as a share, where there is so many times too much."""
     return float(np.clip(ENOUGH / times, STRICTEST, STRICTER))
+
+
+def _within(nlp: Program, point: Point, parameters: Arrays) -> Point:
+    """A point within its bounds, which Ipopt passes by a share of the scales: what this costs may be more than is left."""
+    bounds = nlp.bounds(parameters)
+    w = np.clip(point.w, bounds["lbx"], bounds["ubx"])
+    return replace(point, w=w, where=nlp.unpack(w, parameters))
 
 
 def _best(rounds: list[Round]) -> Round:

@@ -313,11 +313,21 @@ def test_what_is_missed_does_not_depend_on_the_unit(unit):
     ocp.dynamics(x, u)
     ocp.subject_to(x, upper=0.7 * unit, name="wall")
     ocp.subject_to(x, at=0.5, upper=0.3 * unit, name="gate")
+    ocp.subject_to(x - 0.3 * unit, at=0.5, upper=0.0, name="zero")
     ocp.minimize(running=(u / unit) ** 2, terminal=((x - unit) / unit) ** 2)
     missed = co.evaluate(ocp, nominal={"u": unit}, intervals=4).violations
-    expected = {"bounds of x": 0.5, "bounds of u": 0.1, "wall": 0.3, "gate": 0.2}
+    expected = {"bounds of x": 0.5, "bounds of u": 0.1, "wall": 0.3, "gate": 0.2, "zero": 0.2}
     assert missed == pytest.approx({name: value * unit for name, value in expected.items()})
     assert co.evaluate(ocp, nominal=co.solve(ocp, intervals=4, progress=False)).violations == {}
+
+
+def test_a_limit_that_is_rounding_is_not_missed_by_rounding():
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=1.0), ocp.control("u")
+    ocp.dynamics(x, u)
+    ocp.subject_to(x, at=0.5, equals=np.sin(np.pi), name="gate")
+    ocp.minimize(running=u**2)
+    assert co.evaluate(ocp, nominal=co.solve(ocp, intervals=10, progress=False)).violations == {}
 
 
 def test_a_nominal_that_diverges():

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -91,3 +93,37 @@ def test_phases_are_evaluated_along_controls_that_jump() -> None:
     plan = co.solve(two(), intervals=10, **QUIET)
     found = co.evaluate(two(), nominal=plan, intervals=14)
     assert found.cost == pytest.approx(plan.cost, rel=1e-9)
+
+
+def test_a_held_control_is_exact_as_a_linear_one_that_jumps() -> None:
+    plan = through("constant")
+    for mesh in ({}, {"intervals": 7}, {"intervals": 30}):
+        found = co.evaluate(cart(gate=False), nominal=plan, control="linear", **mesh)
+        assert found.cost == pytest.approx(cost_along(plan), rel=1e-9)
+    near = co.evaluate(cart(gate=False), nominal=through("linear"), control="constant", intervals=200)
+    assert near.cost == pytest.approx(cost_along(through("linear")), rel=1e-3)  # which none can be
+
+
+def test_what_was_evaluated_where_the_control_jumps_is_saved_and_read(tmp_path: Path) -> None:
+    """Nodes that are there twice without a condition had been called damage."""
+    found = co.evaluate(cart(gate=False), nominal=through("linear"), intervals=12)
+    found.save(tmp_path / "jump.npz")
+    for read in (co.load(tmp_path / "jump.npz"), co.load(tmp_path / "jump.npz", problem=cart(gate=False))):
+        np.testing.assert_array_equal(read.controls_at([1.0], before=True), found.controls_at([1.0], before=True))
+        np.testing.assert_array_equal(read["u"], found["u"])
+
+
+def test_a_guess_that_is_another_function_by_now_is_another_start() -> None:
+    """Round an obstacle on either side, by one solver: the second start had been the first."""
+    side = {"value": 1.0}
+    ocp = co.Problem(2.0)
+    x = ocp.state("x", 2, initial=[-1.0, 0.0], final=[1.0, 0.0])
+    u = ocp.control("u", 2, guess=lambda s: np.array([1.0, side["value"] * (1.0 - 2.0 * s)]))
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u[0] ** 2 + u[1] ** 2 + 5.0 * ca.exp(-8.0 * (x[0] ** 2 + x[1] ** 2)))
+    solver = co.Solver(ocp, intervals=20)
+    ways = []
+    for side["value"] in (1.0, -1.0, 1.0):
+        ways.append(float(solver.solve(progress=False).trajectory.x[10, 1]))
+    assert ways[0] > 0.1
+    assert ways == pytest.approx([ways[0], -ways[0], ways[0]], rel=1e-6)

@@ -319,3 +319,17 @@ def test_complementarity_that_is_large_is_marked():
     assert "LARGE" not in str(solution)
     bad = replace(solution.optimality, complementarity=0.94)
     assert "LARGE: multipliers push" in str(replace(solution, stored_optimality=bad))
+
+
+@pytest.mark.parametrize("method", ["ipopt", "auto"])
+@pytest.mark.parametrize("strength", [0.01, 1.0])
+def test_a_dear_control_that_is_best_at_its_bound(strength: float, method: str) -> None:
+    """One that moves little has a large scale, and Ipopt passes its bound by a share of it: that was no solution."""
+    ocp = co.Problem(1.0)
+    x = ocp.state("x", initial=0.0, final=1.0)
+    u, w = ocp.control("u"), ocp.control("w", lower=0.0)
+    ocp.dynamics(x, u + strength * w)
+    ocp.minimize(running=u**2 + 10.0 * w)
+    found = co.solve(ocp, intervals=20, method=method, progress=False)
+    assert found.cost == pytest.approx(1.0, rel=2e-6)
+    assert np.abs(found["w"]).max() < 1e-7

@@ -75,7 +75,7 @@ def evaluate(
             noise of whose jumps counts too, or such a dict.
         intervals: number of control intervals; None: 100, along a solution its own mesh. Of phases that of each, or a
             list of one for each. The nodes of a solution are added, twice where its control jumps: the control is the
-            same on every mesh, unless `control=` asks for another form than its own.
+            same on every mesh, but for a linear one of which `control="constant"` is asked for.
         parameters: values of parameters other than the declared ones, by name.
         options: of the mesh, as in `solve`.
 
