@@ -445,7 +445,7 @@ def share_for(times: float) -> float:
 
 
 def _within(nlp: Program, point: Point, parameters: Arrays) -> Point:
-    """A point within its bounds, which Ipopt passes by a share of the scales: what this costs may be more than is left."""
+    """A point within its bounds, which Ipopt passes by a share of the scales: that may cost more than is left."""
     bounds = nlp.bounds(parameters)
     w = np.clip(point.w, bounds["lbx"], bounds["ubx"])
     return replace(point, w=w, where=nlp.unpack(w, parameters))
