@@ -127,3 +127,16 @@ def test_a_guess_that_is_another_function_by_now_is_another_start() -> None:
         ways.append(float(solver.solve(progress=False).trajectory.x[10, 1]))
     assert ways[0] > 0.1
     assert ways == pytest.approx([ways[0], -ways[0], ways[0]], rel=1e-6)
+
+
+@pytest.mark.parametrize("gate", [False, True])
+def test_an_array_over_the_nodes_is_held_from_each_to_the_next(gate: bool) -> None:
+    """The values of a solution as it gives them, one at each node, and without the last one."""
+    plan = co.solve(cart(gate), intervals=12, control="constant", **QUIET)
+    for values in (plan["u"], plan["u"][:-1]):
+        found = co.evaluate(cart(gate), nominal={"u": values}, intervals=12, control="constant")
+        assert found.cost == pytest.approx(cost_along(plan), rel=1e-9)
+    even = np.sin(np.arange(13.0))
+    for values in (even[:-1], even) if not gate else (even[:-1],):  # with the gate there are 13 intervals
+        found = co.evaluate(cart(gate), nominal={"u": values}, intervals=12, control="constant")
+        np.testing.assert_allclose(found.controls_at([0.1, 0.95, 1.9])[:, 0], even[[0, 5, 11]], rtol=1e-12)

@@ -238,10 +238,25 @@ def _controls(statement: Statement, mesh: Mesh, nominal: Given, asked: int) -> t
             raise _not_given("control", block.name, ", ".join(given) or "nothing")
         value = given[block.name]
         value = value if callable(value) else as_number(block.name, "guess", value)
-        if asked and mesh.control == "constant" and np.ndim(value) and value.shape[0] == asked:
-            value = value[(at * asked).astype(int)]  # one for each interval that was asked for
+        if mesh.control == "constant" and np.ndim(value) and np.shape(value) != (block.size,):
+            value = _held(value, at, asked)
         columns.append(evaluate_guess(block, value, at))
     return np.concatenate([np.zeros((at.size, 0)), *columns], axis=1), duration
+
+
+def _held(value: Array, at: Array, asked: int) -> Array:
+    """An array with a row for each interval or each node as one for each interval: held from its node to the next.
+
+    Args:
+        value: the array; one of another length is returned as it is.
+        at: places of the held values, one for each interval of the mesh.
+        asked: intervals that the mesh was asked to have, of which rows may be meant too; or 0.
+    """
+    if value.shape[0] == at.size + 1:
+        return value[:-1]
+    if asked and value.shape[0] != at.size and value.shape[0] in (asked, asked + 1):
+        return np.asarray(value[(at * asked).astype(int)])
+    return value
 
 
 def _sampled(nominal: Solution, mesh: Mesh) -> Array:
