@@ -43,3 +43,34 @@ def test_data_have_values_and_panels_by_name():
     plt.close(figure)
     refused(lambda: solution["wind[2]"], "'wind' has no entry 2")
     refused(lambda: solution.plot("gale"), "'gale' is not in this solution")
+
+
+@pytest.mark.parametrize("control", ["linear", "constant"])
+def test_expressions_and_data_are_drawn_as_they_are_between_the_nodes(control):
+    """A gust between two nodes was drawn as 0.002 of it, the square of a held control as slopes."""
+    times = np.linspace(0.0, 10.0, 201)
+    ocp = co.Problem(10.0)
+    gust = ocp.data("gust", times, np.exp(-(((times - 5.25) / 0.1) ** 2)), kind="cubic")
+    x, u = ocp.state("x", initial=0.0, variance=0.1), ocp.control("u")
+    ocp.dynamics(x, u - x + gust, noise=0.01)
+    ocp.measurement("m", x, noise=0.001)
+    E = ocp.estimation_covariance()
+    ocp.minimize(running=u**2 + (x - 1) ** 2)
+    solution = co.solve(ocp, intervals=20, control=control, progress=False)
+    figure = solution.plot("gust", {"power": u**2}, {"twice x": 2 * x}, {"E": E[x, x]})
+    exact = {
+        "gust": lambda at: at["gust"],
+        "power": lambda at: at["u"] ** 2,
+        "twice x": lambda at: 2 * at["x"],
+        "E": lambda at: at["E"][:, 0, 0],
+    }
+    for axes in figure.axes[:4]:
+        curve = max(axes.lines, key=lambda line: line.get_linewidth())  # the others are the edges of its band
+        t, values = curve.get_xydata().T
+        found = [exact[axes.get_ylabel()](solution.at(t, side)) for side in ("before", "after")]
+        nearest = np.min(np.abs(np.array(found) - values), axis=0)
+        assert nearest.max() < 1e-9
+        assert np.diff(t).max() < 0.06
+        if axes.get_ylabel() == "gust":
+            assert values.max() > 0.99
+    plt.close(figure)

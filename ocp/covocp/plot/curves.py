@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,7 @@ from covocp.base.expressions import Given
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import cached
-from covocp.solution.reading import other_loop
+from covocp.solution.reading import expression_between, other_loop
 from covocp.solution.sample import Sample
 from covocp.solution.solution import Solution
 from covocp.statement.names import block_of
@@ -207,6 +207,32 @@ class Drawn:
         """Values at the times from those at the nodes, time first; without overshoot: variances stay positive."""
         ends = zip(_ends(self.solution.mesh.instants, values.shape[0]), _ends(self.early, self.t.size), strict=True)
         return np.concatenate([_between(self.solution.t[k], values[k], self.t[i]) for k, i in ends])
+
+    def expression(self, key: Any) -> tuple[Array, Array, Array]:
+        """Times, values of an expression of the symbols and their deviations (0 where nothing is uncertain), (K, rows).
+
+        Where controls are held it jumps with them: each interval has times of its own, from after its begin to before
+        its end.
+        """
+        solution, size = self.solution, key.shape[0] * key.shape[1]
+        known = self.covariance is not None and key.shape[1] == 1
+        spread = self.spread(key)[0] if known else np.zeros((self.t.size, size))
+        if not self.known_between:
+            return self.t, self.between(solution[key].reshape(solution.t.size, size)), spread
+        solution[key]  # says what is wrong with it
+        if solution.mesh.control != "constant":
+            values = expression_between(solution, key, self.t).reshape(-1, size)
+            if self.early.size:
+                early = expression_between(solution, key, self.t[self.early], before=True)
+                values[self.early] = early.reshape(-1, size)
+            return self.t, values, spread
+        places = np.union1d(self.t, np.linspace(0.0, solution.duration, SAMPLES + 1))
+        times = np.column_stack([places[:-1], places[1:]])
+        sides = [expression_between(solution, key, times[:, i], before=i == 1).reshape(-1, size) for i in (0, 1)]
+        k = np.searchsorted(self.t, times[:, 0], side="right") - 1
+        shares = ((times - self.t[k, None]) / (self.t[k + 1] - self.t[k])[:, None])[:, :, None]
+        bands = spread[k, None] + shares * (spread[k + 1] - spread[k])[:, None]
+        return times.ravel(), np.stack(sides, axis=1).reshape(-1, size), bands.reshape(-1, size)
 
     def spread(self, key: Given) -> tuple[Array, Array, Array]:
         """Root mean squares at the times, each (K, size): deviation, its error of the estimate, its estimate.

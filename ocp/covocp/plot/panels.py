@@ -316,23 +316,21 @@ def abscissa_label(solutions: list[Solution], over: Given, units: Mapping[str, s
 
 
 def _expression(drawn: list[Drawn], key: Given) -> list[Panel]:
-    """An expression of the symbols with its band, through its values at the nodes."""
+    """An expression of the symbols with its band."""
     curves: list[Curve] = []
-    count = 1
     for d in drawn:
-        values = d.between(d.solution[key].reshape(d.solution.t.size, -1))
-        count = values.shape[1]
-        spread = d.spread(key)[0] if d.covariance is not None and key.shape[1] == 1 else np.zeros_like(values)
+        t, values, spread = d.expression(key)
         curves += [
             Curve(
-                t=d.t,
+                t=t,
                 y=values[:, i],
                 deviation=spread[:, i] if np.any(spread[:, i]) else None,
                 order=d.order,
                 entry=i,
             )
-            for i in range(count)
+            for i in range(values.shape[1])
         ]
+    count = key.shape[0] * key.shape[1]
     return [Panel(label=_written(drawn, key), entries=tuple(str(i) for i in range(count)), curves=tuple(curves))]
 
 

@@ -12,6 +12,7 @@ from covocp.base.matrices import Array, unpack
 from covocp.extremal.closed_loop import ClosedLoop
 from covocp.extremal.spread_limits import scattered
 from covocp.solution.origin import Origin
+from covocp.statement.interval import repeated
 from covocp.statement.names import name_of, sizes_of, unknown_name
 from covocp.statement.statement import Block
 from covocp.statement.time_data import TimeData
@@ -76,6 +77,25 @@ def expression_values(solution: Solution, expression: ca.MX) -> Array:
     if other is not None and function.n_in() > len(arguments):
         arguments = (*arguments, scattered(other).T)
     value = np.asarray(function.map(count)(*arguments).full())
+    return _shaped(value, expression, count)
+
+
+def expression_between(solution: Solution, expression: ca.MX, t: Array, *, before: bool = False) -> Array:
+    """Values of an expression at some times [s], (K,) or (K, rows, columns); where something jumps after it, or before.
+
+    Not of a solution under other statistics, whose matrices are known at the nodes only.
+    """
+    extremal, mesh = solution.extremal, solution.mesh
+    z = solution.dense.at(mesh.placed(t / solution.duration), before=before)
+    u, nx = solution.controls_at(t, before=before), extremal.trajectory.x.shape[1]
+    rest = repeated(solution.duration, extremal.parameters, t.size)
+    function = extremal.statement.expression(expression, scattered=False)
+    value = function.map(t.size)(z[:, :nx].T, u.T, z[:, nx:].T, t[None, :], *rest)
+    return _shaped(np.asarray(value.full()), expression, t.size)
+
+
+def _shaped(value: Array, expression: ca.MX, count: int) -> Array:
+    """Values of an expression side by side as (count,) or (count, rows, columns), without axes of one entry."""
     rows, columns = expression.shape
     shaped = value.reshape(rows, count, columns).transpose(1, 0, 2)
     return np.asarray(shaped.reshape([count, *(n for n in (rows, columns) if n > 1)]))
