@@ -24,6 +24,8 @@ from covocp.solution.solution import Solution
 MARGINS = {"double": 1e-9, "single": 1e-6}
 # Distance of two knots, relative to the duration, that the clock of a machine of this precision resolves.
 RESOLVED = {"double": 1e-12, "single": 1e-5}
+# By so much of the duration a time may be before a knot and is that knot: what some thousand sums of a step leave.
+COUNTED = 0.25 * RESOLVED["double"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -192,8 +194,12 @@ def history(solution: Solution, precision: str) -> History:
 
 
 def _piece(table: Array, time: Expr) -> Any:
-    """Index of the piece between two entries of a table of times that contains a time, from 0."""
+    """Index of the piece between two entries of a table of times that contains a time, from 0.
+
+    A time that counting up has left just before an entry is that entry, as for the solution.
+    """
     pieces, duration = table.size - 1, float(table[-1])
+    time = time + COUNTED * duration
     guess = np.floor(table * (pieces / duration) + 0.5)
     times = ca.MX(ca.DM(table))
     if not np.array_equal(guess, np.arange(pieces + 1)):
