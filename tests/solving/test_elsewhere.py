@@ -197,3 +197,25 @@ def test_no_solution_and_no_phases_are_movable():
     for given in (co.solve(problem, intervals=10, progress=False), co.Phases([problem, lag()])):
         with pytest.raises(co.ProblemError, match="expected: a Problem"):
             co.movable(given)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_plan_that_goes_on_has_a_clock_that_goes_on(moved: bool) -> None:
+    """A wind that sets in at 2 s: with a parameter for the time the rest costs the rest; without one it is told."""
+    ocp = co.Problem(4.0, name="wind")
+    begin = ocp.parameter("t0", 0.0) if moved else 0.0
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u - 1.0 / (1.0 + ca.exp(-4.0 * (ocp.time + begin - 2.0))))
+    ocp.minimize(running=u**2 + (x - 1.0) ** 2)
+    solver = co.Solver(ocp, intervals=64)
+    plan = solver.solve(progress=False)
+    fine = plan.at(np.linspace(0.0, 1.0, 4001))
+    spent = np.trapezoid(fine["u"] ** 2 + (fine["x"] - 1.0) ** 2, fine.t)
+    start = {"initial": {"x": float(plan.at(1.0)["x"])}, "duration": 3.0, "guess": plan, "elapsed": 1.0}
+    if moved:
+        left = solver.solve({"t0": 1.0}, **start, progress=False)
+        assert spent + left.cost == pytest.approx(plan.cost, rel=1e-3)
+        return
+    with pytest.warns(co.CovocpWarning, match="which begins at 0 again"):
+        left = solver.solve(**start, progress=False)
+    assert abs(spent + left.cost - plan.cost) > 0.05 * plan.cost

@@ -47,7 +47,7 @@ from covocp.solving.random_starts import STARTS, check_multistart, random_guesse
 from covocp.solving.refined_meshes import remade
 from covocp.solving.silent import mention_silent
 from covocp.solving.suited_mesh import Beginning, beginning, other_nodes, suits
-from covocp.solving.unused import mention_forgotten, mention_lengths
+from covocp.solving.unused import mention_clock, mention_forgotten, mention_lengths
 from covocp.solving.warm_start import Later, make_guess, make_guesses
 from covocp.statement.magnitudes import check_magnitudes
 from covocp.statement.names import stacked_parameters
@@ -206,6 +206,7 @@ class Solver:
             (carries the best solution without it).
             Interrupted: after Ctrl-C (a KeyboardInterrupt; carries the last iterate, or the best of several starts).
         """
+        mention_clock(self.statement, elapsed, parameters)
         if not all(value is None for value in (initial, means, covariance, duration)):
             other, known = self._elsewhere.solver(duration)
             return other.solve(

@@ -66,6 +66,16 @@ def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Sta
             )
 
 
+def mention_clock(statement: Statement, elapsed: Given, parameters: Mapping[str, Any] | None) -> None:
+    """Warn of a problem with a clock of its own that is planned again later on, and of which nothing says so."""
+    if elapsed and not statement.autonomous and not parameters:
+        warn_user(
+            f"'{statement.name or 'The problem'}' depends on the time, which begins at 0 again: elapsed= says what is "
+            "left of the guess and moves no clock. Write t0 + ocp.time with a parameter t0 and give its value "
+            "(parameters={'t0': ...}); of data over time state the problem anew with those from now on."
+        )
+
+
 def _rows_over_time(guess: Given, block: Block | None) -> int:
     """Rows of a guess that is an array over time, 0 of any other: one value for each entry has no time.
 
