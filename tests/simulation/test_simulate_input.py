@@ -85,7 +85,7 @@ def test_what_cannot_be_simulated(lag, tmp_path):
         simulate(unknown_lag.steering(), 64, 1, **OPTIONS)
     with pytest.raises(ProblemError, match="knows no problem"):
         simulate(co.load(lag.save(tmp_path / "lag.npz")), 64, 1, **OPTIONS)
-    with pytest.raises(ProblemError, match="Nothing is estimated"):
+    with pytest.raises(ProblemError, match="no part of this problem"):
         simulate(co.solve(free_time_integrator.problem(), intervals=20, progress=False), 64, 1, **OPTIONS)
     under = co.evaluate(lag, truth=unknown_lag.steering(process_noise=2.0, parameter_variance=0.1))
     with pytest.raises(ProblemError, match="truth="):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 
 import casadi as ca
@@ -319,6 +320,28 @@ def test_what_is_missed_does_not_depend_on_the_unit(unit):
     expected = {"bounds of x": 0.5, "bounds of u": 0.1, "wall": 0.3, "gate": 0.2, "zero": 0.2}
     assert missed == pytest.approx({name: value * unit for name, value in expected.items()})
     assert co.evaluate(ocp, nominal=co.solve(ocp, intervals=4, progress=False)).violations == {}
+
+
+@pytest.mark.parametrize("kind", ["row", "bound"])
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+def test_a_limit_of_zero_that_is_met_all_the_way_is_not_passed(kind, method):
+    """By 1e-8, or by 1e-39, "100 % of it" had been told: the row is zero everywhere but for rounding."""
+    ocp = co.Problem(2.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0, variance=0.1), ocp.control("u")
+    v = ocp.control("v", lower=0.0) if kind == "bound" else ocp.control("v")
+    ocp.dynamics(x, u - x, noise=0.1)
+    ocp.measurement("m", x, noise=0.1)
+    E = ocp.estimation_covariance()
+    if kind == "row":
+        ocp.subject_to(v, lower=0.0, name="positive")
+    ocp.minimize(running=0.5 * u**2 + 0.5 * (v + 1.0) ** 2, terminal=E[x, x])
+    found = co.solve(ocp, intervals=20, method=method, progress=False)  # any warning is an error
+    assert np.abs(found["v"]).max() < 1e-7
+    assert co.evaluate(ocp, nominal=found).violations == {}
+    name = "positive" if kind == "row" else "bounds of v"
+    with warnings.catch_warnings(action="ignore"):
+        missed = co.evaluate(ocp, nominal={"u": 0.5, "v": -0.01}, intervals=5).violations
+    assert missed[name] == pytest.approx(0.01)
 
 
 def test_a_limit_that_is_rounding_is_not_missed_by_rounding():

@@ -9,8 +9,8 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal, Outcome
+from covocp.extremal.row_units import varied_by
 from covocp.statement.conditions import Conditions, Inside, beyond
-from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Statement
 from covocp.transcription.first_guess import starts
 from covocp.transcription.mesh import Mesh, Options
@@ -26,8 +26,8 @@ MISS = 1e-6
 # Limits of zero have no unit: theirs is at most so many times what the row varies by, which solvers do not see. By a
 # small share of that a limit which is rounding itself (sin(pi)) may be missed.
 FAR, ROUNDING = 1e3, 1e-14
-# By how much Ipopt may pass a bound of a variable, in its scale: a nominal of its is no miss.
-RELAXED = 1e-8
+# By how much Ipopt may pass a bound of a variable, in its scale, and more on short intervals: its nominals miss nothing.
+RELAXED = 1e-7
 
 
 def evaluation_mesh(statement: Statement, options: Options, parameters: Array) -> Mesh:
@@ -114,18 +114,10 @@ def _allowed(extremal: Extremal, conditions: Conditions | Inside, units: Scales)
     if isinstance(conditions, Inside):
         return np.concatenate([_allowed(extremal, part.conditions, units) for part in conditions.parts])
     limits = limit_units(conditions.lower, conditions.upper)
-    varied = _varied(extremal, conditions.function, np.concatenate([units.x, units.u, units.e]))
+    varied = varied_by(extremal, conditions.function, units)
     known = np.isfinite(varied) & (varied > 0.0)
     own = np.where(known, np.minimum(limits, FAR * varied), limits)
     return np.asarray(np.maximum(MISS * own, np.where(known, ROUNDING * varied, 0.0)))
-
-
-def _varied(extremal: Extremal, function: ca.Function, units: Array) -> Array:
-    """What each row of a function varies by at most if all variables change by their units, to first order."""
-    symbols = model_symbols(extremal.statement)
-    by_unit = ca.fabs(ca.jacobian(function(*symbols), ca.vertcat(*symbols[:3]))) @ ca.DM(units)
-    varied = ca.Function("varied", symbols, [by_unit]).map(extremal.mesh.nodes.size)(*extremal.columns())
-    return np.asarray(np.asarray(ca.DM(varied).full()).max(axis=1))
 
 
 def without_value(extremal: Extremal) -> dict[str, float]:

@@ -16,10 +16,12 @@ from covocp.extremal.dense_output import OF_RANGE, mapped
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.fine_mesh import refined
 from covocp.extremal.polynomials import Dense
+from covocp.extremal.row_units import varied_by
 from covocp.statement.conditions import Conditions
 from covocp.statement.interval import repeated
 from covocp.statement.statement import Statement
 from covocp.transcription.mesh import Mesh
+from covocp.transcription.scales import choose_scales
 
 # Points that are looked at together: what bounds the memory.
 TOGETHER = 1 << 15
@@ -138,7 +140,18 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
         return np.hstack([x, _conditions(extremal, dense, st.path, k, s)]) if st.path.size else x
 
     terms = np.concatenate([np.zeros(st.nx), _equation_terms(extremal)])
-    return _passed(extremal, dense, points, names, limits, values, terms)
+    found = _passed(extremal, dense, points, names, limits, values, terms)
+    if found and (np.array(limits) == 0.0).any():  # relative to what is zero as well anything is much
+        found = _passed(extremal, dense, points, names, limits, values, terms, _units(extremal))
+    return found
+
+
+def _units(extremal: Extremal) -> Array:
+    """Units of the states and of the rows along the path, 0 where none are known."""
+    st = extremal.statement
+    units = choose_scales(st, extremal.mesh, extremal.trajectory, extremal.parameters)
+    rows = varied_by(extremal, st.path.function, units) if st.path.size else np.zeros(0)
+    return np.concatenate([units.x, np.where(np.isfinite(rows), rows, 0.0)])
 
 
 def _equation_terms(extremal: Extremal) -> Array:
@@ -182,10 +195,11 @@ def _passed(
     limits: tuple[Array, ...],
     values_at: Callable[[Any, Array], Array],
     terms: Array | float = 0.0,
+    units: Array | float = 0.0,
 ) -> tuple[Passed, ...]:
     """Rows that pass their limits along the true path, from what gives them at normalised times of intervals.
 
-    terms: sizes of what equations compare, 0 of other rows.
+    terms: sizes of what equations compare, 0 of other rows. units: what rows with a limit of zero count as at least.
     """
     mesh, (lower, upper) = extremal.mesh, limits
     worst, largest, held = np.zeros((2, len(names))), np.zeros(len(names)), np.zeros(len(names))
@@ -205,7 +219,8 @@ def _passed(
             worst[side] = np.maximum(worst[side], found)
             there = np.where(lower == upper, _imposed(mesh, k, s, 1), _imposed(mesh, k, s, mesh.points))
             held = np.maximum(held, np.where(there, excess, 0.0).max(axis=0, initial=0.0))
-    shares = worst / limit_sizes(lower, upper, np.where(np.asarray(terms) > 0, terms, largest))
+    largest = np.where(np.asarray(terms) > 0, terms, np.maximum(largest, units))
+    shares = worst / limit_sizes(lower, upper, largest)
     side = shares.argmax(axis=0)
     result = [
         Passed(
