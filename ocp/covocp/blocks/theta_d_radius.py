@@ -6,6 +6,9 @@ these, lambda_i, meets one that is not, -lambda_j (a branch point, where (lambda
 until the subspace has a vector without upper half (a pole). On a circle on which the series still converges both kinds
 are estimated by a Newton step, and then found by Newton's method on H(s). What is found must agree with how the terms
 of high order grow.
+
+Systems beside one another that do not act on one another, in whatever coordinates, are looked at one by one: where two of
+them are alike every eigenvalue of H(s) is a double one, and no two of them are seen to meet.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from covocp.blocks.scaling import diagonal_scales, over
+from covocp.blocks.theta_d_separate import separate
 from covocp.blocks.theta_d_series import Start
 
 Array = NDArray[np.float64]
@@ -33,6 +37,14 @@ EARLY, LATE = slice(46, 101), slice(106, 161)
 POWER, UNCERTAIN = 1.5, 0.1
 # The circle, relative to that radius: what the terms leave out there is rounding. Angles from 0 to pi.
 CIRCLE, ANGLES = 0.8, 65
+# Near its singularity a term of order n behaves like n^-p R^-n: p = 3/2 where two eigenvalues meet, 1/2 for the inverse of
+# such a root, 0 for a pole, -1 for a double one. Orders of recurrences, the windows of terms that are compared, the misfit
+# and uncertainty up to which one is believed, and by how much more than this (and a rest) what is found may differ from it.
+POWERS, ORDERS = (1.5, 0.5, 0.0, -1.0), (2, 4, 6)
+WINDOWS = slice(50, 106), slice(105, 161)
+FITTING, AGREEING, ACCURACY = 3e-3, 3.0, 1e-3
+# Estimates that are followed first: so many, at most so far from where the recurrence tells, relative to its distance.
+TRIED, NEIGHBOURING = 3, 0.2
 # Estimates are followed that are at most so far from their point of the circle, relative to it; those that are as near
 # to a singularity as this, relative to their way, are of that one.
 FAR, SAME = 0.6, 0.25
@@ -63,6 +75,15 @@ class _Singularity(NamedTuple):
 
     s: complex
     meeting: complex | None
+
+
+class _Fit(NamedTuple):
+    """The nearest singularity by a recurrence of some order, how far the terms are from it, and its uncertainty (relative)."""
+
+    order: int
+    nearest: complex
+    misfit: float
+    uncertainty: float
 
 
 class _Family(NamedTuple):
@@ -101,6 +122,14 @@ def nearest_singularity(begin: Start, A0: Array, Q: Array, direction: Array, gua
         direction: D, (n, n).
         guaranteed: a lower bound of it.
     """
+    if not direction.any():
+        return np.inf
+    parts = separate(begin, A0, Q, direction)
+    return float(max(guaranteed, min(_nearest_of(*part) for part in parts)))
+
+
+def _nearest_of(begin: Start, A0: Array, Q: Array, direction: Array) -> float:
+    """The same of a system that is one."""
     units = diagonal_scales(begin.riccati)  # of the states, so that T_0 has ones on its diagonal
     scale = _scale(begin, direction, units) if direction.any() else np.inf
     if not np.isfinite(scale):
@@ -118,9 +147,23 @@ def nearest_singularity(begin: Start, A0: Array, Q: Array, direction: Array, gua
         np.block([[step, zero], [zero, -step.T]]),
         terms,
     )
+    return scale * _agreed(family, by_terms)
+
+
+def _agreed(family: _Family, by_terms: float) -> float:
+    """The nearest singularity that agrees with the terms of high order, or what these tell, less what they leave open."""
+    fitted = recurrence(family.terms)
     most = (1.0 + UNCERTAIN) * by_terms
-    nearest = next(_singularities(family, CIRCLE * by_terms, most), (1.0 - UNCERTAIN) * by_terms)
-    return float(max(guaranteed, scale * nearest))
+    if fitted is None or abs(abs(fitted.nearest) / by_terms - 1.0) > UNCERTAIN:
+        return next(_singularities(family, CIRCLE * by_terms, most), (1.0 - UNCERTAIN) * by_terms)
+    radius, allowed = abs(fitted.nearest), AGREEING * fitted.uncertainty + ACCURACY
+    most = min(most, (1.0 + allowed) * radius)
+    if fitted.order == 2 and (found := _beside(family, fitted, allowed * radius)) is not None:
+        return found
+    for found in _singularities(family, CIRCLE * radius, most):
+        if found > (1.0 - allowed) * radius:
+            return found
+    return (1.0 - fitted.uncertainty) * radius
 
 
 def _scale(begin: Start, direction: Array, units: Array) -> float:
@@ -156,28 +199,87 @@ def scaled_terms(begin: Start, direction: Array, count: int) -> Array:
     return terms
 
 
-def _singularities(family: _Family, radius: float, most: float) -> Iterator[float]:
-    """Distances of branch points and poles up to `most` that are found from a circle, the nearest first."""
-    points = radius * np.exp(1j * np.linspace(0.0, np.pi, ANGLES))
-    branch = family.branch(points)
+def recurrence(terms: Array) -> _Fit | None:
+    """The nearest singularity by a recurrence that n^p T_n obey, of the least order that fits; None where none does.
+
+    The order is 2 where one pair of conjugate singularities is nearest. How the root changes from earlier terms to later
+    ones is its uncertainty.
+    """
+    weighed = [(terms * np.maximum(np.arange(len(terms)), 1.0)[:, None, None] ** p).reshape(len(terms), -1) for p in POWERS]
+    for order in ORDERS:
+        fits = []
+        for values in weighed:
+            (early, _), (late, misfit) = (_dominant(values[window], order) for window in WINDOWS)
+            fits.append(_Fit(order, late, misfit, abs(abs(early) / abs(late) - 1.0)))
+        best = min(fits, key=lambda fit: fit.misfit)
+        if max(best.misfit, best.uncertainty) < FITTING:
+            return best
+    return None
+
+
+def _dominant(values: Array, order: int) -> tuple[complex, float]:
+    """Inverse of the largest root of the recurrence that rows obey best, and its misfit, relative."""
+    values = values / np.abs(values).max()
+    count = len(values) - order
+    columns = np.stack([values[order - k - 1 : order - k - 1 + count].ravel() for k in range(order)], axis=1)
+    last = values[order:].ravel()
+    factors = np.linalg.lstsq(columns, last, rcond=1e-10)[0]
+    misfit = float(np.linalg.norm(last - columns @ factors) / np.linalg.norm(last))
+    roots = np.roots([1.0, *-factors]).astype(complex)
+    largest = roots[np.argmax(np.abs(roots))] if roots.any() else complex(np.nan)
+    return 1.0 / complex(largest), misfit
+
+
+def _estimates(points: Complex, branch: _Branch) -> tuple[Complex, list[tuple[int, int]]]:
+    """Where a step from points (k,) finds eigenvalues to meet and, last, P a pole: (k, pairs + 1); and the pairs."""
     first, second = np.triu_indices(branch.values.shape[1])
     with np.errstate(divide="ignore", invalid="ignore"):
         sums, slopes = (part[:, first] + part[:, second] for part in (branch.values, branch.slopes))
         meetings = points[:, None] - sums / slopes / 2
         poles = points + 2 * _to_pole(branch.slope, branch.bend)  # of a pole and what hardly changes beside it
-    estimates = np.column_stack([meetings, poles])
+    return np.column_stack([meetings, poles]), list(zip(first.tolist(), second.tolist(), strict=True))
+
+
+def _followed(
+    family: _Family, start: complex, branch: _Branch, k: int, pair: tuple[int, int] | None, estimate: complex
+) -> _Singularity | None:
+    """What Newton's method finds from an estimate at the k-th point; without a pair it is one of a pole."""
+    values = branch.values[k]
+    if pair is None:
+        return _pole(family, start, values, branch.slopes[k], estimate)
+    return _branch_point(family, start, values[pair[0]], -values[pair[1]])
+
+
+def _beside(family: _Family, fitted: _Fit, allowed: float) -> float | None:
+    """Distance of the singularity that is no further than allowed from the one of a recurrence; None: none is found."""
+    place = complex(fitted.nearest.real, abs(fitted.nearest.imag))
+    points = np.array([CIRCLE * place])
+    branch = family.branch(points)
+    estimates, pairs = _estimates(points, branch)
+    away = np.abs(estimates[0] - place)
+    for kind in np.argsort(away)[:TRIED]:
+        if away[kind] < NEIGHBOURING * abs(place):
+            pair = pairs[kind] if kind < len(pairs) else None
+            new = _followed(family, points[0], branch, 0, pair, estimates[0, kind])
+            if new is not None and abs(new.s - place) < allowed and _is_reached(family, abs(points[0]), new):
+                return abs(new.s)
+    return None
+
+
+def _singularities(family: _Family, radius: float, most: float) -> Iterator[float]:
+    """Distances of branch points and poles up to `most` that are found from a circle, the nearest first."""
+    points = radius * np.exp(1j * np.linspace(0.0, np.pi, ANGLES))
+    branch = family.branch(points)
+    estimates, pairs = _estimates(points, branch)
     ways = np.abs(estimates - points[:, None])
     near = np.argwhere(ways < FAR * radius)
     found = _meetings_in_zero(family, radius, most)
     for k, kind in near[np.argsort(ways[near[:, 0], near[:, 1]])]:
-        pole = kind == first.size
-        like = (other.s for other in found if (other.meeting is None) == pole)
+        pair = pairs[kind] if kind < len(pairs) else None
+        like = (other.s for other in found if (other.meeting is None) == (pair is None))
         if any(abs(s - estimates[k, kind]) < SAME * ways[k, kind] for s in like):
             continue
-        if pole:
-            new = _pole(family, points[k], branch.values[k], branch.slopes[k], estimates[k, kind])
-        else:
-            new = _branch_point(family, points[k], branch.values[k, first[kind]], -branch.values[k, second[kind]])
+        new = _followed(family, points[k], branch, k, pair, estimates[k, kind])
         if new is not None and abs(new.s) < most:
             found.append(new)
     for entry in sorted(found, key=lambda entry: abs(entry.s)):
