@@ -42,7 +42,10 @@ CIRCLE, ANGLES = 0.8, 65
 # and uncertainty up to which one is believed, and by how much more than this (and a rest) what is found may differ from it.
 POWERS, ORDERS = (1.5, 0.5, 0.0, -1.0), (2, 4, 6)
 WINDOWS = slice(50, 106), slice(105, 161)
-FITTING, AGREEING, ACCURACY = 3e-3, 3.0, 1e-3
+FITTING, AGREEING, ACCURACY = 3e-3, 6.0, 1e-3
+# Angles that are enough to see whether another one is nearer, by this at least; how far beyond the limit an estimate may be
+# of what is within.
+COARSE, NEARER, BEYOND = 33, 1.0 - 1e-6, 1.1
 # Estimates that are followed first: so many, at most so far from where the recurrence tells, relative to its distance.
 TRIED, NEIGHBOURING = 3, 0.2
 # Estimates are followed that are at most so far from their point of the circle, relative to it; those that are as near
@@ -158,12 +161,10 @@ def _agreed(family: _Family, by_terms: float) -> float:
         return next(_singularities(family, CIRCLE * by_terms, most), (1.0 - UNCERTAIN) * by_terms)
     radius, allowed = abs(fitted.nearest), AGREEING * fitted.uncertainty + ACCURACY
     most = min(most, (1.0 + allowed) * radius)
-    if fitted.order == 2 and (found := _beside(family, fitted, allowed * radius)) is not None:
-        return found
-    for found in _singularities(family, CIRCLE * radius, most):
-        if found > (1.0 - allowed) * radius:
-            return found
-    return (1.0 - fitted.uncertainty) * radius
+    if fitted.order == 2 and (beside := _beside(family, fitted, allowed * radius)) is not None:
+        # one that is nearer may be so weak that the terms do not tell of it yet
+        return next(_singularities(family, CIRCLE * radius, NEARER * beside, COARSE), beside)
+    return next(_singularities(family, CIRCLE * radius, most), (1.0 - fitted.uncertainty) * radius)
 
 
 def _scale(begin: Start, direction: Array, units: Array) -> float:
@@ -266,13 +267,13 @@ def _beside(family: _Family, fitted: _Fit, allowed: float) -> float | None:
     return None
 
 
-def _singularities(family: _Family, radius: float, most: float) -> Iterator[float]:
+def _singularities(family: _Family, radius: float, most: float, angles: int = ANGLES) -> Iterator[float]:
     """Distances of branch points and poles up to `most` that are found from a circle, the nearest first."""
-    points = radius * np.exp(1j * np.linspace(0.0, np.pi, ANGLES))
+    points = radius * np.exp(1j * np.linspace(0.0, np.pi, angles))
     branch = family.branch(points)
     estimates, pairs = _estimates(points, branch)
     ways = np.abs(estimates - points[:, None])
-    near = np.argwhere(ways < FAR * radius)
+    near = np.argwhere((ways < FAR * radius) & (np.abs(estimates) < BEYOND * most))
     found = _meetings_in_zero(family, radius, most)
     for k, kind in near[np.argsort(ways[near[:, 0], near[:, 1]])]:
         pair = pairs[kind] if kind < len(pairs) else None
