@@ -7,13 +7,13 @@ until the subspace has a vector without upper half (a pole). On a circle on whic
 are estimated by a Newton step, and then found by Newton's method on H(s). What is found must agree with how the terms
 of high order grow.
 
-Systems beside one another that do not act on one another, in whatever coordinates, are looked at one by one: where two of
-them are alike every eigenvalue of H(s) is a double one, and no two of them are seen to meet.
+Systems that do not act on one another, in whatever coordinates, are looked at one by one: where two of them are alike
+every eigenvalue of H(s) is a double one, and no two of them are seen to meet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,15 +37,16 @@ EARLY, LATE = slice(46, 101), slice(106, 161)
 POWER, UNCERTAIN = 1.5, 0.1
 # The circle, relative to that radius: what the terms leave out there is rounding. Angles from 0 to pi.
 CIRCLE, ANGLES = 0.8, 65
-# Near its singularity a term of order n behaves like n^-p R^-n: p = 3/2 where two eigenvalues meet, 1/2 for the inverse of
-# such a root, 0 for a pole, -1 for a double one. Orders of recurrences, the windows of terms that are compared, the misfit
-# and uncertainty up to which one is believed, and by how much more than this (and a rest) what is found may differ from it.
+# Near its singularity a term of order n behaves like n^-p R^-n: p = 3/2 where two eigenvalues meet, 1/2 for the inverse
+# of such a root, 0 for a pole, -1 for a double one. Orders of recurrences, the windows of terms that are compared, the
+# misfit and uncertainty up to which one is believed; what is found may be farther away by so many times its
+# uncertainty, and a rest.
 POWERS, ORDERS = (1.5, 0.5, 0.0, -1.0), (2, 4, 6)
 WINDOWS = slice(50, 106), slice(105, 161)
 FITTING, AGREEING, ACCURACY = 3e-3, 6.0, 1e-3
-# Angles that are enough to see whether another one is nearer, by this at least; how far beyond the limit an estimate may be
-# of what is within.
-COARSE, NEARER, BEYOND = 33, 1.0 - 1e-6, 1.1
+# How far beyond the limit an estimate may be of what is within. The same, angles and ways that are enough to see
+# whether another one is nearer than one that is known, by this at least.
+BEYOND, CLOSELY, COARSE, CLOSE, NEARER = 1.1, 1.03, 25, 0.4, 1.0 - 1e-6
 # Estimates that are followed first: so many, at most so far from where the recurrence tells, relative to its distance.
 TRIED, NEIGHBOURING = 3, 0.2
 # Estimates are followed that are at most so far from their point of the circle, relative to it; those that are as near
@@ -74,14 +75,18 @@ class _Branch(NamedTuple):
 
 
 class _Singularity(NamedTuple):
-    """Where it is, and the eigenvalue of H(s) at which two of them meet there; None: it is a pole."""
+    """Where it is, and the eigenvalue of H(s) at which two of them meet there; None: it is a pole.
+
+    Where they pass one another it is no singularity, but what estimates from other points lead to as well.
+    """
 
     s: complex
     meeting: complex | None
+    passing: bool = False
 
 
 class _Fit(NamedTuple):
-    """The nearest singularity by a recurrence of some order, how far the terms are from it, and its uncertainty (relative)."""
+    """The nearest singularity by a recurrence of some order, its misfit and the uncertainty, both relative."""
 
     order: int
     nearest: complex
@@ -154,7 +159,7 @@ def _nearest_of(begin: Start, A0: Array, Q: Array, direction: Array) -> float:
 
 
 def _agreed(family: _Family, by_terms: float) -> float:
-    """The nearest singularity that agrees with the terms of high order, or what these tell, less what they leave open."""
+    """The nearest singularity that agrees with the terms of high order, or what these tell less its uncertainty."""
     fitted = recurrence(family.terms)
     most = (1.0 + UNCERTAIN) * by_terms
     if fitted is None or abs(abs(fitted.nearest) / by_terms - 1.0) > UNCERTAIN:
@@ -163,7 +168,7 @@ def _agreed(family: _Family, by_terms: float) -> float:
     most = min(most, (1.0 + allowed) * radius)
     if fitted.order == 2 and (beside := _beside(family, fitted, allowed * radius)) is not None:
         # one that is nearer may be so weak that the terms do not tell of it yet
-        return next(_singularities(family, CIRCLE * radius, NEARER * beside, COARSE), beside)
+        return next(_singularities(family, CIRCLE * radius, NEARER * abs(beside.s), [beside]), abs(beside.s))
     return next(_singularities(family, CIRCLE * radius, most), (1.0 - fitted.uncertainty) * radius)
 
 
@@ -189,24 +194,28 @@ def _scale(begin: Start, direction: Array, units: Array) -> float:
 
 def scaled_terms(begin: Start, direction: Array, count: int) -> Array:
     """T_0, ..., T_count of A0 + direction with epsilon = 1, numbers, (count + 1, n, n)."""
-    weight = begin.root @ begin.root.T
-    terms = np.zeros((count + 1, *direction.shape))
+    weight, size = begin.root @ begin.root.T, len(direction)
+    terms = np.zeros((count + 1, size, size))
     terms[0] = begin.riccati
+    # T_1 S, T_2 S, ... beside one another and T_count, ..., T_1 below one another: their sums are products of matrices
+    left, right = np.zeros((size, count * size)), np.zeros((count * size, size))
     for n in range(1, count + 1):
-        right = -(terms[n - 1] @ direction + direction.T @ terms[n - 1])
-        if n > 1:
-            right += np.einsum("nij,njk->ik", terms[1:n] @ weight, terms[n - 1 : 0 : -1])
-        terms[n] = begin.corrected(right)
+        moved = terms[n - 1] @ direction
+        inner = left[:, : (n - 1) * size] @ right[(count - n + 1) * size :]
+        terms[n] = begin.corrected(inner - moved - moved.T)
+        left[:, (n - 1) * size : n * size] = terms[n] @ weight
+        right[(count - n) * size : (count - n + 1) * size] = terms[n]
     return terms
 
 
 def recurrence(terms: Array) -> _Fit | None:
     """The nearest singularity by a recurrence that n^p T_n obey, of the least order that fits; None where none does.
 
-    The order is 2 where one pair of conjugate singularities is nearest. How the root changes from earlier terms to later
-    ones is its uncertainty.
+    The order is 2 where one pair of conjugate singularities is nearest. How the root changes from earlier terms to
+    later ones is its uncertainty.
     """
-    weighed = [(terms * np.maximum(np.arange(len(terms)), 1.0)[:, None, None] ** p).reshape(len(terms), -1) for p in POWERS]
+    flat, orders = terms.reshape(len(terms), -1), np.maximum(np.arange(len(terms)), 1.0)[:, None]
+    weighed = [flat * orders**power for power in POWERS]
     for order in ORDERS:
         fits = []
         for values in weighed:
@@ -251,8 +260,8 @@ def _followed(
     return _branch_point(family, start, values[pair[0]], -values[pair[1]])
 
 
-def _beside(family: _Family, fitted: _Fit, allowed: float) -> float | None:
-    """Distance of the singularity that is no further than allowed from the one of a recurrence; None: none is found."""
+def _beside(family: _Family, fitted: _Fit, allowed: float) -> _Singularity | None:
+    """The singularity that is no further than allowed from the one of a recurrence; None: none is found."""
     place = complex(fitted.nearest.real, abs(fitted.nearest.imag))
     points = np.array([CIRCLE * place])
     branch = family.branch(points)
@@ -262,29 +271,36 @@ def _beside(family: _Family, fitted: _Fit, allowed: float) -> float | None:
         if away[kind] < NEIGHBOURING * abs(place):
             pair = pairs[kind] if kind < len(pairs) else None
             new = _followed(family, points[0], branch, 0, pair, estimates[0, kind])
-            if new is not None and abs(new.s - place) < allowed and _is_reached(family, abs(points[0]), new):
-                return abs(new.s)
+            if new is None or new.passing or abs(new.s - place) > allowed:
+                continue
+            if _is_reached(family, abs(points[0]), new):
+                return new
     return None
 
 
-def _singularities(family: _Family, radius: float, most: float, angles: int = ANGLES) -> Iterator[float]:
-    """Distances of branch points and poles up to `most` that are found from a circle, the nearest first."""
+def _singularities(family: _Family, radius: float, most: float, known: Sequence[_Singularity] = ()) -> Iterator[float]:
+    """Distances of branch points and poles up to `most` that are found from a circle, the nearest first.
+
+    Where one is known that is just beyond, fewer points and the estimates close to them are enough.
+    """
+    angles, far, beyond = (COARSE, CLOSE, CLOSELY) if known else (ANGLES, FAR, BEYOND)
     points = radius * np.exp(1j * np.linspace(0.0, np.pi, angles))
     branch = family.branch(points)
     estimates, pairs = _estimates(points, branch)
     ways = np.abs(estimates - points[:, None])
-    near = np.argwhere((ways < FAR * radius) & (np.abs(estimates) < BEYOND * most))
-    found = _meetings_in_zero(family, radius, most)
+    near = np.argwhere((ways < far * radius) & (np.abs(estimates) < beyond * most))
+    found = [*known, *_meetings_in_zero(family, radius, most)]
     for k, kind in near[np.argsort(ways[near[:, 0], near[:, 1]])]:
         pair = pairs[kind] if kind < len(pairs) else None
         like = (other.s for other in found if (other.meeting is None) == (pair is None))
-        if any(abs(s - estimates[k, kind]) < SAME * ways[k, kind] for s in like):
+        estimate = estimates[k, kind]
+        if any(min(abs(s - estimate), abs(s.conjugate() - estimate)) < SAME * ways[k, kind] for s in like):
             continue
-        new = _followed(family, points[k], branch, k, pair, estimates[k, kind])
-        if new is not None and abs(new.s) < most:
+        new = _followed(family, points[k], branch, k, pair, estimate)
+        if new is not None:
             found.append(new)
     for entry in sorted(found, key=lambda entry: abs(entry.s)):
-        if _is_reached(family, radius, entry):
+        if abs(entry.s) < most and not entry.passing and _is_reached(family, radius, entry):
             yield abs(entry.s)
 
 
@@ -302,7 +318,7 @@ def _to_pole(P: Complex, slope: Complex) -> Any:
 
 def _is_reached(family: _Family, radius: float, singularity: _Singularity) -> bool:
     """Whether P itself has a singularity, and not another solution: by following its eigenvalues from the circle."""
-    end, meeting = singularity
+    end, meeting, _ = singularity
     start = radius * end / abs(end)
     branch = family.branch(np.array([start]))
     values, slopes, before = branch.values[0], branch.slopes[0], start
@@ -334,7 +350,7 @@ def _pair(values: Complex, mean: complex) -> tuple[int, int]:
 
 
 def _branch_point(family: _Family, start: complex, one: complex, other: complex) -> _Singularity | None:
-    """Where two eigenvalues of H(s) meet and do not pass; None where they do, or are lost."""
+    """Where two eigenvalues of H(s) meet, or pass; None where they are lost."""
     s, size, values, last = start, abs(start), family.eigen(start), np.inf
     a, b = (int(np.argmin(np.abs(values[0] - value))) for value in (one, other))
     for _ in range(NEWTON_STEPS):
@@ -352,7 +368,7 @@ def _branch_point(family: _Family, start: complex, one: complex, other: complex)
     else:
         return None
     mean = complex(values[0][a] + values[0][b]) / 2
-    return _Singularity(s, mean) if _is_branch_point(family, s, mean, size) else None
+    return _Singularity(s, mean, not _is_branch_point(family, s, mean, size))
 
 
 def _is_branch_point(family: _Family, s: complex, meeting: complex, size: float) -> bool:

@@ -70,8 +70,7 @@ def _commuting(matrices: list[Array]) -> list[Array]:
     basis = np.zeros((rows.size, n, n))
     basis[np.arange(rows.size), rows, columns] = basis[np.arange(rows.size), columns, rows] = 1.0
     commutators = np.hstack([(basis @ matrix - matrix @ basis).reshape(rows.size, -1) for matrix in given])
-    vectors, sizes, _ = np.linalg.svd(commutators)
-    sizes = np.concatenate([sizes, np.zeros(rows.size - sizes.size)])
+    vectors, sizes, _ = np.linalg.svd(commutators, full_matrices=False)
     free = vectors[:, sizes <= COMMUTING * max(sizes[0], np.finfo(float).tiny)]
     if free.shape[1] < 2:
         return [np.eye(n)]
