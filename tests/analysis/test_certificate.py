@@ -492,6 +492,43 @@ def test_a_limit_in_a_small_unit_is_violated_by_a_share_of_it() -> None:
         assert "violates the constraints of the problem" in certificate.reason
 
 
+def with_unwanted_actuator(kind: str, size: float = 1.0) -> co.Problem:
+    """The lag and a control in some unit, which moves nothing or another state and is best at its limit of zero."""
+    ocp = co.Problem(10.0, name="lag with two controls")
+    x = ocp.state("x", initial=0.0, final=1.0, variance=1.0)
+    y = ocp.state("y", initial=0.0) if kind == "state" else None
+    b = ocp.unknown("b", mean=1.0, variance=5.0)
+    u, v = ocp.control("u"), ocp.control("v", lower=-np.inf if kind == "condition" else 0.0)
+    ocp.dynamics(x, -b * x + u, noise=1.0)
+    if y is not None:
+        ocp.dynamics(y, -y + v / size)
+    if kind == "condition":
+        ocp.subject_to(v, lower=0.0, name="pos")
+    ocp.measurement("position", x, noise=1.0)
+    E: Any = ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * u**2 + 0.5 * (v / size + 0.1) ** 2, terminal=10.0 * E[b, b])
+    return ocp
+
+
+@pytest.mark.parametrize("kind", ["condition", "bound", "state"])
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+@pytest.mark.filterwarnings("ignore:At points where it is imposed the limit of")  # by 1e-8, or by 1e-34
+def test_a_limit_of_zero_that_is_met_up_to_the_solver_s_tolerance_is_met(kind: str, method: Any) -> None:
+    """What is left there is 1e-8 of the unit of the control, or rounding of nothing."""
+    solution = co.solve(with_unwanted_actuator(kind), intervals=20, method=method, progress=False)
+    assert "violates" not in str(co.certify(solution))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_a_limit_of_zero_is_violated_by_a_share_of_the_unit_of_the_control(size: float) -> None:
+    """The control costs by itself as much as the solution where it is 1.2 of its unit all the time."""
+    best = lag(10.0, 1.0).trajectory.u[:, 0]
+    for kind, share, violates in (("condition", 1e-4, True), ("bound", 1e-4, True), ("bound", 1e-8, False)):
+        nominal = {"u": best, "v": -share * size * np.ones(best.size)}
+        found = co.certify(co.evaluate(with_unwanted_actuator(kind, size), nominal=nominal, intervals=80))
+        assert ("violates" in str(found)) == violates
+
+
 def test_certifying_takes_time_in_proportion_to_the_intervals() -> None:
     """Operations are counted by what is stored: nothing has two axes of control values."""
     st = unknown_lag.problem().statement()

@@ -63,6 +63,58 @@ def test_radius_of_two_scalar_systems_in_any_units(units):
     assert found == pytest.approx(np.abs((1j - first) / second).min(), rel=1e-6)
 
 
+def turned(system, seed):
+    """The same system in random coordinates that keep the identity as Q."""
+    n = len(system[0])
+    O = np.linalg.qr(np.random.default_rng(seed).standard_normal((n, n)))[0]
+    return O @ system[0] @ O.T, O @ system[1] @ O.T, O @ system[2], np.eye(n), np.eye(system[2].shape[1])
+
+
+@pytest.mark.parametrize("copies", [2, 3])
+def test_radius_of_equal_axes_is_that_of_one(copies):
+    """p = a + sqrt(a^2 + 1) of each axis, and the oscillator of above."""
+    one = np.sqrt(1.25) / 0.2
+    found = theta_d.radius(*(np.kron(np.eye(copies), v) for v in (-0.5, 0.2, 1.0, 1.0, 1.0)))
+    assert found == pytest.approx(one, rel=1e-9)
+    oscillator = np.array([[0.0, 1.0], [-2.0, -0.2]]), np.array([[0.0, 0.0], [-2.0, -1.0]]), np.array([[0.0], [1.0]])
+    alone = theta_d.radius(*oscillator, np.eye(2), 1.0)
+    system = tuple(np.kron(np.eye(copies), v) for v in oscillator)
+    assert theta_d.radius(*turned(system, copies)) == pytest.approx(alone, rel=1e-7)
+    assert theta_d.radius(*system, np.eye(2 * copies), np.eye(copies)) == pytest.approx(alone, rel=1e-7)
+
+
+def test_radius_of_opposed_axes_is_that_of_one():
+    """D and -D: the eigenvalues of one system meet those of the other where neither has a singularity."""
+    generator = np.random.default_rng(87019)
+    size = int(generator.integers(1, 6))
+    inputs = int(generator.integers(1, min(size, 2) + 1))
+    A, D = generator.standard_normal((2, size, size))
+    B = generator.standard_normal((size, inputs))
+    two = np.kron(np.eye(2), A), np.kron(np.diag([1.0, -1.0]), D), np.kron(np.eye(2), B)
+    one = theta_d.radius(A, D, B, np.eye(size), np.eye(inputs))
+    assert one == pytest.approx(0.91583, rel=1e-4)  # growth of 1500 terms; a farther branch point is at 0.93516
+    assert theta_d.radius(*two, np.eye(2 * size), np.eye(2 * inputs)) == pytest.approx(one, rel=1e-4)
+    assert theta_d.radius(*turned(two, 1)) == pytest.approx(one, rel=1e-4)
+
+
+def test_radius_of_systems_beside_one_another_that_have_no_cost():
+    """States that nothing weighs leave T_0 singular: x2 does not act on x1, of which p = a + sqrt(a^2 + 1)."""
+    found = theta_d.radius(np.diag([-0.5, -1.0]), np.diag([0.2, 3.0]), np.eye(2), np.diag([1.0, 0.0]), np.eye(2))
+    assert found == pytest.approx(np.sqrt(1.25) / 0.2, rel=1e-9)
+
+
+def test_a_recurrence_tells_the_singularity_of_a_known_series():
+    """(1 - s/r)^1/2 and its conjugate, r = 0.9 exp(i)."""
+    orders = np.arange(161)
+    factors = np.cumprod(np.concatenate([[1.0], (orders[1:] - 1.5) / orders[1:]]))
+    terms = (factors * np.cos(orders) / 0.9**orders)[:, None, None]
+    found = theta_d_radius.recurrence(terms)
+    assert found.order == 2
+    assert abs(found.nearest) == pytest.approx(0.9, rel=1e-3)
+    assert abs(np.angle(found.nearest)) == pytest.approx(1.0, abs=1e-2)
+    assert theta_d_radius.recurrence(np.random.default_rng(0).standard_normal((161, 2, 2))) is None
+
+
 def test_radius_ends_where_a_mode_cannot_be_reached():
     """x1' = x1 + (1 - s) u: p (1 - s)^2 = 1 + sqrt(1 + (1 - s)^2) has a pole at 1, branch points at 1 +- i."""
     # As the input must not depend on s, it comes through a fast state: x1' = x1 + (1 - s) x2, x2' = -3 x2 + u.

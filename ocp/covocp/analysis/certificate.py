@@ -20,13 +20,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 
 from covocp.analysis.conditions import why_not
 from covocp.analysis.constraint_duals import evaluated
 from covocp.analysis.lower_bound import Bound
 from covocp.analysis.mesh_bound import both_ends, divided, mesh_residual
-from covocp.analysis.reduction import Reduction, resolved
+from covocp.analysis.reduction import Reduction, parts, resolved
 from covocp.base.arguments import checked, truth
 from covocp.base.checks import check_kind
 from covocp.base.matrices import Array, standard_deviations, unpack
@@ -39,6 +40,8 @@ from covocp.extremal.fine_mesh import refined
 from covocp.solution.phases import check_whole
 from covocp.solution.solution import Solution
 from covocp.statement.statement import Conditions
+from covocp.transcription.first_guess import simulate_states
+from covocp.transcription.scales import needed_controls, unvanishing
 
 Verdict = Literal["global minimum (certified)", "not certified", "does not apply"]
 
@@ -51,10 +54,12 @@ ROUNDOFF = 1e-9
 INTERVALS = 100
 # Below this an eigenvalue is negative, and not what the mesh leaves of zero.
 # Above these nothing is certified: what another control could save, relative to J; what a constraint is violated by,
-# relative to its limit or to what its values are made of.
+# relative to its limit or to what its values are made of; what solvers leave of a limit where all these are zero,
+# relative to the units that the cost gives (Ipopt relaxes bounds by 1e-8).
 LARGEST_FALL = 1e-3
 LARGEST_GAP = 1e-3
 LARGEST_VIOLATION = 1e-6
+LEFT_AT_ZERO = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +157,9 @@ def _certified(solution: Solution, reporter: Progress) -> Certificate:
     extremal, cost = refined(solution.extremal), solution.cost  # limits act at all nodes of this
     mesh = resolved(extremal.statement, extremal.mesh, extremal.parameters)
     extremal, w = replace(extremal, mesh=mesh), both_ends(extremal)
-    parts = max(1, int(np.ceil(INTERVALS / mesh.intervals)))
+    pieces = max(1, int(np.ceil(INTERVALS / mesh.intervals)))
     bounds, eigenvalues, errors = [], [], []
-    for factor in (parts, 2 * parts):
+    for factor in (pieces, 2 * pieces):
         reporter.say(f"{factor * mesh.intervals} intervals")
         bounds.append(Bound.at(extremal, *divided(mesh, w, factor)))
         eigenvalue, error = bounds[-1].smallest(bounds[-1].curvature)
@@ -222,14 +227,17 @@ def violations(solution: Solution) -> Mapping[str, float]:
 
     It is looked at where limits are imposed: at the nodes, and at the points between them. A limit counts with its own
     size, that of the values along the whole way, and what they are made of: of a state its standard deviation, of a
-    condition its terms. So no unit decides, and a limit of zero that is met up to rounding is met.
+    condition its terms. Where all of these are zero, what is left by rounding and by the solver counts with the unit of
+    the control that the cost gives. So no unit decides, and a limit of zero that is met up to rounding is met.
     """
     extremal = refined(solution.extremal)
     st, t = extremal.statement, extremal.trajectory
     x0, xf, _, _ = st.boundary_values(extremal.parameters)
     deviations = standard_deviations(unpack(t.e, st.matrices[0].size))[:, : st.nx]
-    states = np.maximum(np.abs(t.x), deviations).max(axis=0)
-    controls = np.abs(t.u).max(axis=0)
+    share = LEFT_AT_ZERO / LARGEST_VIOLATION
+    least_x, least_u = (share * unit for unit in _units(extremal, sum(map(abs, solution.cost_terms.values()))))
+    states = np.maximum(np.maximum(np.abs(t.x), deviations).max(axis=0), least_x)
+    controls = np.maximum(np.abs(t.u).max(axis=0), least_u)
     groups = [
         (st.control_names, t.u, *st.control_bounds, controls, ""),
         (st.state_names, t.x, *st.state_bounds, states, ""),
@@ -251,6 +259,34 @@ def violations(solution: Solution) -> Mapping[str, float]:
             if value > most:
                 result[words + name] = max(float(value), result.get(words + name, 0.0))
     return result
+
+
+def _units(extremal: Extremal, cost: float) -> tuple[Array, Array]:
+    """Units of states (nx,) and controls (nu,) that do not vanish with them, for a size of the cost.
+
+    A control is constant and costs by its energy int L_uu u^2/2 dt as much as the solution, or moves a state by its
+    magnitude where that is less; states have the response to these, or their magnitude.
+    """
+    st, t, p = extremal.statement, extremal.trajectory, extremal.parameters
+    given = parts(st, p)
+    diagonal = ca.diag(ca.hessian(given.running, given.z)[0][st.nx :, st.nx :])
+    at_zero = ca.densify(ca.substitute(diagonal, given.z, ca.DM.zeros(given.z.shape)))
+    times = extremal.time
+    energies = ca.Function("energies", [given.time], [at_zero]).map(times.size)(times.reshape(1, -1)).full()
+    energy = t.duration * energies.mean(axis=1)
+    u = np.sqrt(2 * cost / np.where(energy > 0, energy, np.inf))
+    magnitudes = unvanishing(st, extremal.mesh, t, p)
+    needed = needed_controls(st, extremal.mesh, t, magnitudes, p)
+    lower, upper = st.control_bounds
+    u = np.minimum(u, np.where(needed > 0, needed, np.inf))
+    u = np.minimum(u, np.where(upper > lower, 0.5 * (upper - lower), np.inf))
+    start, base = (t.x[0], t.e[0]), t.u
+    along = simulate_states(st, extremal.mesh, *start, base, t.duration, p)
+    moved = [
+        np.abs(simulate_states(st, extremal.mesh, *start, base + row, t.duration, p) - along).max(axis=0)
+        for row in np.diag(u)
+    ]
+    return np.minimum(np.max(moved, axis=0, initial=0.0), magnitudes), u
 
 
 def _terms(extremal: Extremal, conditions: Conditions, sizes: Array) -> Array:

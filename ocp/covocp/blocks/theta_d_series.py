@@ -139,7 +139,7 @@ def start(A0: Expr, B: Expr, Q: Expr, R: Expr, kind: Kind = REGULATOR) -> Start:
         closed_loop=closed_loop,
         feedback=feedback,
         root=root,
-        inverse=_inverse(closed_loop),
+        inverse=inverse_lyapunov(closed_loop),
     )
 
 
@@ -353,7 +353,7 @@ def _in_any_units(function: Expr) -> tuple[Array, Array]:
     return entries[known] / sizes[known, None], STATE_ROUNDING * moved[known] / sizes[known, None]
 
 
-def _inverse(closed_loop: Array) -> Array:
+def inverse_lyapunov(closed_loop: Array) -> Array:
     """Inverse of vech(T) -> vech(T A_c + A_c' T), column by column."""
     size = closed_loop.shape[0]
     columns = np.empty((half_length(size), half_length(size)))

@@ -90,7 +90,9 @@ def radius(A0: Expr, direction: Expr, B: Expr, Q: Expr, R: Expr) -> float:
 
     Returns:
         The distance of the nearest singularity of the Riccati solution in the complex plane of s, to six digits or
-        more; a few percent less where none is found that fits to the growth of the terms; inf where the series ends.
+        more. Where none is found, what a recurrence that the terms of order 50 to 160 obey tells, less its uncertainty
+        (at most 0.3 percent); where there is none of these either, ten percent less than how these terms grow; inf
+        where the series ends.
 
     Raises:
         ProblemError: an argument does not fit, or a pair is not stabilisable or not detectable (names the mode).
