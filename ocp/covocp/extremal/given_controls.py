@@ -26,7 +26,7 @@ MISS = 1e-6
 # Limits of zero have no unit: theirs is at most so many times what the row varies by, which solvers do not see. By a
 # small share of that a limit which is rounding itself (sin(pi)) may be missed.
 FAR, ROUNDING = 1e3, 1e-14
-# By how much Ipopt may pass a bound of a variable, in its scale, and more on short intervals: its nominals miss nothing.
+# By how much Ipopt may pass a bound of a variable, in its scale, on short intervals by more: its nominals miss nothing.
 RELAXED = 1e-7
 
 
@@ -100,6 +100,8 @@ def missed(extremal: Extremal) -> dict[str, float]:
         (st.control_names, t.u, st.control_bounds, units.u),
     ):
         excess = np.maximum(lower - rows, rows - upper).max(axis=0, initial=0.0)
+        sizes = np.abs([lower, upper])
+        unit = np.minimum(unit, np.where(sizes > 0, sizes, np.inf).min(axis=0))
         allowed = MISS * np.abs(rows).max(axis=0, initial=0.0) + RELAXED * unit
         result |= {f"bounds of {n}": float(v) for n, v, a in zip(names, excess, allowed, strict=True) if v > a}
     for conditions, _, rows in extremal.inequalities():
