@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import gcd
 
 import numpy as np
 
@@ -50,6 +51,12 @@ MARGIN, BEFORE = 1.5, 2.0
 # Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not; and how
 # many times more than these they must say: a jump of the model within a step is seen by all, up to four times as much.
 UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11), 10.0
+# So many steps an interval are tried then, in units of what their number is a multiple of: primes, so that no round
+# frequency meets all of them at one place of its period.
+PRIMES = (7, 13, 31, 61)
+# Base in which frequencies, durations and numbers of intervals are round: steps that see little of an oscillation become
+# so many that no divisor of it is one of their number.
+ROUND = 10
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
@@ -293,6 +300,7 @@ def finer_steps(
 
     A gain that is a control, where the estimate learns all the time, may be large for as long as little is estimated.
     Long steps then find a feedback that is none: at the nodes it is hardly seen, in the cost it is.
+    Where the model changes with the time so that halves do not see it, other parts of the steps count, and the cost.
 
     Args:
         extremal: a solution on the mesh of the options.
@@ -303,7 +311,17 @@ def finer_steps(
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
-    return _divided(extremal, options, allowed, running)
+    return _divided(extremal, options, allowed, running) or _unlike(extremal, options, allowed)
+
+
+def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
+    """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
+    found = unseen(extremal)
+    if found is None or not (found.moved > allowed or found.cost > COARSE_MESH):
+        return None
+    unit = step_unit(extremal.statement, extremal.mesh)
+    numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
+    return with_substeps(options, extremal.mesh, numbers[0]) if numbers else None
 
 
 def _divided(
@@ -329,7 +347,10 @@ def _divided(
     unit = step_unit(statement, mesh)
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
-    substeps = min(max(int(np.ceil(wanted / unit)), fewest), MOST_SUBSTEPS // unit) * unit
+    number = max(int(np.ceil(wanted / unit)), fewest)
+    if changes_within_steps(extremal):  # a round number of steps may meet one place of a period
+        number += next(more for more in range(ROUND) if gcd(number + more, ROUND) == 1)
+    substeps = min(number, MOST_SUBSTEPS // unit) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)

@@ -13,20 +13,18 @@ import numpy as np
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import mapped
 from covocp.extremal.extremal import Extremal
-from covocp.statement.interval import one_sided, repeated
+from covocp.statement.interval import repeated
 
-# Places in a step: multiples of the golden section, whose fractions no period has in common; and where steps look.
-PLACES = 8
-IRREGULAR = (np.arange(1, PLACES + 1) * (np.sqrt(5.0) - 1) / 2) % 1.0
-REGULAR = np.array([one_sided(0.0), 0.5, one_sided(1.0)])
-# How far the parabola through where steps look may be off elsewhere, in what changes within the step: 1.4 rad of an
-# oscillation are that much. What is less than the second share of the largest change in any step does not count, nor
-# roundoff.
-PARABOLA, COUNTS, ROUNDOFF = 0.02, 1e-3, 1e-11
+# Places in a step that no period has in common, fractions of square roots of primes: from one of them to the next what
+# has up to 3000 periods in a step turns at least twice, but for a few numbers and phases.
+PLACES = np.sort(np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 31.0, 37.0]) % 1.0)
+# Turns from which on a step is said to be passed too fast: a kink of a table is one, a jump none, and halves see these.
+# Less than the second share of what changes in the step, of the third in any step, and roundoff are no turns.
+TURNS, TURN, COUNTS, ROUNDOFF = 2, 0.02, 1e-3, 1e-9
 
 
 def changes_within_steps(extremal: Extremal) -> bool:
-    """Whether rates or running cost change with the time alone, within a step, in a way that steps do not see.
+    """Whether rates or running cost, with the time alone, rise and fall and rise again within a step, or the reverse.
 
     State, control and matrices are held as they are where the interval of a step begins: what is said is nothing of
     how these move, so of stiff plants as well, and needs no more than values of the model.
@@ -45,22 +43,25 @@ def _changes(extremal: Extremal) -> bool:
         if not values.size:
             return False
         change = np.ptp(values, axis=1)
-        places = np.append(REGULAR, IRREGULAR)
-        seen = np.stack([np.prod([(places - b) / (a - b) for b in REGULAR if b != a], axis=0) for a in REGULAR])
-        off = np.abs(values - np.einsum("jp,kjr->kpr", seen, values[:, : REGULAR.size])).max(axis=1)
-    least = np.maximum(COUNTS * change.max(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
-    return bool(((off > PARABOLA * change) & (off > least)).any())
+        least = np.maximum(COUNTS * change.max(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
+        steps = np.diff(values, axis=1)
+        moves = np.sign(np.where(np.abs(steps) > TURN * change[:, None], steps, 0.0))
+    turns, last = np.zeros(change.shape), np.zeros(change.shape)
+    for move in moves.swapaxes(0, 1):
+        turns += move * last < 0
+        last = np.where(move != 0, move, last)
+    return bool(((turns >= TURNS) & (change > least)).any())
 
 
 def _held(extremal: Extremal) -> Array:
     """Rates and running cost at the places in each step, all but the time held, (steps, places, rows)."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    nodes, places = mesh.nodes, np.append(REGULAR, IRREGULAR)
+    nodes = mesh.nodes
     k = np.flatnonzero(np.diff(nodes) > 0.0)
-    shares = (np.arange(mesh.substeps)[:, None] + places) / mesh.substeps
+    shares = (np.arange(mesh.substeps)[:, None] + PLACES) / mesh.substeps
     times = t.duration * (nodes[k, None, None] + np.diff(nodes)[k, None, None] * shares)
     each = times[0].size
     at = np.repeat(k, each)
     held = (t.x[at].T, extremal.controls[at].T, t.e[at].T, times.reshape(1, -1))
     values = np.vstack(mapped(st.rates, *held, *repeated(t.duration, extremal.parameters, at.size)))
-    return values.T.reshape(k.size * mesh.substeps, places.size, -1)
+    return values.T.reshape(k.size * mesh.substeps, PLACES.size, -1)
