@@ -54,8 +54,8 @@ UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11), 10.0
 # So many steps an interval are tried then, in units of what their number is a multiple of: primes, so that no round
 # frequency meets all of them at one place of its period.
 PRIMES = (7, 13, 31, 61)
-# Base in which frequencies, durations and numbers of intervals are round: steps that see little of an oscillation become
-# so many that no divisor of it is one of their number.
+# Base in which frequencies, durations and numbers of intervals are round: the number of steps that see little of an
+# oscillation shall have no divisor in common with it.
 ROUND = 10
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
