@@ -81,12 +81,8 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     Returns:
         |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
-    st, t = extremal.statement, extremal.trajectory
-    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    if within is not None:
-        cost += within.others
-        own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
-        extremal = replace(extremal, multipliers=own)
+    st = extremal.statement
+    extremal, cost = _of_all(extremal, running, within)
     change, missed, moved = _change(extremal, running, 2)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -100,6 +96,16 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     for further in _unlike_halves(extremal, running):
         hidden = max(hidden, _share(*further[:2], cost), further[2])
     return hidden if hidden > MORE_THAN_HALVES * error else error
+
+
+def _of_all(extremal: Extremal, running: float, within: Within | None) -> tuple[Extremal, float]:
+    """The extremal with multipliers of what is missed at its end by itself, and the cost of the whole chain."""
+    t = extremal.trajectory
+    cost = running + float(extremal.statement.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    if within is None:
+        return extremal, cost
+    own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
+    return replace(extremal, multipliers=own), cost + within.others
 
 
 def _share(change: float, missed: float, cost: float) -> float:
@@ -133,27 +139,27 @@ class Unseen:
     __repr__ = short_repr
 
 
-def unseen(extremal: Extremal) -> Unseen | None:
+def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
     """What halves of the steps do not see of a model that changes with the time; to first order, as `mesh_error`.
 
     Args:
         extremal: the trajectory.
+        within: what the rest of a chain says of it; where it is not known a statement that costs nothing tells no cost.
 
     Returns:
         None where they see it, or where it makes little of a difference beside what they tell.
     """
     if not changes_within_steps(extremal):
         return None
-    st, t = extremal.statement, extremal.trajectory
-    running = _parted(extremal, 1).running
-    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    st, running = extremal.statement, _parted(extremal, 1).running
+    extremal, cost = _of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
         told = _share(*_change(extremal, running, 2)[:2], cost)
         paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running)), default=0.0)
         (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
-    paid = paid if paid > MORE_THAN_HALVES * told else 0.0
+    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
     worst = int(np.argmax(moved))
     if not moved[worst] and not paid:
         return None

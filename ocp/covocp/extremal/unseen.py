@@ -14,6 +14,9 @@ from covocp.base.matrices import Array
 from covocp.extremal.dense_output import mapped
 from covocp.extremal.extremal import Extremal
 from covocp.statement.interval import repeated
+from covocp.statement.statement import Statement
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.trajectory import Trajectory, at_nodes
 
 # Places in a step that no period has in common, fractions of square roots of primes: from one of them to the next what
 # has up to 3000 periods in a step turns at least twice, but for a few numbers and phases.
@@ -32,13 +35,14 @@ def changes_within_steps(extremal: Extremal) -> bool:
     Args:
         extremal: a trajectory.
     """
-    return not extremal.statement.autonomous and _changes(extremal)
+    st, parameters = extremal.statement, tuple(extremal.parameters.tolist())
+    return not st.autonomous and _changes(st, extremal.mesh, extremal.trajectory, parameters)
 
 
 @lru_cache(maxsize=4)
-def _changes(extremal: Extremal) -> bool:
+def _changes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
-        values = _held(extremal)
+        values = _held(statement, mesh, trajectory, np.array(parameters))
         values = values[np.isfinite(values).all(axis=(1, 2))]  # a model without a value there: the steps tell
         if not values.size:
             return False
@@ -53,15 +57,14 @@ def _changes(extremal: Extremal) -> bool:
     return bool(((turns >= TURNS) & (change > least)).any())
 
 
-def _held(extremal: Extremal) -> Array:
+def _held(statement: Statement, mesh: Mesh, t: Trajectory, parameters: Array) -> Array:
     """Rates and running cost at the places in each step, all but the time held, (steps, places, rows)."""
-    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     nodes = mesh.nodes
     k = np.flatnonzero(np.diff(nodes) > 0.0)
     shares = (np.arange(mesh.substeps)[:, None] + PLACES) / mesh.substeps
     times = t.duration * (nodes[k, None, None] + np.diff(nodes)[k, None, None] * shares)
     each = times[0].size
     at = np.repeat(k, each)
-    held = (t.x[at].T, extremal.controls[at].T, t.e[at].T, times.reshape(1, -1))
-    values = np.vstack(mapped(st.rates, *held, *repeated(t.duration, extremal.parameters, at.size)))
+    held = (t.x[at].T, at_nodes(t.u, nodes.size)[at].T, t.e[at].T, times.reshape(1, -1))
+    values = np.vstack(mapped(statement.rates, *held, *repeated(t.duration, parameters, at.size)))
     return values.T.reshape(k.size * mesh.substeps, PLACES.size, -1)

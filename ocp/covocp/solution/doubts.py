@@ -72,7 +72,7 @@ def mention_doubts(solution: Solution) -> None:
 
 def _hidden(solution: Solution) -> Unseen | None:
     """What the steps do not see of a model that changes with the time, where that is much."""
-    found = unseen(solution.extremal)
+    found = unseen(solution.extremal, solution.within)
     much = found is not None and (found.moved > LONG_STEPS or max(found.cost, solution.mesh_error) > COARSE_MESH)
     return found if much else None
 
