@@ -306,7 +306,7 @@ def finer_steps(
 
     A gain that is a control, where the estimate learns all the time, may be large for as long as little is estimated.
     Long steps then find a feedback that is none: at the nodes it is hardly seen, in the cost it is.
-    Where the model changes with the time so that halves do not see it, other parts of the steps count, and the cost.
+    Where the model changes with the time within the steps the cost counts too, and other parts of them than halves.
 
     Args:
         extremal: a solution on the mesh of the options.
@@ -317,7 +317,7 @@ def finer_steps(
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
-    return _divided(extremal, options, allowed, running) or _unlike(extremal, options, allowed)
+    return _unlike(extremal, options, allowed) or _divided(extremal, options, allowed, running)
 
 
 def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
@@ -348,18 +348,28 @@ def _divided(
     )
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
+    fast = changes_within_steps(extremal)
+    if fast and not np.any(gaps):
+        times = max(times, _error_of_one(extremal) / COARSE_MESH)
     if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
         return None
     unit = step_unit(statement, mesh)
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
     number = max(int(np.ceil(wanted / unit)), fewest)
-    if changes_within_steps(extremal):  # a round number of steps may meet one place of a period
+    if fast:  # a round number of steps may meet one place of a period
         number += next(more for more in range(ROUND) if gcd(number + more, ROUND) == 1)
     substeps = min(number, MOST_SUBSTEPS // unit) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
+
+
+def _error_of_one(extremal: Extremal) -> float:
+    """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
+    running = _parted(extremal, 1).running
+    cost = _of_all(extremal, running, None)[1]
+    return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
 
 
 def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:
