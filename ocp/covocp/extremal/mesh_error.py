@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import gcd
 
 import numpy as np
 
 from covocp.base.matrices import Array
+from covocp.base.short_repr import short_repr
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
 from covocp.extremal.open_loop import Departure, departure, nominal_along
+from covocp.extremal.unseen import changes_within_steps
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_run
 from covocp.transcription.mesh import Mesh, Options, step_unit, with_substeps
@@ -45,6 +48,15 @@ UNSTABLE = 10.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
+# Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not; and how
+# many times more than these they must say: a jump of the model within a step is seen by all, up to four times as much.
+UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11), 10.0
+# So many steps an interval are tried then, in units of what their number is a multiple of: primes, so that no round
+# frequency meets all of them at one place of its period.
+PRIMES = (7, 13, 31, 61)
+# Base in which frequencies, durations and numbers of intervals are round: the number of steps that see little of an
+# oscillation shall have no divisor in common with it.
+ROUND = 10
 # Range of what hardly varies, in its magnitude; magnitude of what is zero but for roundoff, in the largest one.
 LEAST_RANGE, ROUNDOFF = 1e-3, 1e-12
 
@@ -53,6 +65,7 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     """Relative change of the cost by halving the integration steps, to first order.
 
     Where rates depend on the time explicitly, they may jump: then that of the states over a segment, where it is more.
+    They may also oscillate so that halves meet one place of the period alone: then that by other parts.
 
     Each shooting segment is run again from its start. The jumps at the ends of the segments count with the multipliers
     of the continuity, which are the costates there: this is the change of the optimal cost. Along the controls
@@ -68,25 +81,103 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     Returns:
         |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
-    st, t = extremal.statement, extremal.trajectory
-    cost = running + float(st.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    if within is not None:
-        cost += within.others
-        own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
-        extremal = replace(extremal, multipliers=own)
+    st = extremal.statement
+    extremal, cost = _of_all(extremal, running, within)
     change, missed, moved = _change(extremal, running, 2)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
             further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
-    error = max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
-    return error if st.autonomous or not np.isfinite(moved) else max(error, moved)
+    error = _share(change, missed, cost)
+    if st.autonomous or not np.isfinite(moved):
+        return error
+    error = max(error, moved)
+    hidden = 0.0
+    for further in _unlike_halves(extremal, running):
+        hidden = max(hidden, _share(*further[:2], cost), further[2])
+    return hidden if hidden > MORE_THAN_HALVES * error else error
+
+
+def _of_all(extremal: Extremal, running: float, within: Within | None) -> tuple[Extremal, float]:
+    """The extremal with multipliers of what is missed at its end by itself, and the cost of the whole chain."""
+    t = extremal.trajectory
+    cost = running + float(extremal.statement.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
+    if within is None:
+        return extremal, cost
+    own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
+    return replace(extremal, multipliers=own), cost + within.others
+
+
+def _share(change: float, missed: float, cost: float) -> float:
+    """A change of the cost, with or without what is missed at the end, in the changed cost."""
+    return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
+
+
+def _unlike_halves(extremal: Extremal, running: float) -> list[tuple[float, float, float]]:
+    """`_change` by parts of a step that see what its halves do not, where there may be such; those that are finite."""
+    if not changes_within_steps(extremal):
+        return []
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [_change(extremal, running, parts) for parts in UNLIKE_HALVES]
+    return [changes for changes in found if np.isfinite(changes).all()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unseen:
+    """What halves of the steps do not see of a model that changes with the time, and other parts do.
+
+    Attributes:
+        moved: largest change at a node of a state or an entry of a matrix, relative to its range.
+        name: of that state, or of the matrix.
+        cost: change of the cost, relative.
+    """
+
+    moved: float
+    name: str
+    cost: float
+
+    __repr__ = short_repr
+
+
+def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
+    """What halves of the steps do not see of a model that changes with the time; to first order, as `mesh_error`.
+
+    Args:
+        extremal: the trajectory.
+        within: what the rest of a chain says of it; where it is not known a statement that costs nothing tells no cost.
+
+    Returns:
+        None where they see it, or where it makes little of a difference beside what they tell.
+    """
+    if not changes_within_steps(extremal):
+        return None
+    st, running = extremal.statement, _parted(extremal, 1).running
+    extremal, cost = _of_all(extremal, running, within)
+    with np.errstate(over="ignore", invalid="ignore"):
+        told = _share(*_change(extremal, running, 2)[:2], cost)
+        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running)), default=0.0)
+        (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
+        moved = np.max(others, axis=0) / size
+    moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
+    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
+    worst = int(np.argmax(moved))
+    if not moved[worst] and not paid:
+        return None
+    return Unseen(moved=float(moved[worst]), name=_entry(st, worst), cost=paid)
+
+
+def _entry(statement: Statement, row: int) -> str:
+    """The name of the state, or of the matrix, to which a row of x and e stacked belongs."""
+    if row < statement.nx:
+        return statement.state_names[row]
+    blocks = statement.matrices
+    return next((b.name for b in blocks if b.span.start <= row - statement.nx < b.span.stop), "")
 
 
 def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, float, float]:
     """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    finer = refined_run(st, mesh, t, extremal.parameters, parts) if parts > 2 else _halved(extremal)
+    finer = _parted(extremal, parts)
     jumps = finer.jumps
     weights = extremal.multipliers.gaps
     if weights.shape != jumps.shape:  # a method without segments
@@ -104,12 +195,25 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
 
 def _halved(extremal: Extremal) -> Refined:
     """The run with steps of half the length."""
-    return _halved_run(extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist()))
+    return _parted(extremal, 2)
+
+
+def _parted(extremal: Extremal, parts: int) -> Refined:
+    """The run with each step in so many parts."""
+    given = extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist())
+    return _halved_run(*given) if parts == 2 else _parted_run(*given, parts)
 
 
 @lru_cache(maxsize=2)
 def _halved_run(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
     return refined_run(statement, mesh, trajectory, np.array(parameters))
+
+
+@lru_cache(maxsize=1 + len(UNLIKE_HALVES))
+def _parted_run(
+    statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...], parts: int
+) -> Refined:
+    return refined_run(statement, mesh, trajectory, np.array(parameters), parts)
 
 
 @lru_cache(maxsize=2)
@@ -122,6 +226,7 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
 
     The states are those of one run along the controls, in which an unstable plant amplifies what each segment is off.
     Where a feedback holds them, and for matrices that are variables, the jumps at the ends of segments are summed up.
+    Where the model changes with the time so that halves do not see it, that by other parts of the steps.
 
     Args:
         extremal: the trajectory.
@@ -131,6 +236,13 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
     Returns:
         The largest of them; inf where a run along the controls diverges, nan where the segments do.
     """
+    error = _by_halves(extremal, gaps)
+    hidden = None if np.any(gaps) else unseen(extremal)
+    return error if hidden is None else float(np.maximum(error, hidden.moved))
+
+
+def _by_halves(extremal: Extremal, gaps: Array | float) -> float:
+    """`node_error` by halves of the steps alone."""
     moved, size = _by_segments(extremal, gaps)
     with np.errstate(over="ignore", invalid="ignore"):
         left = None if np.any(gaps) else _departure(extremal, moved, size)
@@ -141,9 +253,9 @@ def node_error(extremal: Extremal, gaps: Array | float = 0.0) -> float:
         return float((moved / size).max(initial=0.0))
 
 
-def _by_segments(extremal: Extremal, gaps: Array | float) -> tuple[Array, Array]:
+def _by_segments(extremal: Extremal, gaps: Array | float, parts: int = 2) -> tuple[Array, Array]:
     """Largest change of each entry inside the segments, and of all jumps at their ends, summed up; and its range."""
-    t, finer = extremal.trajectory, _halved(extremal)
+    t, finer = extremal.trajectory, _parted(extremal, parts)
     scales, values = _magnitudes(extremal.statement, t, tuple(extremal.parameters.tolist())), np.hstack([t.x, t.e])
     magnitude = np.concatenate([scales.x, scales.e])
     least = np.maximum(LEAST_RANGE * magnitude, ROUNDOFF * magnitude.max(initial=0.0))
@@ -194,6 +306,7 @@ def finer_steps(
 
     A gain that is a control, where the estimate learns all the time, may be large for as long as little is estimated.
     Long steps then find a feedback that is none: at the nodes it is hardly seen, in the cost it is.
+    Where the model changes with the time within the steps the cost counts too, and other parts of them than halves.
 
     Args:
         extremal: a solution on the mesh of the options.
@@ -204,7 +317,17 @@ def finer_steps(
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
-    return _divided(extremal, options, allowed, running)
+    return _unlike(extremal, options, allowed) or _divided(extremal, options, allowed, running)
+
+
+def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
+    """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
+    found = unseen(extremal)
+    if found is None or not (found.moved > allowed or found.cost > COARSE_MESH):
+        return None
+    unit = step_unit(extremal.statement, extremal.mesh)
+    numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
+    return with_substeps(options, extremal.mesh, numbers[0]) if numbers else None
 
 
 def _divided(
@@ -225,19 +348,32 @@ def _divided(
     )
     if statement.fed and running is not None:
         times = max(times, mesh_error(extremal, running) / COARSE_MESH)
+    fast = changes_within_steps(extremal)
+    if fast and not np.any(gaps):
+        times = max(times, _error_of_one(extremal) / COARSE_MESH)
     if not 1.0 < times < np.inf:  # where halving them diverges nothing can be said
         return None
     unit = step_unit(statement, mesh)
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
-    substeps = min(max(int(np.ceil(wanted / unit)), fewest), MOST_SUBSTEPS // unit) * unit
+    number = max(int(np.ceil(wanted / unit)), fewest)
+    if fast:  # a round number of steps may meet one place of a period
+        number += next(more for more in range(ROUND) if gcd(number + more, ROUND) == 1)
+    substeps = min(number, MOST_SUBSTEPS // unit) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
 
 
+def _error_of_one(extremal: Extremal) -> float:
+    """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
+    running = _parted(extremal, 1).running
+    cost = _of_all(extremal, running, None)[1]
+    return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
+
+
 def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:
-    """`node_error` where a few more steps suffice against what an unstable plant makes of them; else 0.
+    """`_by_halves` where a few more steps suffice against what an unstable plant makes of them; else 0.
 
     Over a long horizon no steps do, and roundoff and what the solver left of the gaps grow as they do. What an
     oscillator adds up is told as it is: against it the segments by themselves are looked at.
@@ -245,7 +381,7 @@ def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, mar
     mesh = extremal.mesh
     if np.any(gaps) or len(mesh.segments) == 1:
         return 0.0
-    error = node_error(extremal)
+    error = _by_halves(extremal, gaps)
     if not error > allowed or not mesh.substeps * (margin * error / allowed) ** (1 / order) <= MOST_AGAINST_GROWTH:
         return 0.0
     if unstable(extremal) is None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from covocp.base.errors import CovocpError, warn_user
 from covocp.extremal.given_controls import without_value
-from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, node_error, unstable
+from covocp.extremal.mesh_error import COARSE_MESH, LONG_STEPS, OPTIMISED, Unseen, node_error, unseen, unstable
 from covocp.solution.flight import NOTICED, gains_are_steep, interpolated_flight
 from covocp.solution.jumps import coarse_elsewhere, mention_jumps
 from covocp.solution.solution import Solution
@@ -38,6 +38,8 @@ def mention_doubts(solution: Solution) -> None:
         warn_user(alone)
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
+    elif depends_on_time and (hidden := _hidden(solution)) is not None:
+        warn_user(_too_fast(solution, hidden))
     elif jumps and not coarse_elsewhere(solution, jumps):
         pass  # the steps are long where it jumps, and no others are right there
     elif not (error <= COARSE_MESH or by_steps):
@@ -66,6 +68,28 @@ def mention_doubts(solution: Solution) -> None:
             f"A covariance is indefinite (smallest eigenvalue {solution.smallest_eigenvalue:.3g}); use "
             f"{other}more intervals."
         )
+
+
+def _hidden(solution: Solution) -> Unseen | None:
+    """What the steps do not see of a model that changes with the time, where that is much."""
+    found = unseen(solution.extremal, solution.within)
+    much = found is not None and (found.moved > LONG_STEPS or max(found.cost, solution.mesh_error) > COARSE_MESH)
+    return found if much else None
+
+
+def _too_fast(solution: Solution, found: Unseen) -> str:
+    """What changes too fast for the steps, by how much they may be off, what helps."""
+    mesh = solution.mesh
+    step = np.diff(solution.t).max() / mesh.substeps
+    moves = f"move '{found.name}' at a node by {found.moved:.1e} of its range" if found.moved else ""
+    costs = f"change the cost by {found.cost:.1e} (relative)" if found.cost else ""
+    changes = " and ".join(filter(None, (moves, costs)))
+    return (
+        f"The model changes with the time faster than the integration steps see, of {step:.3g} s: they meet it near "
+        f"one place of its period. Steps of other lengths {changes}: by so much states and cost may be off. Use more "
+        f"substeps (substeps=, now {mesh.substeps}) or intervals, more than three steps to what oscillates fastest, or "
+        "put its mean in its place."
+    )
 
 
 def _flown_alone(solution: Solution) -> tuple[str, bool]:

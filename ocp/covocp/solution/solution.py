@@ -73,7 +73,7 @@ class Solution:
         end_rates: at the ends of the intervals with their own control, which may jump there, (K - 1, nx + ne).
         filter_gain: Kalman gain E M' U^-1 at the nodes, (K, n, m); None without a measured covariance.
         loop: covariances, gain and expected cost of the closed loop; None where nothing is fed back.
-        mesh_error: relative change of the cost by halving the integration steps (estimated to first order).
+        mesh_error: relative change of the cost by shorter integration steps, mostly halves (to first order).
         violations: of constraints, by name.
         stats: iterations, times, what the method counts.
         blocks: where each symbol lies.
