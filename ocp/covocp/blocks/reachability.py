@@ -193,7 +193,8 @@ def _level_units(links: Array) -> Array:
         units += levels[group]
         links = links - levels[:, None] + levels
         # what the largest cycles join is one state from here on
-        first, joined = np.unique(np.argmax(_together(links > size - 1.0), axis=1), return_inverse=True)
+        large = np.where(links > size - 1.0, 1.0, 0.0)
+        first, joined = np.unique(np.argmax(_together(large), axis=1), return_inverse=True)
         order = np.argsort(joined, kind="stable")
         starts = np.searchsorted(joined[order], np.arange(len(first)))
         links = np.maximum.reduceat(np.maximum.reduceat(links[np.ix_(order, order)], starts, axis=0), starts, axis=1)
