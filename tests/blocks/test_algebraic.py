@@ -1,4 +1,4 @@
-"""Solutions of discrete Riccati equations of plants whose largest mode leaves no digit of A'S A but its own."""
+"""Riccati equations at the end of what numbers can solve: large modes, modes that are hardly reached."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from linear_systems import by_doubling
 
+from covocp import ProblemError
 from covocp.blocks import riccati
 
 
@@ -35,3 +36,16 @@ def test_unstable_modes_far_apart(seed):
     np.fill_diagonal(A, [fast, 0.9, 1.0001])
     B = generator.standard_normal((3, 1)) * np.array([[fast], [10.0], [1.0]])
     assert_solved(A, B, np.diag(10.0 ** generator.uniform(-2, 4, 3)), 10.0 ** generator.uniform(0, 8))
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("reach", [1e-9, 1e-10])
+def test_a_mode_that_is_hardly_reached_is_the_one_that_is_named(discrete, reach):
+    """Of two unstable ones, and by how little: the pair is stabilisable, with a gain beyond what can be solved for."""
+    turn = np.linalg.qr(np.array([[1.0, 2.0, 0.3], [-0.4, 1.0, 0.5], [0.7, -0.2, 1.0]]))[0]
+    A, B = turn @ np.diag([2.5, 1.7, 0.5]) @ turn.T, turn @ np.array([[1.0], [reach], [1.0]])
+    assert riccati.unstabilisable(A, B, discrete=discrete).size == 0
+    with pytest.raises(ProblemError, match=r"the mode 1\.7, which B does not reach but for a share of \d") as caught:
+        riccati.lqr(A, B, np.eye(3), 1.0, discrete=discrete)
+    share = float(str(caught.value).split("a share of ")[1].split()[0])
+    assert 1e-2 * reach < share < reach

@@ -29,7 +29,7 @@ Modes = NDArray[np.complex128]
 # Largest relative residual of a Riccati equation that counts as solved.
 RESIDUAL = 1e-7
 # A mode that stays on the boundary is blamed on what hardly reaches or weights it where this share of the data decides.
-NEAR = 1e-8
+NEAR = 1e-6
 # Most Newton steps after scipy's solution: where that is off by a tenth, five reach rounding.
 STEPS = 8
 
@@ -283,8 +283,9 @@ def _solved(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool) ->
 
     best, least, received = np.zeros(A.shape), np.inf, ""
     with warnings.catch_warnings():
-        # of matrices that are all but singular: the residual says what became of it
+        # of equations that are all but singular: the residual says what became of it
         warnings.simplefilter("ignore", linalg.LinAlgWarning)
+        warnings.filterwarnings("ignore", "Input .* has an eigenvalue pair whose sum", RuntimeWarning)
         for start in (_by_pencil, doubled):
             try:
                 found = start(A, B, Q, R, N, discrete=discrete)
