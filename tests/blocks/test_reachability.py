@@ -101,6 +101,35 @@ def test_an_unreached_mode_is_found_in_numerical_modal_coordinates(seed):
     np.testing.assert_allclose(riccati.unstabilisable(back @ A @ vectors, back @ B, discrete=True), [1.7], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("size", "far"), [(3, 0), (4, 0), (6, 3), (6, 9), (12, 6), (20, 6)])
+def test_an_unreached_mode_in_blocks_of_numerical_modes(size, far):
+    """In any units, powers of two: what the change of coordinates leaves beside B is cond V roundings, no input."""
+    for seed in range(6, 14) if far else (13, 32, 34, 46, 60):
+        generator = np.random.default_rng(seed)
+        A, B = np.full((size, size), 0.0), np.zeros((size, 1))
+        A[:-1, :-1], A[:-1, -1] = generator.standard_normal((size - 1, size - 1)), generator.standard_normal(size - 1)
+        A[-1, -1], B[:-1] = 0.7, generator.standard_normal((size - 1, 1))
+        T = np.linalg.qr(generator.standard_normal((size, size)))[0]
+        A, B = T @ A @ T.T, T @ B
+        vectors = np.linalg.eig(A)[1]
+        vectors = vectors.real + vectors.imag
+        A, B = np.linalg.solve(vectors, A @ vectors), np.linalg.solve(vectors, B)
+        units = 2.0 ** np.round(generator.uniform(-far, far, size) * np.log2(10.0))
+        modes = riccati.unstabilisable(A * units[:, None] / units, B * units[:, None])
+        np.testing.assert_allclose(modes, [0.7], rtol=1e-9)
+
+
+@pytest.mark.parametrize("feedback", [1e-12, 1e-6, 1.0])
+@pytest.mark.parametrize("fast", [1e2, 1e5, 1e8])
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_position_that_moves_its_fast_actuator(feedback, fast, unit):
+    """x1' = x2, x2' = fast (u - x2 - feedback x1): weakly linked back, and yet reached."""
+    A, B = np.array([[1e-9, unit], [-feedback * fast / unit, -fast]]), np.array([[0.0], [fast / unit]])
+    assert riccati.unstabilisable(A, B).size == 0
+    F, G = sampled(A, B, 20.0 / fast)
+    assert riccati.unstabilisable(F, G, discrete=True).size == 0
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
 def test_a_clock_in_any_unit_of_its_phase(unit):
     """Phase and frequency; rounding of the variance of the one in ns is more than the whole of the other's."""

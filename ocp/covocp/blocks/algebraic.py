@@ -5,6 +5,7 @@ Everything here is numeric (scipy); a Lyapunov equation, being linear, may also 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,7 @@ Modes = NDArray[np.complex128]
 
 # Largest relative residual of a Riccati equation that counts as solved.
 RESIDUAL = 1e-7
-# A mode of the closed loop on the boundary is one of A within this share of the size of A.
+# A mode that stays on the boundary is blamed on what hardly reaches or weights it where this share of the data decides.
 NEAR = 1e-6
 # Most Newton steps after scipy's solution: where that is off by a tenth, five reach rounding.
 STEPS = 8
@@ -255,35 +256,48 @@ def stabilising(
     if not len(A):
         return np.zeros((0, 0))
     solution, residual, received = _solved(A, B, Q, R, N, discrete)
-    closed = A - B @ gain_of(A, B, R, N, solution, discrete=discrete)
-    left = slow_modes(closed, discrete=discrete)
-    if left.size and np.abs(np.linalg.eigvals(A) - left[0]).min() <= NEAR * np.linalg.norm(A, 2):
-        # lost within rounding only: named by the pair that is nearer to losing it
-        hardly = nearness(A, B, left[0]) <= nearness((A - B @ back).T, seen, left[0])
-        raise lost_mode(left, *(words.reach if hardly else words.see))
-    if left.size or not residual <= RESIDUAL:
-        stable = received or f"a relative residual of {residual:.3g}"
-        raise _unsolved("the closed loop is not stable" if left.size and not received else stable)
-    return semidefinite_part(solution) * unit
+    left = _left(A, B, R, N, solution, discrete)
+    if left.size:
+        # lost within rounding only: named by the mode, and the pair, that is nearest to it
+        shares = [
+            (nearness(*pair, mode), mode, why)
+            for mode in left
+            for pair, why in (((A, B), words.reach[3]), (((A - B @ back).T, seen), words.see[3]))
+        ]
+        share, mode, why = min(shares, key=lambda one: one[0])
+        if share <= NEAR:
+            raise _unsolved(f"the mode {mode_text(mode)}, which {why} but for a share of {share:.1g} of the entries")
+        raise _unsolved(received or "the closed loop is not stable")
+    if not residual <= RESIDUAL:
+        raise _unsolved(received or f"a relative residual of {residual:.3g}")
+    return solution * unit
 
 
 def _solved(A: Array, B: Array, Q: Array, R: Array, N: Array, discrete: bool) -> tuple[Array, float, str]:
     """The solution, its relative residual (infinite: none), and what the last of the methods said that failed.
 
     Scipy's solver orders the eigenvalues of a pencil, which fails where some are close to the boundary or rounding
-    moves them over it. Doubling knows none of them.
+    moves them over it. Doubling knows none of them. Each is judged by what is returned, its semidefinite part.
     """
+    from scipy import linalg
+
     best, least, received = np.zeros(A.shape), np.inf, ""
-    for start in (_by_pencil, doubled):
-        try:
-            solution, residual = _corrected(A, B, Q, R, N, start(A, B, Q, R, N, discrete=discrete), discrete)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            received = str(error)
-            continue
-        if residual < least:
-            best, least, received = solution, residual, ""
-        if least <= RESIDUAL:
-            break
+    with warnings.catch_warnings():
+        # of equations that are all but singular: the residual says what became of it
+        warnings.simplefilter("ignore", linalg.LinAlgWarning)
+        warnings.filterwarnings("ignore", "Input .* has an eigenvalue pair whose sum", RuntimeWarning)
+        for start in (_by_pencil, doubled):
+            try:
+                found = start(A, B, Q, R, N, discrete=discrete)
+                solution = semidefinite_part(_corrected(A, B, Q, R, N, found, discrete))
+                residual = _relative_residual(A, B, Q, R, N, solution, discrete)
+            except (np.linalg.LinAlgError, ValueError) as error:
+                received = str(error)
+                continue
+            if residual < least:
+                best, least, received = solution, residual, ""
+            if least <= RESIDUAL:
+                break
     return best, least, received
 
 
@@ -297,15 +311,41 @@ def _by_pencil(A: Array, B: Array, Q: Array, R: Array, N: Array, *, discrete: bo
     return np.asarray(symmetrised(np.asarray(solve(A, B, Q, R, s=N), dtype=float)))
 
 
-def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, start: Array, discrete: bool) -> tuple[Array, float]:
-    """A solution and its relative residual, corrected by Newton's method with the diagonal scaled to one."""
+def _corrected(A: Array, B: Array, Q: Array, R: Array, N: Array, start: Array, discrete: bool) -> Array:
+    """A solution corrected by Newton's method with the diagonal scaled to one."""
     units = diagonal_scales(start)
-    A, B = A * units[:, None] / units, B * units[:, None]
-    Q, N, start = over(Q, units), N / units[:, None], over(start, units)
-    solution, residual = _newton(A, B, Q, R, N, start, discrete)
-    scale = max(np.abs(Q).max(initial=0.0), np.abs(solution).max(initial=0.0) * np.abs(A).max(initial=0.0))
-    relative = 0.0 if residual == 0.0 else residual / max(scale, np.finfo(float).tiny)
-    return np.asarray(solution * units[:, None] * units), float(relative)
+    solution = _newton(*_in_units(A, B, Q, N, units), R, over(start, units), discrete)
+    return np.asarray(solution * units[:, None] * units)
+
+
+def _in_units(A: Array, B: Array, Q: Array, N: Array, units: Array) -> tuple[Array, Array, Array, Array]:
+    """A, B, Q, N of states times these units."""
+    return A * units[:, None] / units, B * units[:, None], over(Q, units), N / units[:, None]
+
+
+def _relative_residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> float:
+    """Residual over the size of the terms, the diagonal of S scaled to one; infinite where the closed loop is unstable.
+
+    Where the closed loop is smaller than A its terms are those of the discrete equation: held against what an unstable
+    plant makes of S, anything would be a solution.
+    """
+    if _left(A, B, R, N, S, discrete).size:
+        return np.inf
+    units = diagonal_scales(S)
+    A, B, Q, N = _in_units(A, B, Q, N, units)
+    S = over(S, units)
+    residual = float(np.abs(_residual(A, B, Q, R, N, S, discrete)).max(initial=0.0))
+    size = float(np.abs(A).max(initial=0.0))
+    if discrete:
+        closed = A - B @ gain_of(A, B, R, N, S, discrete=True)
+        size = max(1.0, min(size, float(np.abs(closed).max(initial=0.0))))
+    scale = max(float(np.abs(Q).max(initial=0.0)), size * float(np.abs(S).max(initial=0.0)), np.finfo(float).tiny)
+    return 0.0 if residual == 0.0 else residual / float(scale)
+
+
+def _left(A: Array, B: Array, R: Array, N: Array, S: Array, discrete: bool) -> Modes:
+    """Modes of the closed loop of S that are not stable."""
+    return slow_modes(A - B @ gain_of(A, B, R, N, S, discrete=discrete), discrete=discrete)
 
 
 def _unsolved(received: str) -> ProblemError:
@@ -337,14 +377,14 @@ def sorted_modes(A: Array) -> Modes:
     return result
 
 
-def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> tuple[Array, float]:
-    """Kleinman's iteration until rounding ends its quadratic convergence, and the residual that is left.
+def _newton(A: Array, B: Array, Q: Array, N: Array, R: Array, S: Array, discrete: bool) -> Array:
+    """Kleinman's iteration until rounding ends its quadratic convergence.
 
-    The residual is infinite where the start makes no stable closed loop.
+    From a start that is far off the first step may lead farther away, never a later one.
     """
-    best, least = S, np.inf
     left = _residual(A, B, Q, R, N, S, discrete)
-    for _ in range(STEPS):
+    best, least = S, float(np.abs(left).max(initial=0.0))
+    for step in range(STEPS):
         closed = A - B @ gain_of(A, B, R, N, S, discrete=discrete)
         if slow_modes(closed, discrete=discrete).size:
             break
@@ -352,17 +392,27 @@ def _newton(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete
         S = S + np.asarray(lyapunov(closed.T, symmetrised(left), discrete=discrete))
         left = _residual(A, B, Q, R, N, S, discrete)
         size = float(np.abs(left).max(initial=0.0))
-        if not size < least:
+        if size < least:
+            best, least = S, size
+        elif step:
             break
-        best, least = S, size
-    return best, least
+    return best
 
 
 def _residual(A: Array, B: Array, Q: Array, R: Array, N: Array, S: Array, discrete: bool) -> Array:
+    """Of the equation; the discrete one also with the closed loop C, S = C'S C + Q + K'R K - N K - K'N'.
+
+    Of an unstable plant A'S A, and what is subtracted from it, may be 10^14 times as large as S. Where inputs cost next
+    to nothing it is C that is large. The form whose terms are smaller leaves less rounding.
+    """
     K = gain_of(A, B, R, N, S, discrete=discrete)
-    if discrete:
-        return A.T @ S @ A - S + Q - (A.T @ S @ B + N) @ K
-    return A.T @ S + S @ A + Q - (S @ B + N) @ K
+    if not discrete:
+        return A.T @ S + S @ A + Q - (S @ B + N) @ K
+    closed, cross, sizes = A - B @ K, N @ K, np.abs(S)
+    terms = np.abs(closed).T @ sizes @ (np.abs(A) + np.abs(B) @ np.abs(K))
+    if np.max(terms, initial=0.0) < np.max(np.abs(A).T @ sizes @ np.abs(A), initial=0.0):
+        return closed.T @ S @ closed - S + Q + K.T @ R @ K - cross - cross.T
+    return A.T @ S @ A - S + Q - (A.T @ S @ B + N) @ K
 
 
 def _linear_lyapunov(A: Expr, Q: Expr, discrete: bool) -> Any:
