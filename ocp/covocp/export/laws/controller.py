@@ -65,11 +65,11 @@ NO_STEP = -1.0
 ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
-    "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h. The measurement "
-    "m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, a' = h(x, u) + "
-    "M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A the covariance of the error of a "
-    "(U h of noise in it), B that between it and the estimate's: from E(s) of the design, P becomes Phi P Phi' + d Q "
-    "in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The control is u - C y.",
+    "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h. The "
+    "measurement m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, "
+    "a' = h(x, u) + M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A "
+    "the covariance of the error of a (U h of noise in it), B that between it and the estimate's: from E(s) of the "
+    "design, P becomes Phi P Phi' + d Q in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The control is u - C y.",
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
@@ -235,7 +235,11 @@ def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
     (n, m, r), a = design.sizes, design.always
     sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1}
-    sizes |= {"spread": half_length(n + a), **({"expected": a} if a else {}), **({"overdue": 1} if design.reads else {})}
+    sizes |= {
+        "spread": half_length(n + a),
+        **({"expected": a} if a else {}),
+        **({"overdue": 1} if design.reads else {}),
+    }
     ports = {name: Port(name=name, rows=rows) for name, rows in sizes.items()}
     ports["measurement"] = measurement_port(design)
     ports["time"] = Port(name="time", unit="s", about="of the measurement")

@@ -61,9 +61,7 @@ class Moves:
         n, m, _ = design.sizes
         r = design.always
         measured = [
-            _blocks(
-                [[p.F, p.zero(n, r), p.G, -p.G @ p.u], [p.M, p.zero(r, r), p.H, p.h - p.H @ p.u]], n + r + m + 1
-            )
+            _blocks([[p.F, p.zero(n, r), p.G, -p.G @ p.u], [p.M, p.zero(r, r), p.H, p.h - p.H @ p.u]], n + r + m + 1)
             for p in points
         ]
         joint = [matrix[:, : n + r, : n + r] for matrix in measured]

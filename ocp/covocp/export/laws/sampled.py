@@ -69,7 +69,8 @@ ABOUT = (
     "the gain of the other rows in the filter with all of them. At time zero the control is that of the nominal.",
 )
 ABOUT_INSTANTS = (
-    "Rows of the measurement that are read at instants are compared with what is expected then, and count with their variance at the sample of their instant "
+    "Rows of the measurement that are read at instants are compared with what is expected then, and count with "
+    "their variance at the sample of their instant "
     "alone, and once. Between the instants they are left out, whatever they are, without a status; NaN is no missing "
     "row then. A reading that comes later than its sample is lost.",
 )
@@ -154,7 +155,11 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         "filter_gain": L,
         "status": ca.if_else(more, CONTINUE, status_of(conditions)),
     }
-    core = ca.Function("step", [y, last, held, measured, time, *((summed, passed) if always else ())], [flat(v) for v in fields.values()])
+    core = ca.Function(
+        "step",
+        [y, last, held, measured, time, *((summed, passed) if always else ())],
+        [flat(v) for v in fields.values()],
+    )
     limits = (design.statement, design.limits)
     spoken = f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."
     return Law(
@@ -226,9 +231,7 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
         C = sampled_gains(moves, design.final_weight, t.size)
     n, m, r = design.sizes
     reads = (h - H @ u[:, :m, None], M, H, U)
-    periods = [
-        _told(moves, k, period, [part[k] for part in reads], told[k, :, 0]) for k in range(count + 1)
-    ]
+    periods = [_told(moves, k, period, [part[k] for part in reads], told[k, :, 0]) for k in range(count + 1)]
     P, gains, spreads = design.prior, [], []
     for own, there in zip(periods, told, strict=True):
         gain, spread, P = _updated(own, P, there)
@@ -316,7 +319,7 @@ def _updated(period: Period, P: Array, told: Array) -> tuple[Array, Array, Array
     gain = np.linalg.solve(spread, joint[n:, :n]).T
     left = np.hstack([np.eye(n), -gain])
     after = left @ joint @ left.T
-    return gain, spread, 0.5 * (after + after.T)
+    return np.asarray(gain), spread, 0.5 * (after + after.T)
 
 
 def _correlations(spreads: Array) -> Array:
