@@ -23,7 +23,7 @@ def linear(seed: int) -> tuple[Any, co.Solution]:
     random = np.random.default_rng(seed)
     n, r = int(random.integers(1, 4)), int(random.integers(1, 3))
     unit, seen = 10.0 ** random.uniform(-4, 4, n), 10.0 ** random.uniform(-4, 4, r)
-    F = unit[:, None] * (random.normal(size=(n, n)) * 10.0 ** random.uniform(-1, 0.5)) / unit
+    F = unit[:, None] * (random.normal(size=(n, n)) * 10.0 ** random.uniform(-1, 0)) / unit
     G, H = unit[:, None] * random.normal(size=(n, 1)), seen[:, None] * random.normal(size=(r, 1))
     M, start = seen[:, None] * random.normal(size=(r, n)) / unit, unit * random.normal(size=n)
     ocp = co.Problem(DURATION, name="linear")
@@ -36,9 +36,9 @@ def linear(seed: int) -> tuple[Any, co.Solution]:
 
 
 def lost(law: Any, system: Any, lengths: list[float], missing: tuple[int, ...] = ()) -> float:
-    """Largest difference of estimate and true deviation, in units, of a plant without noise that is told its means."""
+    """Largest difference of estimate and true deviation, in sizes, of a plant without noise that is told its means."""
     F, G, M, H, x, unit = system
-    r, now, worst = len(M), 0.0, 0.0
+    r, now, worst, size = len(M), 0.0, 0.0, unit.copy()
     law.init()
     u = np.ravel(law.step(np.full(r, np.nan), 0.0))
     for k, h in enumerate(lengths):
@@ -47,7 +47,8 @@ def lost(law: Any, system: Any, lengths: list[float], missing: tuple[int, ...] =
         x, now = after[: len(F)], now + h
         told = np.where(k in missing, np.nan, after[len(F) :])
         u = np.ravel(law.step(told, min(now, DURATION)))
-        worst = max(worst, float(np.abs((law.estimate - (x - law.state["nominal_state"])) / unit).max()))
+        size = np.maximum(size, np.abs(law.state["nominal_state"]))
+        worst = max(worst, float(np.abs((law.estimate - (x - law.state["nominal_state"])) / size).max()))
     return worst
 
 
@@ -63,9 +64,9 @@ def test_what_the_nominal_moves_in_a_step_is_no_deviation(seed: int) -> None:
         assert lost(law, system, lengths, missing=(2,)) < 1e-5
 
 
-@pytest.mark.parametrize("period", [None, 0.2])
+@pytest.mark.parametrize("period", [None, 0.1])
 def test_a_flown_law_has_no_bias(period: float | None) -> None:
-    """A mass that must go from 0 to 4: at the end it was half a step of its way, 17 standard deviations, too far."""
+    """A mass that must go from 0 to 4: at the end it was half a step of its way, eight standard deviations, too far."""
     ocp = co.Problem(4.0, name="mass")
     x = ocp.state("x", initial=0.0, final=4.0, variance=1e-4)
     v = ocp.state("v", initial=1.0, variance=1e-4)
@@ -76,5 +77,5 @@ def test_a_flown_law_has_no_bias(period: float | None) -> None:
     ocp.minimize_expected(running=u**2, terminal_weight={x: 10.0})
     solution = co.solve(ocp, progress=False)
     law = export_c(solution, FOLDER / f"mass_{period}", period=period, largest_spread=np.inf).python()
-    sample = co.simulate(solution, 200, seed=1, law=law, period=0.2, progress=False)
+    sample = co.simulate(solution, 200, seed=1, law=law, period=0.1, progress=False)
     assert abs(sample.deviations[:, 0].mean()) < 4 * sample.deviations[:, 0].std() / np.sqrt(200)

@@ -134,7 +134,7 @@ def test_what_a_period_loses_at_the_end_is_told_however_large_deviations_were_be
     flown = np.sqrt(np.diagonal(tables(solution, 0.1).flown[-1]))
     promised = np.array([solution.deviation(name)[-1] for name in "xv"]).ravel()
     worst = int(np.argmax(flown / promised))
-    assert flown[worst] > 1.1 * promised[worst]
+    assert flown[worst] > 1.05 * promised[worst]
     assert promised[worst] < 0.1 * solution.deviation("xv"[worst]).max()
     with pytest.warns(co.CovocpWarning, match=f"'{'xv'[worst]}' at t = 6 s is {flown[worst]:.4g} as flown"):
         co.export_c(solution, tmp_path / "pk", period=0.1, largest_spread=10.0)

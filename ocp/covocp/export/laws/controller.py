@@ -69,7 +69,8 @@ ABOUT = (
     "measurement m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, "
     "a' = h(x, u) + M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A "
     "the covariance of the error of a (U h of noise in it), B that between it and the estimate's: from E(s) of the "
-    "design, P becomes Phi P Phi' + d Q in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The control is u - C y.",
+    "design, P becomes Phi P Phi' + d Q in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The "
+    "control is u - C y.",
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
