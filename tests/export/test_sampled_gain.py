@@ -130,7 +130,7 @@ def test_what_a_period_loses_at_the_end_is_told_however_large_deviations_were_be
     problem.dynamics(v, u, noise=1e-2)
     problem.measurement("position", x, noise=1e-3)
     problem.minimize_expected(running=0.5 * u**2, terminal_weight={x: 1e4, v: 1e-4})
-    solution = co.solve(problem, progress=False)
+    solution = co.solve(problem, intervals=150, progress=False)
     flown = np.sqrt(np.diagonal(tables(solution, 0.1).flown[-1]))
     promised = np.array([solution.deviation(name)[-1] for name in "xv"]).ravel()
     worst = int(np.argmax(flown / promised))
