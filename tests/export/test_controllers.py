@@ -35,18 +35,33 @@ def predicted(solution, y, held, begin, end):
     return solve_ivp(rate, (begin, end), y, rtol=1e-12, atol=1e-13).y[:, -1]
 
 
+def expected_mean(solution, y, held, begin, end):
+    """The mean of x that is expected between two times, integrated accurately."""
+
+    def rate(t, z):
+        F, G = slopes(solution, t)
+        return np.append(F @ z[:2] + G * (held - float(solution.at(t)["u"])), float(solution.at(t)["x"]) + z[0])
+
+    return solve_ivp(rate, (begin, end), np.append(y, 0.0), rtol=1e-12, atol=1e-13).y[2, -1] / (end - begin)
+
+
 def gain(solution, t, h):
-    """h P M' (h M P M' + U)^-1 for M = (1, 0), P = Phi P Phi' + h Q from node to node."""
+    """h B A^-1 of x and its integral: P = Phi P Phi' + noise that comes evenly, from node to node."""
 
     def rate(s, move):
-        return (slopes(solution, s)[0] @ move.reshape(2, 2)).ravel()
+        drift = np.zeros((3, 3))
+        drift[:2, :2], drift[2, 0] = slopes(solution, s)[0], 1.0
+        return (drift @ move.reshape(3, 3)).ravel()
 
-    P = solution.at(t - h)["E"]
+    P = np.zeros((3, 3))
+    P[:2, :2] = solution.at(t - h)["E"]
     ends = np.unique([t - h, *(node for node in solution.t if t - h < node < t), t])
     for begin, end in itertools.pairwise(ends):
-        move = solve_ivp(rate, (begin, end), np.eye(2).ravel(), rtol=1e-12, atol=1e-13).y[:, -1].reshape(2, 2)
-        P = move @ P @ move.T + (end - begin) * np.diag([NOISE, 0.0])
-    return h * P[:, 0] / (h * P[0, 0] + U)
+        move = solve_ivp(rate, (begin, end), np.eye(3).ravel(), rtol=1e-12, atol=1e-13).y[:, -1].reshape(3, 3)
+        d = end - begin
+        even = np.array([[d, 0.0, d**2 / 2], [0.0, 0.0, 0.0], [d**2 / 2, 0.0, d**3 / 3]])
+        P = move @ P @ move.T + NOISE * even + d * np.diag([0.0, 0.0, U])
+    return h * P[:2, 2] / P[2, 2]
 
 
 def after(controller, steps):
@@ -68,10 +83,10 @@ def test_two_steps_follow_the_formulas():
         before = predicted(solution, y, held, begin, time)
         sample = solution.at(time)
         L = gain(solution, time, time - begin)
-        y = before + L * (reading - float(sample["x"]) - before[0])
+        y = before + L * (reading - expected_mean(solution, y, held, begin, time))
         C = sample["S"][0, :]  # B^-1 G' S, B = 1
         held, begin = float(sample["u"]) - C @ y, time
-        np.testing.assert_allclose(state["filter_gain"], L, rtol=1e-6)  # one Gauss step of order 4
+        np.testing.assert_allclose(state["filter_gain"], L, rtol=1e-6, atol=1e-12)  # one Gauss step of order 4
         np.testing.assert_allclose(state["feedback_gain"][0], C, rtol=1e-12)
         np.testing.assert_allclose(state["estimate"], y, rtol=0, atol=1e-7)  # one Gauss step of order 4
         assert state["control"] == pytest.approx(held, abs=1e-7)
@@ -110,16 +125,23 @@ def test_a_measurement_that_sees_the_control_is_corrected_by_the_one_that_was_he
     controller = export_c(solution, FOLDER / "direct").reference().step
     first, second = after(controller, [(0.9, 1.0), (0.4, 1.1)])
     held, y = first["control"], first["estimate"]
-    before = solve_ivp(
-        lambda t, y: -y + held - float(solution.at(t)["u"]), (1.0, 1.1), [float(y)], rtol=1e-12, atol=1e-14
-    ).y[0, -1]
-    now = solution.at(1.1)
-    nominal = float(now["u"])
-    P, node = float(solution.at(1.0)["E"].item()), solution.t[(solution.t > 1.0 + 1e-9) & (solution.t < 1.1 - 1e-9)]
+
+    def rate(t, z):
+        now = solution.at(t)
+        moved = held - float(now["u"])
+        return np.array([-z[0] + moved, float(now["x"]) + 0.5 * float(now["u"]) + z[0] + 0.5 * moved])
+
+    before, integral = solve_ivp(rate, (1.0, 1.1), [float(y), 0.0], rtol=1e-12, atol=1e-14).y[:, -1]
+    P, node = (
+        np.diag([float(solution.at(1.0)["E"].item()), 0.0]),
+        solution.t[(solution.t > 1.0 + 1e-9) & (solution.t < 1.1 - 1e-9)],
+    )
     for h in np.diff([1.0, *node, 1.1]):
-        P = np.exp(-2.0 * h) * P + h * 0.2
-    L = 0.1 * P / (0.1 * P + 0.1)
-    expected = before + L * (0.4 - float(now["x"]) - 0.5 * nominal - before - 0.5 * (held - nominal))
+        move = np.array([[np.exp(-h), 0.0], [1.0 - np.exp(-h), 1.0]])
+        even = np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]])
+        P = move @ P @ move.T + 0.2 * even + np.diag([0.0, 0.1 * h])
+    L = 0.1 * P[0, 1] / P[1, 1]
+    expected = before + L * (0.4 - integral / 0.1)
     assert second["filter_gain"] == pytest.approx(L, rel=1e-6)  # one Gauss step of order 4
     assert second["estimate"] == pytest.approx(expected, abs=1e-8)
 
@@ -145,8 +167,8 @@ def test_gain_tends_to_the_continuous_one_and_is_stable_for_any_step():
         assert values.real.max() < 1.0
 
 
-def spread_before(solution, t, h):
-    """Covariance of the error at t from that at t - h without a measurement: Phi E Phi' + h Q, by scipy."""
+def spread_before(solution, t, h, row):
+    """Covariance of the errors at t of the state and of the integral of a row that is measured, by scipy."""
     st, T, p = solution.statement, solution.duration, solution.parameters
 
     def expansion(s):
@@ -155,23 +177,33 @@ def spread_before(solution, t, h):
         return st.loop.expansion(x, float(sample["lift_to_drag"]), s, T, p)
 
     def rate(s, move):
-        return (expansion(s)[0].full() @ move.reshape(n, n)).ravel()
+        drift = np.zeros((n + 1, n + 1))
+        drift[:n, :n], drift[n, :n] = expansion(s)[0].full(), row(s)
+        return (drift @ move.reshape(n + 1, n + 1)).ravel()
 
     E = solution.at(t - h)["E"]
     n = len(E)
-    move = solve_ivp(rate, (t - h, t), np.eye(n).ravel(), rtol=1e-11, atol=1e-14).y[:, -1].reshape(n, n)
-    return move @ E @ move.T + h * expansion(t)[5].full()
+    joint, Q = np.zeros((n + 1, n + 1)), expansion(t)[5].full()
+    joint[:n, :n] = E
+    move = solve_ivp(rate, (t - h, t), np.eye(n + 1).ravel(), rtol=1e-11, atol=1e-14).y[:, -1].reshape(n + 1, n + 1)
+    middle = row(t - h / 2)
+    across = h**2 / 2 * (middle @ Q)
+    even = np.block([[h * Q, across[:, None]], [across, h**3 / 3 * (middle @ Q @ middle)]])
+    return move @ joint @ move.T + even
 
 
 def test_rows_that_are_missing_leave_the_filter_of_the_others():
     solution, controller = mars(), package("mars").python().step
     t, h = 600.0, 2.0
     st, T, p = solution.statement, solution.duration, solution.parameters
-    sample = solution.at(t)
-    x = np.array([sample[b.name] for b in st.states])
-    M = st.measurement(x, float(sample["lift_to_drag"]), t, T, p)[1].full()
-    E, kept = spread_before(solution, t, h), M[1:]
-    expected = h * E @ kept.T / (h * kept @ E @ kept.T + 0.02)
+
+    def row(s):
+        sample = solution.at(s)
+        x = np.array([sample[b.name] for b in st.states])
+        return st.measurement(x, float(sample["lift_to_drag"]), s, T, p)[1].full()[1]
+
+    joint = spread_before(solution, t, h, row)
+    expected = h * joint[:-1, -1:] / (joint[-1, -1] + 0.02 * h)
     controller.init()
     controller.step([np.nan, np.nan], t - h)
     controller.step([np.nan, 3.0], t)
@@ -334,15 +366,18 @@ def test_samples_that_are_left_out_are_predicted_over_one_by_one():
     late = package("lag_sampled").python().step
     after(late, [(0.4, 1.0), (0.1, 1.5), (0.9, 2.0)])
     control = late.step(0.8, 2.25)
-    held = float(controller.state["control"])
+    held, start = float(controller.state["control"]), controller.state["estimate"].copy()
     for k in range(201, 225):
         controller.step(np.nan, k * 0.01)
         controller._values[span(controller.law.outputs, "control")] = held  # it was held all the time
-    expected = controller.step(0.8, 2.25)
-    assert (controller.status, late.status) == ("OK", "OK")
-    np.testing.assert_allclose(control, expected, rtol=1e-12)
-    np.testing.assert_allclose(late.state["estimate"], controller.state["estimate"], rtol=1e-12)
-    assert late.state["index"] == 225
+    controller.step(np.nan, 2.25)
+    assert (controller.status, late.status) == ("MEASUREMENT_MISSING", "OK")
+    residual = 0.8 - expected_mean(lag(), start, held, 2.0, 2.25)  # the mean of all that time
+    expected = controller.state["estimate"] + late.state["filter_gain"] * residual
+    np.testing.assert_allclose(late.state["estimate"], expected, rtol=0, atol=1e-9)
+    nominal = float(lag().at(2.25)["u"])
+    assert control[0] == pytest.approx(nominal - late.state["feedback_gain"][0] @ expected, abs=1e-8)
+    assert (late.state["index"], late.state["passed"]) == (225, 0)
 
 
 def test_the_nearest_sample_is_taken():

@@ -2,17 +2,17 @@
 
 from itertools import product
 
+import means
 import numpy as np
 import pytest
 from exports import FOLDER, STRICT, SWING, package, swing
-from scipy.linalg import expm
 
 from covocp.export import export_c
 
 pytestmark = pytest.mark.needs_cc
 STEPS = 24
 F, G, M, H = SWING.F, SWING.G, SWING.M, SWING.H
-PERIOD, CONTROL, R = SWING.period, SWING.control, SWING.U / SWING.period
+PERIOD, CONTROL = SWING.period, SWING.control
 PATTERNS = [np.array(p) for p in product((True, False), repeat=3)]
 
 
@@ -29,24 +29,17 @@ def flown(controller, unit=1.0, wrong=np.nan):
 
 
 def expected():
-    """Gain and estimate after each step: exact discrete model, P- of the filter that has all rows."""
+    """Gain and estimate after each step: exact discrete model of means, P of the filter that has all rows."""
     random = np.random.default_rng(5)
-    joint = expm(PERIOD * np.block([[F, G[:, None]], [np.zeros((1, 3))]]))
-    Phi, Gamma = joint[:2, :2], joint[:2, 2]
-    loan = expm(PERIOD * np.block([[-F, SWING.Q], [np.zeros((2, 2)), F.T]]))
-    noise = Phi @ loan[:2, 2:]
+    own = means.told(F, G[:, None], M, H[:, None], SWING.Q, SWING.U, PERIOD)
+    Phi, Gamma, seen, held_on = own.state[:2], own.held[:2, 0], own.state[2:], own.held[2:, 0]
     P, y, nominal, held = SWING.P0, np.zeros(2), np.zeros(2), CONTROL
     for k in range(STEPS):
-        nominal = Phi @ nominal + Gamma * CONTROL
-        P = Phi @ P @ Phi.T + noise
         there = PATTERNS[k % 8]
-        m = random.normal(size=3)[there]
-        Mp, L = M[there], np.zeros((2, 3))
-        L[:, there] = P @ Mp.T @ np.linalg.inv(Mp @ P @ Mp.T + R[np.ix_(there, there)])
-        y = Phi @ y + Gamma * (held - CONTROL)
-        y = y + L[:, there] @ (m - Mp @ (nominal + y) - H[there] * held)
-        full = P @ M.T @ np.linalg.inv(M @ P @ M.T + R)
-        P = P - full @ M @ P
+        m = random.normal(size=3)
+        L, _, P = means.filtered(P, own, there)
+        y = Phi @ y + Gamma * (held - CONTROL) + L @ (m - seen @ (nominal + y) - held_on * held)
+        nominal = Phi @ nominal + Gamma * CONTROL
         held = yield L, y, there
 
 

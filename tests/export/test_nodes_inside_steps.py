@@ -109,7 +109,7 @@ def test_a_step_of_any_length_has_the_order_of_the_mesh() -> None:
 
 
 def test_the_gain_follows_slopes_that_jump_with_the_control() -> None:
-    """x' = -u x + w: P by exponentials from node to node, the noise of each piece at its end."""
+    """x' = -u x + w, x measured: covariance of x and its integral by exponentials, noise that comes evenly."""
     ocp, Q, U = co.Problem(2.0, name="leaking"), 0.1, 0.3
     x, u = ocp.state("x", initial=1.0, variance=0.2), ocp.control("u")
     ocp.dynamics(x, -u * x, noise=Q)
@@ -120,11 +120,12 @@ def test_the_gain_follows_slopes_that_jump_with_the_control() -> None:
     step = export_c(solution, FOLDER / "leaking", largest_spread=np.inf).reference()["step"]
     step.step(1.1, 0.3)
     step.step(0.7, 1.4)
-    P = float(np.squeeze(solution.at(0.3)["E"]))
+    P = np.diag([float(np.squeeze(solution.at(0.3)["E"])), 0.0])
     for h, rate in zip((0.2, 0.5, 0.4), controls[:3], strict=True):
-        P = np.exp(-2.0 * rate * h) * P + h * Q
-    h = 1.1
-    assert float(step.state["filter_gain"]) == pytest.approx(h * P / (h * P + U), rel=2e-3)  # order 4, h u = 1
+        move = np.array([[np.exp(-rate * h), 0.0], [(1.0 - np.exp(-rate * h)) / rate, 1.0]])
+        even = np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]])
+        P = move @ P @ move.T + Q * even + np.diag([0.0, h * U])
+    assert float(step.state["filter_gain"]) == pytest.approx(1.1 * P[0, 1] / P[1, 1], rel=2e-3)  # order 4, h u = 1
 
 
 def test_an_estimate_that_is_lost_on_the_way_leaves_the_nominal_control_of_the_end() -> None:

@@ -130,6 +130,17 @@ def _predicted(phase: co.Solution, name: str, y: np.ndarray, held: float, begin:
     return solve_ivp(rate, (begin, end), y, rtol=1e-10, atol=1e-13).y[:, -1]
 
 
+def _joined(phase: co.Solution, z: np.ndarray, held: float, end: float) -> np.ndarray:
+    """Deviation of what rises, and integrals of place and speed as they are expected, from its beginning."""
+
+    def rate(t: float, z: np.ndarray) -> np.ndarray:
+        F, G = _slopes(phase, t)
+        now = phase.at(float(np.clip(t, 0.0, phase.duration)))
+        return np.concatenate([F @ z[:5] + G * (held - float(now["w"])), np.ravel([now["x"], now["v"]]) + z[:2]])
+
+    return solve_ivp(rate, (0.0, end), z, rtol=1e-10, atol=1e-13).y[:, -1]
+
+
 def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> None:
     """Prediction to the end, the tangent of the jump, prediction from there, the reading of the time since then."""
     fall, rise = bounced()
@@ -146,15 +157,15 @@ def test_a_step_across_passes_the_estimate_as_an_independent_integration() -> No
     J[0, 0] = J[3, 2] = J[4, 3] = 1.0
     J[1, 1], J[1, 2] = -phased_loops.RESTITUTION, -speed
     h, begun = 0.02, float(rise["w"][0])
-    y = _predicted(rise, "w", J @ end, begun, 0.0, h)
-    Phi = np.column_stack([_predicted(rise, "w", c, 0, 0.0, h) for c in np.eye(5)])
-    Phi -= _predicted(rise, "w", np.zeros(5), 0, 0.0, h)[:, None]
-    P = Phi @ rise.values["E"][0] @ Phi.T + h * np.diag([0.01, 0.02, 0.05, 0.0, 0.0])
-    M, U = np.eye(5)[:2], np.diag([0.1, 0.2])
-    L = h * P @ M.T @ np.linalg.inv(h * M @ P @ M.T + U)
+    z = _joined(rise, np.append(J @ end, [0.0, 0.0]), begun, h)
+    Phi = np.column_stack([_joined(rise, c, 0, h) for c in np.eye(7)]) - _joined(rise, np.zeros(7), 0, h)[:, None]
+    P, M, Q, U = np.zeros((7, 7)), np.eye(5)[:2], np.diag([0.01, 0.02, 0.05, 0.0, 0.0]), np.diag([0.1, 0.2])
+    P[:5, :5] = rise.values["E"][0]
+    even = np.block([[h * Q, h**2 / 2 * Q @ M.T], [h**2 / 2 * M @ Q, h**3 / 3 * M @ Q @ M.T + h * U]])
+    P = Phi @ P @ Phi.T + even
     at = rise.at(h)
     reading = np.array([float(at["x"]) + 0.2, float(at["v"]) - 0.3])
-    y = y + L @ (reading - np.array([float(at["x"]), float(at["v"])]) - M @ y)
+    y = z[:5] + h * P[:5, 5:] @ np.linalg.inv(P[5:, 5:]) @ (reading - z[5:] / h)
     control = step.step(reading, 1.0 + h)
     assert (step.status, step.state["phase"]) == ("OK", 1)
     np.testing.assert_allclose(step.estimate, y, rtol=1e-6, atol=1e-8)
@@ -403,15 +414,19 @@ def _filtered(solution: co.PhasesSolution, measures: list[bool], readings: np.nd
     errors, S = _riccati(measures)
     phi, y, held, found = np.exp(RATE * SIDE), 0.0, float(solution[0]["u"][0]), []
     nodes, weights = np.polynomial.legendre.leggauss(5)
+    slope = (phi - 1.0) / RATE  # of the integral of the deviation over a step
     for k, reading in enumerate(readings):
         phase, begin = k // 20, (k % 20) * SIDE
         inside = SIDE * (1.0 + nodes) / 2.0
-        forced = np.exp(RATE * (SIDE - inside)) * (held - solution[phase].at(begin + inside)["u"])
-        y = phi * y + SIDE / 2.0 * float(weights @ forced)
+        moved, on = held - solution[phase].at(begin + inside)["u"], SIDE - inside
+        # integrals of x along the nominal, and of the deviation, which goes on to the end of the step
+        seen = float(weights @ (solution[phase].at(begin + inside)["x"] + (np.exp(RATE * on) - 1.0) / RATE * moved))
+        seen = SIDE / 2.0 * seen + slope * y
+        y = phi * y + SIDE / 2.0 * float(weights @ (np.exp(RATE * on) * moved))
         if measures[phase]:
-            P = phi**2 * errors[k] + SIDE * MOVED
-            L = SIDE * P / (SIDE * P + SEEN)
-            y += L * (reading - float(solution[phase]["x"][k % 20 + 1]) - y)
+            across = slope * phi * errors[k] + MOVED * SIDE**2 / 2.0
+            L = SIDE * across / (slope**2 * errors[k] + MOVED * SIDE**3 / 3.0 + SEEN * SIDE)
+            y += L * (reading - seen / SIDE)
         y *= TURN if k == 19 else 1.0
         now, node = (phase + 1, 0) if k in (19, 39) else (phase, k % 20 + 1)
         held = float(solution[now]["u"][node]) - S[now, node] * y

@@ -105,11 +105,32 @@ def gauss_step(points: Any, forcing: Any, start: Expr, unit: Any, solve: Callabl
         unit: the identity.
         solve: (matrix, right side) -> solution.
     """
+    (_, _, change), (_, _, turn) = gauss_stages(points, forcing, start, unit, solve)
+    return change, unit + turn
+
+
+def gauss_stages(
+    points: Any, forcing: Any, start: Expr, unit: Any, solve: Callable[[Any, Any], Any]
+) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    """The same with what y and its transition are at the two nodes: by the mean of both anything of y is integrated.
+
+    Args:
+        points: h H at the two nodes, expressions.
+        forcing: h f there.
+        start: y.
+        unit: the identity.
+        solve: (matrix, right side) -> solution.
+
+    Returns:
+        Of y, and of the transition from the start: values at the first and the second node, change over the step.
+    """
     left, right, matrix = _eliminated(points, unit)
     first, second = forcing
     ahead = start + GAP * first
     stages = solve(matrix, ca.horzcat(left @ ahead + SHARE / 2 * (first + second), left))
-    return (right @ stages[:, 0] - ahead) / SHARE, unit + (right @ stages[:, 1:] - unit) / SHARE
+    y, transition = stages[:, 0], stages[:, 1:]
+    change, turn = (right @ y - ahead) / SHARE, (right @ transition - unit) / SHARE
+    return (y, y + 2 * GAP * change, change), (transition, transition + 2 * GAP * turn, turn)
 
 
 def _eliminated(points: Any, unit: Any) -> tuple[Any, Any, Any]:

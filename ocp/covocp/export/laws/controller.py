@@ -5,16 +5,22 @@ deviation from the nominal, computes
 
     y- :  y' = F y + G (u_held - u(time)) over [s, t], a step of the two-stage Gauss method from each node of the mesh
           to the next (`prediction`): order 4 where u jumps or has kinks too, stable for any h
+    a  :  a' = h(x, u) + M y- + H (u_held - u), from a(s) = 0: what is to be measured, integrated by the same stages
     P- :  P <- Phi P Phi' + d Q              of the error before the measurement, from E(s) of the design over the same
                                              pieces, of lengths d and transitions Phi
-    L  =  h P- M' (h M P- M' + U)^-1         K h to first order; the spectrum of L M is in [0, 1): stable for any h, and
-                                             right where a first measurement tells more than all that was known before
-    y+ =  y- + L (m - h(x, u, t) - M y- - H (u_held - u(t)))
+    A, B                                     covariance of the error of a, the noise of the measurement included, and
+                                             between those of y- and a
+    L  =  h B A^-1                           best gain of the mean of the measurement; h P- M' (h M P- M' + U)^-1 and
+                                             K h to first order. It never adds to P-: stable for any h, and right where
+                                             a first measurement tells more than all that was known before
+    y+ =  y- + L (m - a/h)
     u  =  u(t) - C y+,                       within the limits, where there are some
 
 with F, G, Q, M, H, U and the measurement h expected there from the model's own functions along the nominal, and C at t.
-A measurement stands for the h seconds before it: white noise of density U, averaged over them. What is read at an
-instant has its variance in place of U/h. Where it did not come E of the design is not what is known: P is kept then.
+A measurement m stands for the h seconds before it: it is the mean over them, white noise of density U included, and is
+compared with the mean that is expected (at the end of a step the nominal is half a step ahead of it). What is read at
+an instant is compared with what is expected then, m - h - M y- - H (u_held - u), and has its variance. Where it did not
+come E of the design is not what is known: P is kept then.
 """
 
 from __future__ import annotations
@@ -26,14 +32,12 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.gains import innovation_gain
-from covocp.base.matrices import Array, half_length, pack, pack_symbolic, unpack_symbolic
-from covocp.blocks.updates import joseph_form, without
-from covocp.export.laws.design import Design, measured_blocks
+from covocp.base.matrices import Array, half_length, pack, pack_symbolic, stacked, unpack_symbolic
+from covocp.export.laws.design import Design, DesignAt, measured_blocks
 from covocp.export.laws.history import History, Nominal
 from covocp.export.laws.law import LARGEST, QUATERNION, Law, Port, flat, span, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, Piece, next_piece, predicted, solved
+from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, Ahead, Piece, next_piece, predicted, solved
 from covocp.export.laws.trajectory import times
 from covocp.statement.entries import entry_names, error_names
 from covocp.statement.statement import Statement
@@ -41,7 +45,9 @@ from covocp.statement.statement import Statement
 # What is kept of a step that is under way, and after an instant at which a reading did not come.
 ABOUT_KEPT = {
     "elapsed": "how long a step has been under way that goes on after a node; 0 between two calls",
-    "spread": "half-vector of P, which counts in the place of E of the design within a step, and where overdue is 1",
+    "expected": "integral of what is to be measured since a step that is under way began; 0 between two calls",
+    "spread": "half-vector of the covariance of the errors of estimate and integral, which counts in the place of E of "
+    "the design within a step, and where overdue is 1",
     "overdue": "1 where something that is read at an instant did not come, until all that is due at a later one does",
 }
 STATUSES = (
@@ -49,22 +55,28 @@ STATUSES = (
     "FAILED",
 )  # fmt: skip
 HELD = {
-    "estimate": "estimate", "last": "time", "held": "control", "elapsed": "elapsed", "spread": "spread",
-    "overdue": "overdue",
+    "estimate": "estimate", "last": "time", "held": "control", "elapsed": "elapsed", "expected": "expected",
+    "spread": "spread", "overdue": "overdue",
 }  # fmt: skip
+# A length of a step by which anything may be divided, in single precision too.
+SHORTEST = 1e-30
 # Time or index of the last step before the first one, where something is read at time zero.
 NO_STEP = -1.0
 ABOUT = (
     "Perturbation filter and feedback. The control returned is held until the next call. From the last call at s to "
     "this one at t = s + h the estimate y of the deviation from the nominal is predicted by y' = F y + G (u_held - "
-    "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h; it is "
-    "corrected by L (m - what is expected) with L = h P M' (h M P M' + U)^-1, P the covariance of its error before: "
-    "from E(s) of the design, P becomes Phi P Phi' + d Q in each piece of length d; the control is u - C y.",
+    "u), a step of the two-stage Gauss method from each node of the mesh to the next, stable for any h. The "
+    "measurement m is the mean of what is measured from s to t, and is compared with the mean a/h that is expected, "
+    "a' = h(x, u) + M y + H (u_held - u). The estimate is corrected by L (m - a/h), L = h B A^-1, A "
+    "the covariance of the error of a (U h of noise in it), B that between it and the estimate's: from E(s) of the "
+    "design, P becomes Phi P Phi' + d Q in each piece of length d. To first order L is h P M' (h M P M' + U)^-1. The "
+    "control is u - C y.",
     "A row of the measurement that is not finite is left out; readings beyond 1e30 count as not finite. The first "
     "measurement that counts is that of the first call after time zero: it stands for the time from zero to then.",
 )
 ABOUT_INSTANTS = (
-    "Rows of the measurement that are read at instants count with their variance in every call in which they are "
+    "Rows of the measurement that are read at instants are compared with what is expected at the time of the call "
+    "and count with their variance in every call in which they are "
     "finite, in a second one at the same time as another reading: give each reading once, NaN after it. NaN between "
     "the instants is no missing row. A reading that comes after its instant, or in a second call at it, is weighed by "
     "what is known without it.",
@@ -119,9 +131,10 @@ class Given(NamedTuple):
     """What a step begins with: the fields of the struct that it goes on from, and what is measured.
 
     estimate; last: time of the last step (`NO_STEP`: there was none), or of the node that this one has come to; held:
-    control since then; measured; elapsed: how long this step has been under way already; spread: half-vector of P at
-    `last`, which counts in the place of E of the design where a step is under way or something is overdue; overdue: 1
-    where a reading that was due at an instant did not come.
+    control since then; measured; elapsed: how long this step has been under way already; expected: integral of what is
+    to be measured in that time; spread: half-vector of the covariance of the errors of estimate and integral at `last`,
+    which counts in the place of E of the design where a step is under way or something is overdue; overdue: 1 where a
+    reading that was due at an instant did not come.
     """
 
     estimate: Any
@@ -129,14 +142,16 @@ class Given(NamedTuple):
     held: Any
     measured: Any
     elapsed: Any
+    expected: Any
     spread: Any
     overdue: Any
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> Given:
-        """Of inputs by name; nothing is overdue where nothing is read at instants."""
+        """Of inputs by name; nothing is overdue where nothing is read at instants, nor expected where all is."""
         estimate, last, held, measured = (values[name] for name in ("estimate", "last", "held", "measurement"))
-        kept = values["elapsed"], values["spread"], values.get("overdue", ca.MX(0))
+        expected, overdue = values.get("expected", ca.MX(0, 1)), values.get("overdue", ca.MX(0))
+        kept = values["elapsed"], expected, values["spread"], overdue
         return Given(estimate, last, held, measured, *kept)
 
 
@@ -163,43 +178,47 @@ def stepped(design: Design, tables: History, given: Given, time: Expr, valid: Ex
     """
     m = design.sizes[1]
     piece = next_piece(tables, ca.fmax(given.last, 0.0), time, valid)
-    y, P = predicted(design, tables, (given.estimate, _known(design, tables, given, piece), given.held), piece)
+    begun = Ahead(given.estimate, given.expected, _known(design, tables, given, piece))
+    ahead = predicted(design, tables, begun, given.held, piece)
     # a prediction that overflows is not gone on with: the step ends with the nominal control of its time
-    more = ca.logic_and(piece.more, finite(y))
+    more = ca.logic_and(piece.more, finite(ahead.estimate, ahead.expected))
     end = ca.if_else(more, piece.end, time)
     now = tables.at(end)
     due = design.due(end, tables.margin * tables.duration)
     counts = ca.logic_and(valid, ca.logic_not(piece.more))
     taken = ca.if_else(counts, given.measured, 2.0 * LARGEST)  # what was read when nobody knows corrects nothing
     elapsed = given.elapsed + piece.length
-    found = _corrected(design, (y, P), (given.held, taken, elapsed, due), now, end)
+    found = _corrected(design, ahead, (given.held, taken, elapsed, due), now, end)
     feedback = found.C @ found.y
     good = finite(found.y, feedback)
     nominal = now.u[:m]
     moved = nominal - ca.if_else(ca.logic_and(good, valid), feedback, 0.0)
     fields = {
         "time": ca.if_else(valid, end, given.last),
-        "estimate": ca.if_else(more, y, ca.if_else(good, found.y, given.estimate)),
+        "estimate": ca.if_else(more, ahead.estimate, ca.if_else(good, found.y, given.estimate)),
         "control": ca.if_else(more, given.held, clipped(moved, design.limits)),
         "nominal_state": now.x,
         "nominal_control": nominal,
         "feedback_gain": found.C,
         "filter_gain": found.L,
         "elapsed": ca.if_else(more, elapsed, 0.0),
-        "spread": ca.if_else(valid, ca.if_else(more, pack_symbolic(P), found.spread), given.spread),
+        "spread": ca.if_else(valid, ca.if_else(more, pack_symbolic(ahead.spread), found.spread), given.spread),
     }
+    if design.always:
+        fields["expected"] = ca.if_else(more, ahead.expected, 0.0)
     if design.reads:
         fields["overdue"] = ca.if_else(valid, _overdue(design, tables, given, (piece, more, end), found), given.overdue)
     return Stepped(fields=fields, more=more, good=good, missing=found.missing)
 
 
 def _known(design: Design, tables: History, given: Given, piece: Piece) -> Any:
-    """Covariance of the error of the estimate where a piece begins."""
+    """Covariance of the errors of the estimate, and of the integral of what is to be measured, where a piece begins."""
     known = design.error(tables.at(piece.begin).e)
     if design.reads_first:  # the tables have what is known after it
         known = ca.if_else(given.last < 0.0, ca.DM(design.prior), known)
     own = ca.logic_or(given.elapsed > 0.0, given.overdue) if design.reads else given.elapsed > 0.0
-    return ca.if_else(own, unpack_symbolic(given.spread, design.sizes[0]), known)
+    n, a = design.sizes[0], design.always
+    return ca.if_else(own, unpack_symbolic(given.spread, n + a), ca.diagcat(known, ca.MX.zeros(a, a)))
 
 
 def about(design: Design, own: tuple[str, ...]) -> tuple[str, ...]:
@@ -215,9 +234,13 @@ def finite(*values: Expr) -> Any:
 
 def input_ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs of a step; those that are held take the place of fields of the struct."""
-    n, m, r = design.sizes
-    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1, "spread": half_length(n)}
-    sizes |= {"overdue": 1} if design.reads else {}
+    (n, m, r), a = design.sizes, design.always
+    sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1}
+    sizes |= {
+        "spread": half_length(n + a),
+        **({"expected": a} if a else {}),
+        **({"overdue": 1} if design.reads else {}),
+    }
     ports = {name: Port(name=name, rows=rows) for name, rows in sizes.items()}
     ports["measurement"] = measurement_port(design)
     ports["time"] = Port(name="time", unit="s", about="of the measurement")
@@ -234,7 +257,8 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     """Ports of the fields of the struct."""
     st, (n, m, r) = design.statement, design.sizes
     shapes = {"feedback_gain": (m, n), "filter_gain": (n, r), "estimate": (n, 1), "nominal_state": (st.nx, 1)}
-    shapes |= {"control": (m, 1), "nominal_control": (m, 1), "spread": (half_length(n), 1)}
+    shapes |= {"control": (m, 1), "nominal_control": (m, 1), "expected": (design.always, 1)}
+    shapes |= {"spread": (half_length(n + design.always), 1)}
     units = {"time": "s", "elapsed": "s"}
     about = {
         "time": "of the last step",
@@ -246,6 +270,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
         "filter_gain": "L of the last step; zero for rows that were left out",
         **ABOUT_KEPT,
         "index": "of the last sample",
+        "passed": "samples over which a step that is under way has gone; 0 between two calls",
         "status": "of the last step",
     }
     controls = with_units(st, st.control_names[:m])
@@ -259,7 +284,7 @@ def field_ports(design: Design, fields: dict[str, Any]) -> tuple[Port, ...]:
     for name in fields:
         rows, columns = shapes.get(name, (1, 1))
         unit, listed = units.get(name, ""), entries.get(name, ())
-        whole = name in ("index", "overdue", "status")
+        whole = name in ("index", "passed", "overdue", "status")
         port = Port(name=name, rows=rows, columns=columns, unit=unit, about=about[name], entries=listed, whole=whole)
         ports.append(port)
     return tuple(ports)
@@ -334,14 +359,12 @@ class _Corrected(NamedTuple):
     came: Any
 
 
-def _corrected(
-    design: Design, predicted: tuple[Any, Any], given: tuple[Any, ...], now: Nominal, time: Expr
-) -> _Corrected:
+def _corrected(design: Design, ahead: Ahead, given: tuple[Any, ...], now: Nominal, time: Expr) -> _Corrected:
     """What a measurement tells.
 
     Args:
         design: the model.
-        predicted: estimate and covariance of its error before.
+        ahead: what is predicted.
         given: control held, measurement, length of the step, which rows are there.
         now: the nominal.
         time: of the measurement.
@@ -349,32 +372,38 @@ def _corrected(
     st, (n, m, r), always = design.statement, design.sizes, design.always
     kind = design.symbolic if r <= SCALAR_SIZE else ca.MX
     y, held, measured, h = kind.sym("y", n), kind.sym("held", m), kind.sym("measurement", r), kind.sym("h")
-    due = kind.sym("due", r)
+    seen, due = kind.sym("a", always), kind.sym("due", r)
     x, u, e, t = kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("e", st.ne), kind.sym("t")
     model = design.model(x, u, t)
-    expected, M, slope, U = model.h, model.M, model.H, model.U
-    E, C = kind.sym("E", n, n), design.gain(x, u, e, t)[0]
+    E, C = kind.sym("E", n + always, n + always), design.gain(x, u, e, t)[0]
     if r == 0:  # a phase that measures nothing: prediction alone, which the feedback goes on acting on
         gain = ca.Function("feedback", [x, u, e, t], [ca.densify(C)])
         C, none = gain(now.x, now.u, now.e, time), ca.MX(0)
-        return _Corrected(predicted[0], C, ca.MX(n, 0), pack_symbolic(predicted[1]), none, none, none)
-    present = ca.fabs(measured) <= LARGEST
-    residual = ca.if_else(present, measured - expected - M @ y - slope @ (held - u[:m]), 0.0)
-    if not design.reads:
-        L, _ = innovation_gain(h * E, *without(present, M, U), solved_in_units)
-        after = E  # P after the last piece: the next step begins with that of the design
-    else:  # sqrt(h) of what is measured all the time, so that its noise is U; what is read has its variance
-        roots = ca.vertcat(ca.repmat(ca.sqrt(h), always, 1), kind.ones(r - always))
-        rows, noise = without(present, ca.diag(roots) @ M, U)
-        L, _ = innovation_gain(E, rows, noise, solved_in_units)
-        after = joseph_form(E, L, rows, noise)
-        L = L @ ca.diag(roots)
+        return _Corrected(ahead.estimate, C, ca.MX(n, 0), pack_symbolic(ahead.spread), none, none, none)
+    present, read = ca.fabs(measured) <= LARGEST, slice(always, r)
+    some = ca.fmax(h, SHORTEST)
+    at_end = model.h[read, 0] + model.M[read, :] @ y + model.H[read, :] @ (held - u[:m])
+    residual = ca.if_else(present, measured - ca.vertcat(seen / some, at_end), 0.0)
+    # sqrt(h) of a mean, so that its noise is U; no time has passed of which one at the same time could tell
+    roots = ca.vertcat(ca.repmat(ca.sqrt(some), always, 1), kind.ones(r - always))
+    there = present * ca.vertcat(ca.repmat(h > 0, always, 1), kind.ones(r - always))
+    of_means = ca.horzcat(kind(always, n), ca.DM.eye(always) / ca.sqrt(some))
+    rows = ca.diag(there) @ ca.vertcat(of_means, ca.horzcat(model.M[read, :], kind(r - always, always)))
+    noise = ca.diagcat(kind(always, always), model.U[read, read])
+    spread = rows @ E @ rows.T + ca.diag(there) @ noise @ ca.diag(there) + ca.diag(1 - there)
+    L = solved_in_units(spread, rows @ E[:, :n]).T @ ca.diag(there)
+    after = E[:n, :n]  # what is not read at instants is what the design expects: the next step begins with its E
+    if design.reads:
+        left = ca.horzcat(ca.DM.eye(n), kind(n, always)) - L @ rows
+        after = left @ E @ left.T + L @ noise @ L.T
     absent = due * (1 - present)
     late = ca.sum1(absent[always:]) > 0
     flags = [ca.sum1(absent) > 0, late, ca.logic_and(ca.sum1(due[always:]) > 0, ca.logic_not(late))]
-    outputs = [ca.densify(v) for v in (y + L @ residual, C, L, pack_symbolic(after), *flags)]
-    function = ca.Function("correct", [y, E, held, measured, h, due, x, u, e, t], outputs)
-    return _Corrected(*function(*predicted, *given, now.x, now.u, now.e, time))
+    kept = pack_symbolic(ca.diagcat(after, kind(always, always)))
+    L = L @ ca.diag(roots)
+    outputs = [ca.densify(v) for v in (y + L @ residual, C, L, kept, *flags)]
+    function = ca.Function("correct", [y, seen, E, held, measured, h, due, x, u, e, t], outputs)
+    return _Corrected(*function(*ahead, *given, now.x, now.u, now.e, time))
 
 
 def points(design: Design, tables: History, random: np.random.Generator, count: int) -> Array:
@@ -403,10 +432,12 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
         first = random.uniform(size=count) < 0.2
         last[first] = NO_STEP
         time[first & (random.uniform(size=count) < 0.5)] = 0.0
-    kept = pack(np.array([E[:, k * n : (k + 1) * n] for k in range(count)]))
-    under_way = random.uniform(size=count) < 0.2
+    elapsed = (random.uniform(size=count) < 0.2) * steps
+    rows[:, span(ports, "elapsed")] = elapsed[:, None]
+    kept, seen = _under_way(design, model, E, rows[:, span(ports, "estimate")], elapsed)
     rows[:, span(ports, "spread")] = kept * random.uniform(0.5, 2.0, (count, 1))
-    rows[:, span(ports, "elapsed")] = (under_way * steps)[:, None]
+    if design.always:
+        rows[:, span(ports, "expected")] = seen
     if design.reads:
         rows[:, span(ports, "overdue")] = random.uniform(size=(count, 1)) < 0.2
     rows[:, span(ports, "last")] = last[:, None]
@@ -419,6 +450,24 @@ def points(design: Design, tables: History, random: np.random.Generator, count: 
         rows[-1, span(ports, "estimate")] = np.nan
         rows[-2, span(ports, "estimate")] = 1e300
     return rows
+
+
+def _under_way(design: Design, model: DesignAt, E: Array, estimates: Array, elapsed: Array) -> tuple[Array, Array]:
+    """Spread and integral of what is to be measured that steps under way may have, (count, ...), as all were constant.
+
+    Args:
+        design: the model.
+        model: at each step, side by side.
+        E: covariances of the errors, side by side.
+        estimates: (count, n).
+        elapsed: how long they have been under way [s], (count,).
+    """
+    count, a = elapsed.size, design.always
+    h, M, U = (stacked(v, count) for v in (model.h, model.M, model.U))
+    M, own, s = M[:, :a], stacked(ca.DM(E), count), elapsed[:, None, None]
+    across = s * (M @ own)
+    spread = np.block([[own, across.mT], [across, s * (across @ M.mT) + s * U[:, :a, :a]]])
+    return pack(spread), ((h[:, :a] + M @ estimates[:, :, None]) * s)[:, :, 0]
 
 
 def _root(covariance: Array) -> Array:

@@ -18,28 +18,30 @@ WHOLE = 1e-9
 
 
 class Period(NamedTuple):
-    """Phi and Gamma of a period, by the state at its start and the control that is held, g, and P after it."""
+    """Of a period: deviation d at its end, and what is told of it: means over the period, then what is read at its end.
 
-    transition: Array
+    state: slopes by d at its start, (n + r, n); held: by the control that is held, (n + r, m); offset: what they are
+    without both, (n + r, 1); noise: their covariance from noise alone, (n + r, n + r).
+    """
+
+    state: Array
     held: Array
     offset: Array
-    covariance: Array
+    noise: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moves:
     """Gauss steps between nodes and samples; n deviations, m controls, r values that are measured all the time.
 
-    state: transitions of (deviation, control held, 1), (steps, n + m + 1, n + m + 1).
-    measured: of (deviation, integral of what is measured of it, control held), (steps, n + r + m, n + r + m).
-    noise, measured_noise, weight: step matrices of the Lyapunov equations of the covariance of the deviation, of that
-        of (deviation, integral), and, run backward, of the cost of (deviation, control held).
+    measured: transitions of (deviation, integral of what is measured, control held, 1), (steps, n + r + m + 1,
+        n + r + m + 1).
+    measured_noise, weight: step matrices of the Lyapunov equations of the covariance of (deviation, integral), and, run
+        backward, of the cost of (deviation, control held).
     sizes: n, m, r. first: the step that begins at each of the times.
     """
 
-    state: Array
     measured: Array
-    noise: Array
     measured_noise: Array
     weight: Array
     sizes: tuple[int, int, int]
@@ -58,16 +60,16 @@ class Moves:
         points = [_Point.at(design, tables, grid[:-1] + c * h, h[:, None, None]) for c in GAUSS_NODES]
         n, m, _ = design.sizes
         r = design.always
-        state = [_blocks([[p.F, p.G, -p.G @ p.u]], n + m + 1) for p in points]
-        measured = [_blocks([[p.F, p.zero(n, r), p.G], [p.M, p.zero(r, r), p.H]], n + r + m) for p in points]
+        measured = [
+            _blocks([[p.F, p.zero(n, r), p.G, -p.G @ p.u], [p.M, p.zero(r, r), p.H, p.h - p.H @ p.u]], n + r + m + 1)
+            for p in points
+        ]
         joint = [matrix[:, : n + r, : n + r] for matrix in measured]
         spread = [_blocks([[p.Q, p.zero(n, r)], [p.zero(r, n), p.U]], n + r) for p in points]
         held = [_blocks([[p.F, p.G]], n + m).transpose(0, 2, 1) for p in points[::-1]]
         cost = [_blocks([[p.A, p.N], [p.N.transpose(0, 2, 1), p.B]], n + m) for p in points[::-1]]
         return Moves(
-            state=_transitions(state),
             measured=_transitions(measured),
-            noise=_lyapunov([p.F for p in points], [p.Q for p in points]),
             measured_noise=_lyapunov(joint, spread),
             weight=_lyapunov(held, cost),
             sizes=(n, m, r),
@@ -78,26 +80,14 @@ class Moves:
         """The steps of period k."""
         return range(int(self.first[k]), int(self.first[k + 1]))
 
-    def over(self, k: int, P: Array) -> Period:
-        """What a period does without a measurement."""
-        n, m, _ = self.sizes
-        z = np.eye(n + m + 1)
-        for i in self.steps(k):
-            z, P = self.state[i] @ z, lyapunov_after(self.noise[i], P)
-        return Period(transition=z[:n, :n], held=z[:n, n : n + m], offset=z[:n, n + m :], covariance=P)
-
-    def measuring(self, k: int) -> tuple[Array, Array, Array]:
-        """Over period k, of the deviation d and the integral a of what is measured of it, noise included.
-
-        Returns:
-            Slopes of (d, a) at its end by d at its start (n + r, n), by the deviation of the control that is held
-            (n + r, m), their covariance from noise alone (n + r, n + r).
-        """
+    def measuring(self, k: int) -> Period:
+        """Over period k: the deviation at its end, and the integral of what is measured, noise included."""
         n, m, r = self.sizes
-        z, P = np.eye(n + r + m), np.zeros((n + r, n + r))
+        z, P = np.eye(n + r + m + 1), np.zeros((n + r, n + r))
         for i in self.steps(k):
             z, P = self.measured[i] @ z, lyapunov_after(self.measured_noise[i], P)
-        return z[: n + r, :n], z[: n + r, n + r :], P
+        z = z[: n + r]
+        return Period(state=z[:, :n], held=z[:, n + r : -1], offset=z[:, -1:], noise=P)
 
     def weighed(self, k: int, S: Array) -> Array:
         """Weight of (d at the start of period k, deviation of the control held) in twice the cost, from S at its end.
@@ -118,6 +108,7 @@ class _Point:
 
     F: Array
     G: Array
+    h: Array
     M: Array
     H: Array
     U: Array
@@ -134,12 +125,13 @@ class _Point:
         """At some times, for steps of some lengths."""
         x, u, _ = tables.rows(t)
         columns = x.T, u.T, t[None, :]
-        F, G, _, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
+        F, G, seen, M, H, U = (h * stacked(v, t.size) for v in design.linear.map(t.size)(*columns))
         r = design.always
-        M, H, U = M[:, :r], H[:, :r], U[:, :r, :r]
+        seen, M, H, U = seen[:, :r], M[:, :r], H[:, :r], U[:, :r, :r]
         Q = h * stacked(design.noise.map(t.size)(*columns), t.size)
         A, N, B = (h * stacked(v, t.size) for v in design.weights.map(t.size)(*columns))
-        return _Point(F=F, G=G, M=M, H=H, U=U, Q=Q, A=A, N=N, B=B, u=u[:, : design.sizes[1], None])
+        nominal = u[:, : design.sizes[1], None]
+        return _Point(F=F, G=G, h=seen, M=M, H=H, U=U, Q=Q, A=A, N=N, B=B, u=nominal)
 
     def zero(self, rows: int, columns: int) -> Array:
         """A block of zeros."""

@@ -36,6 +36,7 @@ from covocp.export.laws.controller import (
     Given,
     about,
     first_fields,
+    input_ports,
     points,
     stepped,
     with_units,
@@ -83,12 +84,16 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Room:
-    """Sizes that are enough for every phase: estimate, control, measurement, state; whether one reads at instants."""
+    """Sizes that are enough for every phase: estimate, control, measurement, state; what is measured all the time, that
+    and the estimate; whether one reads at instants.
+    """
 
     n: int
     m: int
     r: int
     nx: int
+    always: int
+    joint: int
     reads: bool
 
     __repr__ = short_repr
@@ -102,8 +107,9 @@ class _Room:
             "feedback_gain": (m, n),
             "filter_gain": (n, self.r),
             "elapsed": (1, 1),
-            "spread": (half_length(n), 1),
+            "spread": (half_length(self.joint), 1),
         }
+        shapes |= {"expected": (self.always, 1)} if self.always else {}
         return shapes | ({"overdue": (1, 1)} if self.reads else {})
 
     @property
@@ -267,7 +273,9 @@ def _room(legs: tuple[Leg, ...]) -> _Room:
     """What is enough for all phases."""
     n, m, r = (max(leg.design.sizes[k] for leg in legs) for k in range(3))
     nx, reads = max(leg.design.statement.nx for leg in legs), any(leg.design.reads for leg in legs)
-    return _Room(n=n, m=m, r=r, nx=nx, reads=reads)
+    always = max(leg.design.always for leg in legs)
+    joint = max(leg.design.sizes[0] + leg.design.always for leg in legs)
+    return _Room(n=n, m=m, r=r, nx=nx, always=always, joint=joint, reads=reads)
 
 
 def _padded(value: Expr, rows: int, columns: int = 1) -> Any:
@@ -281,11 +289,11 @@ def _padded(value: Expr, rows: int, columns: int = 1) -> Any:
 
 def _given(leg: Leg, room: _Room) -> tuple[list[Any], Given]:
     """What is kept, time of the last step in the phase, measurement: with room, and what the phase takes of it."""
-    n, m, r = leg.design.sizes
+    (n, m, r), a = leg.design.sizes, leg.design.always
     sizes = {**room.kept, "last": 1, "measurement": room.r}
     symbols = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
-    own = {"estimate": n, "held": m, "spread": half_length(n), "measurement": r}
-    taken = {name: symbol[: own.get(name, 1)] for name, symbol in symbols.items()}
+    own = {"estimate": n, "held": m, "spread": half_length(n + a), "measurement": r, "expected": a}
+    taken = {name: symbol[: own.get(name, 1), 0] for name, symbol in symbols.items()}
     return list(symbols.values()), Given.of(taken)
 
 
@@ -447,16 +455,13 @@ def _points(legs: tuple[Leg, ...], room: _Room, duration: float, random: np.rand
     share = max(count // len(legs), 1)
     parts = []
     for k, leg in enumerate(legs):
-        n, m, r = leg.design.sizes
         own = points(leg.design, leg.tables, random, share if k + 1 < len(legs) else max(count - share * k, 1))
         rows = np.zeros((own.shape[0], sum(port.size for port in ports)))
         offset = 0
-        sizes = {"estimate": n, "last": 1, "held": m, "measurement": r, "time": 1, "elapsed": 1}
-        sizes |= {"spread": half_length(n)} | ({"overdue": 1} if leg.design.reads else {})
-        for name, size in sizes.items():
-            place = span(ports, name).start
-            rows[:, place : place + size] = own[:, offset : offset + size]
-            offset += size
+        for port in input_ports(leg.design):
+            place = span(ports, port.name).start
+            rows[:, place : place + port.size] = own[:, offset : offset + port.size]
+            offset += port.size
         for name in ("last", "time"):
             rows[:, span(ports, name)] += leg.start
         if k + 1 < len(legs):

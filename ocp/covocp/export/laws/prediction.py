@@ -2,8 +2,8 @@
 
 At its nodes the control of the nominal jumps or has a kink, and with it the slopes along the nominal may: a rule of
 integration that has two points in a step does not see that. So a step ends at the next node where one lies before its
-end, and goes on from there. What is predicted to a node is kept until the step is done: the estimate, the covariance P
-of its error, and the time that has gone.
+end, and goes on from there. What is predicted to a node is kept until the step is done: the estimate, the integral of
+what is to be measured, the covariance of the errors of both, and the time that has gone.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import casadi as ca
 
 from covocp.base.expressions import Expr
 from covocp.base.linear_solve import COMPILED_SOLVER, linear_solve
-from covocp.base.quadrature import GAUSS_NODES, gauss_step
+from covocp.base.quadrature import GAUSS_NODES, gauss_stages
 from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 
@@ -51,32 +51,72 @@ def next_piece(tables: History, begin: Expr, time: Expr, valid: Expr) -> Piece:
     return Piece(begin=begin, end=end, length=ca.if_else(valid, end - begin, 0.0), more=more)
 
 
-def predicted(design: Design, tables: History, given: tuple[Any, Any, Any], piece: Piece) -> tuple[Any, Any]:
-    """Estimate and covariance of its error at the end of a piece, computed in units of typical deviations.
+class Ahead(NamedTuple):
+    """What is carried through a step; n: rows of the estimate, a: values that are measured all the time.
+
+    estimate: (n,). expected: integral of what is to be measured since the last measurement, (a,). spread: covariance of
+    the errors of both, that of the integral with the noise of the measurement, (n + a, n + a).
+    """
+
+    estimate: Any
+    expected: Any
+    spread: Any
+
+
+def predicted(design: Design, tables: History, ahead: Ahead, held: Expr, piece: Piece) -> Ahead:
+    """What a piece makes of it, computed in units of typical deviations.
 
     Args:
         design: the model.
         tables: the nominal.
-        given: estimate, covariance of its error and control held since the last step.
+        ahead: where the piece begins.
+        held: control since the last step.
         piece: from where to where.
     """
-    st, (n, m, _), h = design.statement, design.sizes, piece.length
+    st, (n, m, _), a, h = design.statement, design.sizes, design.always, piece.length
     units, inverse = ca.diag(ca.DM(design.units)), ca.diag(1.0 / ca.DM(design.units))
     kind = design.symbolic if n <= SCALAR_SIZE else ca.MX
-    own, error, du, dt = kind.sym("y", n), kind.sym("E", n, n), kind.sym("held", m), kind.sym("h")
+    own, seen, error = kind.sym("y", n), kind.sym("a", a), kind.sym("E", n + a, n + a)
+    du, dt = kind.sym("held", m), kind.sym("h")
     symbols = [[kind.sym("x", st.nx), kind.sym("u", st.nu), kind.sym("t")] for _ in GAUSS_NODES]
-    slopes = [design.model(*three)[:2] for three in symbols]
-    points = [dt * (inverse @ F @ units) for F, _ in slopes]
-    forcing = [dt * (inverse @ (G @ (du - three[1][:m]))) for (_, G), three in zip(slopes, symbols, strict=True)]
-    change, transition = gauss_step(points, forcing, inverse @ own, ca.DM.eye(n), solved)
-    value, move = own + units @ change, units @ transition @ inverse
-    spread = move @ error @ move.T + dt * design.noise(*symbols[1])
-    inputs = [own, error, du, dt, *symbols[0], *symbols[1]]
-    function = ca.Function("predict", inputs, [ca.densify(value), ca.densify(spread)])
+    models = [design.model(*three) for three in symbols]
+    moved = [du - three[1][:m] for three in symbols]
+    points = [dt * (inverse @ at.F @ units) for at in models]
+    forcing = [dt * (inverse @ (at.G @ by)) for at, by in zip(models, moved, strict=True)]
+    (*values, change), (*moves, turn) = gauss_stages(points, forcing, inverse @ own, ca.DM.eye(n), solved)
+    rows = [at.M[:a, :] for at in models]
+    means = [
+        at.h[:a, 0] + M @ (units @ y) + at.H[:a, :] @ by
+        for at, M, y, by in zip(models, rows, values, moved, strict=True)
+    ]
+    slope = dt / 2 * sum((M @ units @ move for M, move in zip(rows, moves, strict=True)), kind(a, n))
+    transition = ca.blockcat(ca.DM.eye(n) + units @ turn @ inverse, kind(n, a), slope @ inverse, ca.DM.eye(a))
+    noise = _noise_of_piece(design.noise(*symbols[1]), rows, [at.U[:a, :a] for at in models], dt)
+    outputs = [
+        own + units @ change,
+        seen + dt / 2 * (means[0] + means[1]),
+        transition @ error @ transition.T + noise,
+    ]
+    inputs = [own, seen, error, du, dt, *symbols[0], *symbols[1]]
+    function = ca.Function("predict", inputs, [ca.densify(value) for value in outputs])
     at = [piece.begin + c * h for c in GAUSS_NODES]
     nodes = [(now.x, now.u, t) for now, t in zip(map(tables.at, at), at, strict=True)]
-    value, spread = function(*given, h, *nodes[0], *nodes[1])
-    return value, spread
+    return Ahead(*function(*ahead, held, h, *nodes[0], *nodes[1]))
+
+
+def _noise_of_piece(Q: Any, rows: list[Any], densities: list[Any], h: Any) -> Any:
+    """Covariance of what noise makes of deviation and integral in a piece: it comes evenly, the deviation keeps it.
+
+    Args:
+        Q: density of the process noise (n, n).
+        rows: M at both nodes, (a, n) each.
+        densities: U there, (a, a) each.
+        h: length of the piece.
+    """
+    M = (rows[0] + rows[1]) / 2
+    across = h**2 / 2 * (M @ Q)
+    own = h**3 / 3 * (M @ Q @ M.T) + h / 2 * (densities[0] + densities[1])
+    return ca.blockcat(h * Q, across.T, across, own)
 
 
 def solved(matrix: Expr, right: Expr) -> Any:

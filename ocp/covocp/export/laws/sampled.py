@@ -3,18 +3,25 @@
 For the samples t_k = k period, with y the estimate of the deviation and w the control held since the last sample,
 
     y-_k = Phi_k y_(k-1) + Gamma_k w + g_k,          g_k = - int Phi G u dt: the nominal goes on, the control is held
-    y_k  = y-_k + L_k (m_k - h_k - M_k y-_k - H_k (w - u_k)),      u_k  =  u(t_k) - C(t_k) y_k,
+    y_k  = y-_k + L_k (m_k - h_k - M_k y_(k-1) - H_k w),           u_k  =  u(t_k) - C(t_k) y_k,
 
 the control within the limits, where there are some.
 
-Phi, Gamma, g by the two-stage Gauss method between the nodes of the mesh. L_k = P- M' (M P- M' + U/period)^-1 is the
-gain of the discrete filter: P from E(0) by the same method, each measurement with the noise of one period. C(t_k) is
+The measurement m_k is the mean over the period before, and h_k + M_k y_(k-1) + H_k w the mean that is expected: of h(x,
+u) + M y- + H (w - u) along the nominal, y- as it moves in the period. What is read at an instant is expected there.
+
+Phi, Gamma, g, h, M, H by the two-stage Gauss method between the nodes of the mesh. L_k = B A^-1 is the gain of the
+discrete filter: A the covariance of what is new in the mean, its noise of one period included, B that between it and
+the error of y-, from E(0) by the same method; P- M' (M P- M' + U/period)^-1 for a short period. C(t_k) is
 the gain of the control that is held over a period: the best one by the discrete Riccati recursion (`sampled_gain`), or
 that of the design where its gain was constrained.
 
-Of a measurement whose rows p are there the gain is P- M_p' (M_p P- M_p' + U_pp/period)^-1, P- of the full filter. As
-P- M' = L S with S = M P- M' + U/period, that is L S_.p S_pp^-1: the residuals that are missing are expected from the
-others. Only S has to be known, and only a system of the size of the measurement is solved, where a row is missing.
+Of a measurement whose rows p are there the gain is B_.p A_pp^-1, both of the full filter. As B = L A, that is
+L A_.p A_pp^-1: the residuals that are missing are expected from the others. Only A has to be known, and only a system
+of the size of the measurement is solved, where a row is missing.
+
+Where samples are left out the measurement is the mean since the last step: of the means of the periods, with the gain
+of the last of them.
 """
 
 from __future__ import annotations
@@ -27,10 +34,8 @@ import numpy as np
 
 from covocp.base.errors import ExportError
 from covocp.base.expressions import Expr
-from covocp.base.gains import innovation_gain
 from covocp.base.matrices import Array, pack, stacked, unpack_symbolic
 from covocp.base.short_repr import short_repr
-from covocp.blocks.updates import joseph_form
 from covocp.export.laws.controller import (
     NO_STEP,
     STATUSES,
@@ -45,26 +50,27 @@ from covocp.export.laws.design import Design
 from covocp.export.laws.history import History
 from covocp.export.laws.law import LARGEST, Law, Port, flat, span, stacked_size, status_of
 from covocp.export.laws.limits import clipped, limit_constants, limits_notes, limits_text
-from covocp.export.laws.moves import WHOLE, Moves
+from covocp.export.laws.moves import WHOLE, Moves, Period
 from covocp.export.laws.prediction import CONTINUE, SCALAR_SIZE, solved
 from covocp.export.laws.sampled_gain import flown_covariances, sampled_gains
 
 MOST_SAMPLES = 200_000
 # Share of a period by which an instant may miss a sample.
 SAME_INSTANT = 1e-6
-HELD = {"estimate": "estimate", "last": "index", "held": "control"}
+HELD = {"estimate": "estimate", "last": "index", "held": "control", "expected": "expected", "passed": "passed"}
 ABOUT = (
     "Perturbation filter and feedback for samples of a fixed period; call it once a period. The time chooses the "
     "nearest sample; samples that were left out are predicted over, one loop for each. The control returned is held "
     "until the next call. The estimate y of the deviation from the nominal is predicted by Phi y + Gamma u_held + g "
     "and corrected by L (m - what is expected), L of the discrete filter whose measurements have the noise of one "
-    "period; the control is u - C y.",
+    "period; the control is u - C y. The measurement m is the mean of what is measured since the last call, and is "
+    "compared with the mean that is expected.",
     "A row of the measurement that is not finite is left out (readings beyond 1e30 count as not finite): L is then "
-    "P- M' (M P- M' + U/period)^-1 of the other rows, P- that of the filter with all of them. At time zero the control "
-    "is that of the nominal.",
+    "the gain of the other rows in the filter with all of them. At time zero the control is that of the nominal.",
 )
 ABOUT_INSTANTS = (
-    "Rows of the measurement that are read at instants count with their variance at the sample of their instant "
+    "Rows of the measurement that are read at instants are compared with what is expected then, and count with "
+    "their variance at the sample of their instant "
     "alone, and once. Between the instants they are left out, whatever they are, without a status; NaN is no missing "
     "row then. A reading that comes later than its sample is lost.",
 )
@@ -104,10 +110,11 @@ class Samples:
 
 def sampled_law(design: Design, tables: History, samples: Samples, tolerance: float) -> Law:
     """The law (estimate, last sample, held control, measurement, time) -> control and all that the struct keeps."""
-    n, m, r = design.sizes
+    (n, m, r), always = design.sizes, design.always
     period = samples.period
     y, last, held = ca.MX.sym("estimate", n), ca.MX.sym("last"), ca.MX.sym("held", m)
     measured, time = ca.MX.sym("measurement", r), ca.MX.sym("time")
+    summed, passed = ca.MX.sym("expected", always), ca.MX.sym("passed")
     least = NO_STEP if design.reads_first else 0.0
     begun = ca.fmax(last, least)  # a struct that was never set must not lead out of the tables
     clock = tables.clock(time, ca.fmax(begun, 0.0) * period)
@@ -122,7 +129,9 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
     present = finite_rows if "due" not in at else ca.if_else(at["due"], finite_rows, 1.0)
     missing = ca.sum1(present) < r
     before = ca.if_else(ahead, at["Phi"] @ y + at["Gamma"] @ held + at["g"], y)
-    residual = measured - at["h"] - at["M"] @ before - at["H"] @ (held - at["u"])
+    expected = at["h"] + at["M"] @ y + at["H"] @ held
+    total = summed + expected[:always, 0]  # of the means of all periods since the last step
+    residual = measured - ca.vertcat(total / (passed + 1.0), expected[always:, 0])
     L = _gain_of_rows(at, present, missing) * ca.logic_and(ahead, ca.logic_not(more))
     corrected = before + L @ ca.if_else(finite_rows, residual, 0.0)
     feedback = at["C"] @ corrected
@@ -139,13 +148,18 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         "estimate": estimate,
         "control": ca.if_else(more, held, clipped(moved, design.limits)),
         "index": kept,
+        **({"expected": ca.if_else(more, total, 0.0), "passed": ca.if_else(more, passed + 1.0, 0.0)} if always else {}),
         "nominal_state": at["x"],
         "nominal_control": at["u"],
         "feedback_gain": at["C"],
         "filter_gain": L,
         "status": ca.if_else(more, CONTINUE, status_of(conditions)),
     }
-    core = ca.Function("step", [y, last, held, measured, time], [flat(v) for v in fields.values()])
+    core = ca.Function(
+        "step",
+        [y, last, held, measured, time, *((summed, passed) if always else ())],
+        [flat(v) for v in fields.values()],
+    )
     limits = (design.statement, design.limits)
     spoken = f"Period: {period!r} s; {samples.count + 1} samples, the last at {samples.count * period:g} s."
     return Law(
@@ -158,7 +172,7 @@ def sampled_law(design: Design, tables: History, samples: Samples, tolerance: fl
         inputs=_ports(design),
         outputs=field_ports(design, fields),
         statuses=STATUSES,
-        held=HELD,
+        held={name: kept for name, kept in HELD.items() if kept in fields},
         start=first_fields(design, tables, fields, "index", samples.parts["C"][0]),
         points=lambda random, count: _points(design, tables, samples, random, count),
         tolerance=tolerance,
@@ -211,30 +225,29 @@ def discretised(design: Design, tables: History, period: float) -> Samples:
     due = _due(design, t, period)
     told = due.copy()
     told[0, : design.always] = 0.0  # no time has passed of which a mean could tell
-    M, noise = M * told, _noise_of(design, U, told, period)
     held_on = tables.duration - t[-1] > WHOLE * period
     moves = Moves.of(design, tables, np.append(t, tables.duration) if held_on else t)
     if design.best_gain:
         C = sampled_gains(moves, design.final_weight, t.size)
     n, m, r = design.sizes
-    Phi, Gamma, g = np.zeros((count + 1, n, n)), np.zeros((count + 1, n, m)), np.zeros((count + 1, n, 1))
-    Phi[0], P, gains, spreads = np.eye(n), design.prior, [], []
-    for k in range(count + 1):
-        if k:
-            Phi[k], Gamma[k], g[k], P = moves.over(k - 1, P)
-        gain, spread = innovation_gain(P, M[k], noise[k], np.linalg.solve)
-        P = joseph_form(P, gain, M[k], noise[k])
+    reads = (h - H @ u[:, :m, None], M, H, U)
+    periods = [_told(moves, k, period, [part[k] for part in reads], told[k, :, 0]) for k in range(count + 1)]
+    P, gains, spreads = design.prior, [], []
+    for own, there in zip(periods, told, strict=True):
+        gain, spread, P = _updated(own, P, there)
         gains.append(gain)
         spreads.append(spread)
     L = np.array(gains)
-    parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": h, "M": M, "H": H, "C": C, "Phi": Phi, "Gamma": Gamma}
-    parts |= {"g": g, "L": L}
+    state, held, offset = (np.array([getattr(own, name) for own in periods]) for name in ("state", "held", "offset"))
+    parts = {"x": x[:, :, None], "u": u[:, :m, None], "h": offset[:, n:], "M": state[:, n:], "H": held[:, n:]}
+    parts |= {"C": C, "Phi": state[:, :n], "Gamma": held[:, :n], "g": offset[:, :n], "L": L}
     if design.always < r:
         parts["due"] = due
     if r > 1:
         parts["spread"] = _correlations(np.array(spreads))[:, :, None]
     with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges is told by its numbers
-        flown = flown_covariances(moves, period, design.prior, C, L, M, H, noise)
+        zero = periods[0]
+        flown = flown_covariances(periods, design.prior, C, L, zero.state[n:], zero.noise[n:, n:])
     return Samples(parts=parts, period=period, times=t, flown=flown)
 
 
@@ -263,12 +276,50 @@ def _due(design: Design, t: Array, period: float) -> Array:
     return np.array(rows).T[:, :, None]
 
 
-def _noise_of(design: Design, U: Array, due: Array, period: float) -> Array:
-    """Variances of what is measured: of the mean over a period, of what is read; one where nothing is."""
-    always = np.arange(U.shape[1]) < design.always
-    noise = np.where(always[:, None] & always, U / period, U)
-    there = due * due.transpose(0, 2, 1)
-    return np.asarray(noise * there + np.eye(U.shape[1]) * (1.0 - due))
+def _told(moves: Moves, k: int, length: float, reads: list[Array], told: Array) -> Period:
+    """What is told at sample k: means over the period before, and what is read, by the deviation at the sample before.
+
+    Args:
+        moves: between the samples.
+        k: number of the sample; nothing moves before the first one.
+        length: of a period [s].
+        reads: h - H u, M, H, variance of all values at the sample, of which those that are read at instants count.
+        told: which values tell something there, 1 or 0, (r,).
+    """
+    n, m, always = moves.sizes
+    if k:
+        moved = moves.measuring(k - 1)
+    else:
+        rest = np.zeros((n + always, n + always))
+        moved = Period(state=np.eye(n + always, n), held=rest[:, :0], offset=rest[:, :1], noise=rest)
+        moved = moved._replace(held=np.zeros((n + always, m)), offset=np.zeros((n + always, 1)))
+    (h, M, H, R), size, there = (part for part in reads), n + always, told[:, None]
+    h, M, H, R = (part[always:] for part in (h, M, H, R))
+    every = np.vstack([np.eye(n, size), np.eye(size)[n:] / length, M @ np.eye(n, size)])
+    every[n:] *= there
+    state, held, offset = every @ moved.state, every @ moved.held, every @ moved.offset
+    held[size:] += H
+    offset[size:] += h
+    noise = every @ moved.noise @ every.T
+    noise[size:, size:] += R[:, always:] * there[always:] * there[always:].T
+    return Period(state=state, held=held, offset=offset, noise=noise)
+
+
+def _updated(period: Period, P: Array, told: Array) -> tuple[Array, Array, Array]:
+    """Gain of what is told, covariance of what is new in it (one where nothing is told), P after it.
+
+    Args:
+        period: what is told, by the deviation at the sample before.
+        P: covariance of the error there, (n, n).
+        told: which values tell something, 1 or 0, (r, 1).
+    """
+    n = P.shape[0]
+    joint = period.state @ P @ period.state.T + period.noise
+    spread = joint[n:, n:] + np.diag(1.0 - told[:, 0])
+    gain = np.linalg.solve(spread, joint[n:, :n]).T
+    left = np.hstack([np.eye(n), -gain])
+    after = left @ joint @ left.T
+    return np.asarray(gain), spread, 0.5 * (after + after.T)
 
 
 def _correlations(spreads: Array) -> Array:
@@ -290,23 +341,32 @@ def _at_samples(design: Design, tables: History, t: Array) -> tuple[Array, ...]:
 
 def _ports(design: Design) -> tuple[Port, ...]:
     """Ports of the inputs."""
-    n, m, _ = design.sizes
+    (n, m, _), always = design.sizes, design.always
+    under_way = (Port(name="expected", rows=always), Port(name="passed")) if always else ()
     return (
         Port(name="estimate", rows=n),
         Port(name="last"),
         Port(name="held", rows=m),
         measurement_port(design),
         Port(name="time", unit="s", about="of the measurement"),
+        *under_way,
     )
 
 
 def _points(design: Design, tables: History, samples: Samples, random: np.random.Generator, count: int) -> Array:
     """As for any time between two steps, the last step at a sample a few periods before."""
-    rows = points(design, tables, random, count)[:, : stacked_size(_ports(design))]
-    place = span(_ports(design), "last")
+    ports, found = _ports(design), points(design, tables, random, count)
+    rows = np.zeros((count, stacked_size(ports)))
+    shared = span(ports, "time").stop
+    rows[:, :shared] = found[:, :shared]
+    place, under_way = span(ports, "last"), random.integers(0, 3, count) * (random.uniform(size=count) < 0.2)
     before = random.choice([0, 1, 1, 1, 1, 2, 5, -1], count)
-    time = np.nan_to_num(rows[:, -1], nan=0.0, posinf=tables.duration, neginf=0.0)
+    time = np.nan_to_num(rows[:, shared - 1], nan=0.0, posinf=tables.duration, neginf=0.0)
     index = np.floor(np.clip(time, 0.0, tables.duration) / samples.period + 0.5)
     least = NO_STEP if design.reads_first else 0
     rows[:, place] = np.clip(index - before, least, samples.count)[:, None]
+    if design.always:
+        seen = samples.parts["h"][np.clip(index, 0, samples.count).astype(int), : design.always, 0]
+        rows[:, span(ports, "expected")] = under_way[:, None] * seen
+        rows[:, span(ports, "passed")] = under_way[:, None]
     return rows
