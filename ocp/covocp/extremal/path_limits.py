@@ -27,6 +27,8 @@ from covocp.transcription.scales import choose_scales
 TOGETHER = 1 << 15
 # Share of a limit by which it may be passed between the points where it is imposed without a word.
 NOTED = 1e-4
+# A limit of zero is met up to this share of the unit of its row: of a row that is zero all the way rounding is all.
+MET = 1e-7
 # A limit acts where a value is closer to it than this, in its range or the limit itself.
 TOUCHED = 1e-4
 # Share of what a limit is passed by that is much of it, and parts of an interval within which a point is one.
@@ -141,9 +143,11 @@ def passed_limits(extremal: Extremal, dense: Dense, points: int) -> tuple[Passed
 
     terms = np.concatenate([np.zeros(st.nx), _equation_terms(extremal)])
     found = _passed(extremal, dense, points, names, limits, values, terms)
-    if found and (np.array(limits) == 0.0).any():  # relative to what is zero as well anything is much
-        found = _passed(extremal, dense, points, names, limits, values, terms, _units(extremal))
-    return found
+    zero = (np.array(limits) == 0.0).any(axis=0)
+    if not found or not zero.any():
+        return found
+    met = dict(zip(names, np.where(zero, MET * _units(extremal), 0.0), strict=True))
+    return tuple(entry for entry in found if entry.by > met[entry.name])
 
 
 def _units(extremal: Extremal) -> Array:
@@ -195,11 +199,10 @@ def _passed(
     limits: tuple[Array, ...],
     values_at: Callable[[Any, Array], Array],
     terms: Array | float = 0.0,
-    units: Array | float = 0.0,
 ) -> tuple[Passed, ...]:
     """Rows that pass their limits along the true path, from what gives them at normalised times of intervals.
 
-    terms: sizes of what equations compare, 0 of other rows. units: what rows with a limit of zero count as at least.
+    terms: sizes of what equations compare, 0 of other rows.
     """
     mesh, (lower, upper) = extremal.mesh, limits
     worst, largest, held = np.zeros((2, len(names))), np.zeros(len(names)), np.zeros(len(names))
@@ -219,8 +222,7 @@ def _passed(
             worst[side] = np.maximum(worst[side], found)
             there = np.where(lower == upper, _imposed(mesh, k, s, 1), _imposed(mesh, k, s, mesh.points))
             held = np.maximum(held, np.where(there, excess, 0.0).max(axis=0, initial=0.0))
-    largest = np.where(np.asarray(terms) > 0, terms, np.maximum(largest, units))
-    shares = worst / limit_sizes(lower, upper, largest)
+    shares = worst / limit_sizes(lower, upper, np.where(np.asarray(terms) > 0, terms, largest))
     side = shares.argmax(axis=0)
     result = [
         Passed(

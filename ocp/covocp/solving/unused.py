@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from covocp.base.arguments import is_number
 from covocp.base.errors import warn_user
 from covocp.base.expressions import Given
 from covocp.base.matrices import half_indices, real_numbers
@@ -68,7 +69,8 @@ def mention_lengths(guesses: Mapping[str, Any], options: Options, statement: Sta
 
 def mention_clock(statement: Statement, elapsed: Given, parameters: Mapping[str, Any] | None) -> None:
     """Warn of a problem with a clock of its own that is planned again later on, and of which nothing says so."""
-    if elapsed and not statement.autonomous and not parameters:
+    later = is_number(elapsed) and elapsed > 0  # other values are refused where they are read
+    if later and not statement.autonomous and (parameters is None or parameters == {}):
         warn_user(
             f"'{statement.name or 'The problem'}' depends on the time, which begins at 0 again: elapsed= says what is "
             "left of the guess and moves no clock. Write t0 + ocp.time with a parameter t0 and give its value "

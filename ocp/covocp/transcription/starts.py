@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from covocp.base.arguments import is_number
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
 from covocp.base.quadrature import interpolated
@@ -111,7 +112,7 @@ def own_start(statement: Statement, mesh: Mesh, parameters: Array, *, hold: bool
     The last ones are kept, unless a guess may have changed since (a function, an array that is filled anew): a solver
     that is asked again for the same parameters starts from the same.
     """
-    fixed = all(is_plain(guess) for guess in statement.guesses.values())
+    fixed = all(guess is None or is_number(guess) for guess in statement.guesses.values())
     return (_own_start if fixed else _own_start.__wrapped__)(statement, mesh, tuple(parameters), hold)
 
 
