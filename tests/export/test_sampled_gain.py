@@ -131,13 +131,13 @@ def test_what_a_period_loses_at_the_end_is_told_however_large_deviations_were_be
     problem.measurement("position", x, noise=1e-3)
     problem.minimize_expected(running=0.5 * u**2, terminal_weight={x: 1e4, v: 1e-4})
     solution = co.solve(problem, intervals=150, progress=False)
-    flown = np.sqrt(np.diagonal(tables(solution, 0.1).flown[-1]))
+    flown = np.sqrt(np.diagonal(tables(solution, 0.2).flown[-1]))
     promised = np.array([solution.deviation(name)[-1] for name in "xv"]).ravel()
     worst = int(np.argmax(flown / promised))
-    assert flown[worst] > 1.09 * promised[worst]
+    assert flown[worst] > 1.1 * promised[worst]
     assert promised[worst] < 0.1 * solution.deviation("xv"[worst]).max()
     with pytest.warns(co.CovocpWarning, match=f"'{'xv'[worst]}' at t = 6 s is {flown[worst]:.4g} as flown"):
-        co.export_c(solution, tmp_path / "pk", period=0.1, largest_spread=10.0)
+        co.export_c(solution, tmp_path / "pk", period=0.2, largest_spread=10.0)
 
 
 @pytest.mark.parametrize("value", ["much", 0.5, np.nan, True, None])

@@ -112,14 +112,10 @@ def gauss_step(points: Any, forcing: Any, start: Expr, unit: Any, solve: Callabl
 def gauss_stages(
     points: Any, forcing: Any, start: Expr, unit: Any, solve: Callable[[Any, Any], Any]
 ) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """The same with what y and its transition are at the two nodes: by the mean of both anything of y is integrated.
+    """A step as `gauss_step` takes it, with y and its transition at the two nodes: their mean integrates y.
 
     Args:
-        points: h H at the two nodes, expressions.
-        forcing: h f there.
-        start: y.
-        unit: the identity.
-        solve: (matrix, right side) -> solution.
+        points, forcing, start, unit, solve: as of `gauss_step`.
 
     Returns:
         Of y, and of the transition from the start: values at the first and the second node, change over the step.
