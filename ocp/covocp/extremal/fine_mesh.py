@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-import casadi as ca
 import numpy as np
 
-from covocp.base.buffered import Matrices
 from covocp.base.matrices import Array
 from covocp.extremal.extremal import Extremal
 from covocp.statement.statement import Statement
+from covocp.transcription.inside import inside_intervals
 from covocp.transcription.mesh import Mesh
-from covocp.transcription.shooting import interval_columns
-from covocp.transcription.steps import inside_interval
 from covocp.transcription.trajectory import Trajectory
 
 
@@ -33,11 +30,9 @@ def _inside(
     statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...], substeps: int
 ) -> Array:
     """The same, remembered: several residuals look at one trajectory; read-only."""
-    n, z = mesh.intervals, np.hstack([trajectory.x, trajectory.e])
-    columns = interval_columns(mesh, ca.DM(trajectory.u.T), trajectory.duration, ca.DM(np.array(parameters)))
-    function = Matrices(inside_interval(statement, substeps, mesh.step).map(n))
-    (inside,) = function.evaluated(z[:-1].T, z[1:].T, *columns)
-    values = np.ascontiguousarray(inside.T).reshape(n, substeps + 1, z.shape[1])
+    nodes = np.hstack([trajectory.x, trajectory.e])
+    given = (trajectory.u, trajectory.duration, np.array(parameters))
+    values = inside_intervals(statement, mesh, nodes, *given, substeps)
     values.setflags(write=False)
     return values
 

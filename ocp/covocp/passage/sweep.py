@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from covocp.base.expressions import Expr
-from covocp.base.matrices import half_length
+from covocp.base.matrices import Array, half_length
 from covocp.base.nodes import Buffers, Node
 from covocp.passage.library import needed
 from covocp.passage.shape import Pattern, shape
@@ -73,6 +73,34 @@ def passed_by(
 
 
 values_by = partial(passed_by, lean=True)
+
+
+def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Pattern) -> Array:
+    """Half-vectors of a covariance after each of some Gauss steps, the same number of them from each of many starts.
+
+    Args:
+        firsts: half-vectors at the starts, (starts, half).
+        points: entries of h H at the first and at the second point, of one step after the other, those of the first
+            start first.
+        size: of the covariance.
+        pattern: rows and columns of the entries.
+
+    Returns:
+        (starts, count, half).
+    """
+    starts = firsts.shape[0]
+    count = points[0].size // (starts * len(pattern[0]))
+    sweep = _sweep(size, pattern, count, False, (), 0, True, 1)
+    result = np.empty((starts, count, sweep.half))
+    given = [np.ascontiguousarray(array, dtype=float) for array in (firsts, *points)]
+    lengths = [array.nbytes // starts for array in (*given, result)]
+    places = [array.ctypes.data for array in (*given, result)]
+    memory, forward = _WORKSPACES.take(sweep), needed()["passage_forward"]
+    for k in range(starts):
+        first, one, two, after = (place + k * length for place, length in zip(places, lengths, strict=True))
+        forward(memory, first, one, two, None, None, after)
+    _WORKSPACES.give(sweep, memory)
+    return result
 
 
 def entries(points: Sequence[Expr], size: int) -> tuple[Pattern, list[Any]]:

@@ -315,40 +315,6 @@ def gathering_step(statement: Statement, step: StepKind, solver: str = LINEAR_SO
 
 
 @lru_cache(maxsize=KEPT)
-def inside_interval(statement: Statement, count: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
-    """The trajectory inside an interval whose ends are known: what runs forward from its start, S from its end.
-
-    Returns:
-        (x and e stacked at the start, at the end, *interval) -> the stack at the start and at the ends of `count`
-        substeps, (nx + ne, count + 1).
-    """
-    nx, size = statement.nx, statement.nx + statement.ne
-    before, after = ca.MX.sym("before", size), ca.MX.sym("after", size)
-    interval = Interval.symbols(statement, ca.MX)
-    if not statement.behind:
-        _, fine, _ = full_interval(statement, count, step, solver)(before, *interval)
-        return ca.Function("inside", [before, after, *interval], [ca.horzcat(before, fine)])
-    x = ca.horzcat(before[:nx], nominal_interval(statement, count, step)(before[:nx], *interval)[1])
-    ahead, behind = statement.entries(statement.ahead), statement.entries(statement.behind)
-    first, last = [before[nx:][ahead]], [after[nx:][behind]]
-    gathered = [before[nx:][statement.entries(statement.summed), :]]
-    forward, backward = (matrices_step(statement, which, step, solver) for which in (statement.ahead, statement.behind))
-    parts = [interval.part(j / count, (j + 1) / count) for j in range(count)]
-    for j in range(count):
-        first.append(forward(first[-1], x[:, j], x[:, j + 1], *parts[j]))
-        if statement.summed:
-            gather = gathering_step(statement, step, solver)
-            gathered.append(gathered[-1] + gather(*first[-2:], x[:, j], x[:, j + 1], *parts[j]))
-    for j in range(count - 1, -1, -1):
-        last.append(backward(last[-1], x[:, j + 1], x[:, j], *parts[j].turned()))
-    rows = [ca.horzcat(*first), ca.horzcat(*last[::-1])]
-    if statement.summed:
-        rows.append(ca.horzcat(*gathered))
-    e = in_order(statement, *rows)
-    return ca.Function("inside", [before, after, *interval], [ca.vertcat(x, e)])
-
-
-@lru_cache(maxsize=KEPT)
 def runge_kutta_step(statement: Statement, positions: tuple[int, ...]) -> ca.Function:
     """(half-vectors of some matrices, state, *interval of the substep) -> half-vectors after a classical step."""
     entries = statement.entries(positions)

@@ -1,0 +1,145 @@
+"""The trajectory inside control intervals whose ends are known."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from covocp.base.buffered import Buffered, Matrices
+from covocp.base.linear_solve import LINEAR_SOLVER
+from covocp.base.matrices import Array
+from covocp.passage.shape import Pattern
+from covocp.passage.sweep import from_many
+from covocp.statement.interval import Interval
+from covocp.statement.statement import Statement
+from covocp.transcription.covariance_steps import KEPT, StepKind, fed, gauss_points
+from covocp.transcription.mesh import Mesh
+from covocp.transcription.sequences import NUMERIC_ENTRIES, at_columns
+from covocp.transcription.shooting import compiled_steps, interval_columns
+from covocp.transcription.steps import (
+    full_interval,
+    gathering_step,
+    in_order,
+    matrices_step,
+    nominal_interval,
+)
+
+
+def inside_intervals(
+    statement: Statement, mesh: Mesh, nodes: Array, u: Array, duration: float, parameters: Array, count: int
+) -> Array:
+    """Each interval integrated again from its node; what runs backward from its later node.
+
+    Args:
+        statement: the problem.
+        mesh: of it; its substeps are not seen.
+        nodes: x and e stacked at the nodes, (N + 1, nx + ne).
+        u: control values, (N + 1 or N, nu).
+        duration: terminal time [s].
+        parameters: of the statement.
+        count: substeps.
+
+    Returns:
+        x and e stacked at the starts of the substeps and at the end, (N, count + 1, nx + ne).
+
+    Raises:
+        RuntimeError: a step cannot be solved.
+    """
+    st, n = statement, mesh.intervals
+    common = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
+    if not st.matrices or not _alone(st) or not compiled_steps(mesh):
+        function = Matrices(inside_interval(st, count, mesh.step).map(n))
+        (inside,) = function.evaluated(nodes[:-1].T, nodes[1:].T, *common)
+        return np.ascontiguousarray(inside.T).reshape(n, count + 1, nodes.shape[1])
+    result = np.empty((n, count + 1, nodes.shape[1]))
+    result[:, 0], result[:, -1] = nodes[:-1], nodes[1:]
+    advance = nominal_interval(st, count, mesh.step).map(n)
+    result[:, 1:, : st.nx] = np.asarray(advance(nodes[:-1, : st.nx].T, *common)[1].full()).T.reshape(n, count, st.nx)
+    most = max(NUMERIC_ENTRIES // (8 * st.ne * count), 1)  # H of all steps takes memory
+    for first in range(0, n, most):
+        span = slice(first, min(first + most, n))
+        _pass_matrices(st, mesh, result[span], common.columns(span))
+    return result
+
+
+def _alone(statement: Statement) -> bool:
+    """Whether all matrices pass along a nominal that is known, by steps of their own alone."""
+    everything = statement.ahead + statement.behind
+    plain = not statement.coupled and not statement.summed and statement.samples is None
+    return plain and not fed(statement, everything)
+
+
+def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Interval) -> None:
+    """Write the matrices inside some intervals beside the states, (N, count + 1, nx + ne), by the compiled passage."""
+    st, (n, points, _), nx = statement, values.shape, statement.nx
+    count = points - 1
+    states = [values[:, at, :nx].reshape(n * count, nx) for at in (slice(count), slice(1, None))]
+    order = np.arange(n * count).reshape(n, count)[:, ::-1].ravel()
+    for positions, backward in ((st.ahead, False), (st.behind, True)):
+        if not positions:
+            continue
+        ends, steps = states, common.substeps(count)
+        if backward:
+            ends, steps = [state[order] for state in states[::-1]], steps.columns(order.tolist()).turned()
+        rows = [end.ravel() for end in ends] + [np.asarray(ca.DM(v).full()).ravel(order="F") for v in steps]
+        for i in positions:
+            block = st.matrices[i]
+            own = slice(nx + block.span.start, nx + block.span.stop)
+            function, pattern = _entries(st, i, mesh.step)
+            h = Buffered(at_columns(st, mesh, function, n * count))(*rows)
+            if h is None:
+                raise RuntimeError(f"{function.name()} failed")
+            after = from_many(values[:, -1 if backward else 0, own], h, block.size, pattern)
+            if backward:
+                values[:, :-1, own] = after[:, ::-1]
+            else:
+                values[:, 1:, own] = after
+
+
+@lru_cache(maxsize=KEPT)
+def _entries(statement: Statement, index: int, step: StepKind) -> tuple[ca.Function, Pattern]:
+    """What of h H may be nonzero at both Gauss points of a step, and its rows and columns."""
+    function = gauss_points(statement, index, step)
+    one, two = (function.sparsity_out(i) for i in range(2))
+    if one != two:
+        symbols = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+        outputs = [ca.project(value, one + two) for value in function.call(symbols)]
+        function = ca.Function(function.name(), symbols, outputs)
+    rows, columns = function.sparsity_out(0).get_triplet()
+    return function, (tuple(rows), tuple(columns))
+
+
+@lru_cache(maxsize=KEPT)
+def inside_interval(statement: Statement, count: int, step: StepKind, solver: str = LINEAR_SOLVER) -> ca.Function:
+    """The trajectory inside an interval whose ends are known: what runs forward from its start, S from its end.
+
+    Returns:
+        (x and e stacked at the start, at the end, *interval) -> the stack at the start and at the ends of `count`
+        substeps, (nx + ne, count + 1).
+    """
+    nx, size = statement.nx, statement.nx + statement.ne
+    before, after = ca.MX.sym("before", size), ca.MX.sym("after", size)
+    interval = Interval.symbols(statement, ca.MX)
+    if not statement.behind:
+        _, fine, _ = full_interval(statement, count, step, solver)(before, *interval)
+        return ca.Function("inside", [before, after, *interval], [ca.horzcat(before, fine)])
+    x = ca.horzcat(before[:nx], nominal_interval(statement, count, step)(before[:nx], *interval)[1])
+    ahead, behind = statement.entries(statement.ahead), statement.entries(statement.behind)
+    first, last = [before[nx:][ahead]], [after[nx:][behind]]
+    gathered = [before[nx:][statement.entries(statement.summed), :]]
+    forward, backward = (matrices_step(statement, which, step, solver) for which in (statement.ahead, statement.behind))
+    parts = [interval.part(j / count, (j + 1) / count) for j in range(count)]
+    for j in range(count):
+        first.append(forward(first[-1], x[:, j], x[:, j + 1], *parts[j]))
+        if statement.summed:
+            gather = gathering_step(statement, step, solver)
+            gathered.append(gathered[-1] + gather(*first[-2:], x[:, j], x[:, j + 1], *parts[j]))
+    for j in range(count - 1, -1, -1):
+        last.append(backward(last[-1], x[:, j + 1], x[:, j], *parts[j].turned()))
+    rows = [ca.horzcat(*first), ca.horzcat(*last[::-1])]
+    if statement.summed:
+        rows.append(ca.horzcat(*gathered))
+    e = in_order(statement, *rows)
+    return ca.Function("inside", [before, after, *interval], [ca.vertcat(x, e)])
