@@ -21,7 +21,7 @@ def fine_trajectory(extremal: Extremal, substeps: int) -> Array:
     Returns:
         x and e stacked at the starts of the substeps and at the end, (N, substeps + 1, nx + ne).
     """
-    mesh = replace(extremal.mesh, points=1, substeps=1)  # of which nothing else is seen
+    mesh = replace(extremal.mesh, points=1)
     return _inside(extremal.statement, mesh, extremal.trajectory, tuple(extremal.parameters.tolist()), substeps)
 
 

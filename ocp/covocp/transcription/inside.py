@@ -34,7 +34,7 @@ def inside_intervals(
 
     Args:
         statement: the problem.
-        mesh: of it; its substeps are not seen.
+        mesh: of it.
         nodes: x and e stacked at the nodes, (N + 1, nx + ne).
         u: control values, (N + 1 or N, nu).
         duration: terminal time [s].
@@ -55,8 +55,7 @@ def inside_intervals(
         return np.ascontiguousarray(inside.T).reshape(n, count + 1, nodes.shape[1])
     result = np.empty((n, count + 1, nodes.shape[1]))
     result[:, 0], result[:, -1] = nodes[:-1], nodes[1:]
-    advance = nominal_interval(st, count, mesh.step).map(n)
-    result[:, 1:, : st.nx] = np.asarray(advance(nodes[:-1, : st.nx].T, *common)[1].full()).T.reshape(n, count, st.nx)
+    result[:, 1:, : st.nx] = _states(st, mesh, nodes[:-1, : st.nx], common, count)
     most = max(NUMERIC_ENTRIES // (8 * st.ne * count), 1)  # H of all steps takes memory
     for first in range(0, n, most):
         span = slice(first, min(first + most, n))
@@ -69,6 +68,17 @@ def _alone(statement: Statement) -> bool:
     everything = statement.ahead + statement.behind
     plain = not statement.coupled and not statement.summed and statement.samples is None
     return plain and not fed(statement, everything)
+
+
+def _states(statement: Statement, mesh: Mesh, starts: Array, common: Interval, count: int) -> Array:
+    """The nominal at the ends of the substeps, (N, count, nx), by the function of the transcription where it divides."""
+    n, own = mesh.intervals, mesh.substeps if count % mesh.substeps == 0 else count
+    advance, parts = Matrices(nominal_interval(statement, own, mesh.step).map(n)), count // own
+    values, x = [], starts.T
+    for j in range(parts):
+        x, fine, _ = advance.evaluated(x, *common.part(j / parts, (j + 1) / parts))
+        values.append(fine.T.reshape(n, own, statement.nx))
+    return np.concatenate(values, axis=1)
 
 
 def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Interval) -> None:
