@@ -43,9 +43,10 @@ from covocp.extremal.slope_terms import slope_sizes, slope_terms
 from covocp.passage.sweep import passed_by
 from covocp.statement.interval import Interval, repeated
 from covocp.statement.statement import Statement
+from covocp.transcription.inside import inside_interval
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.shooting import interval_columns, matrices_along
-from covocp.transcription.steps import full_interval, inside_interval, nominal_interval
+from covocp.transcription.steps import full_interval, nominal_interval
 from covocp.transcription.trajectory import at_nodes
 
 # Scalar operations of the rates, times the steps in an interval, above which functions are not written out in them.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -71,7 +72,7 @@ def _alone(statement: Statement) -> bool:
 
 
 def _states(statement: Statement, mesh: Mesh, starts: Array, common: Interval, count: int) -> Array:
-    """The nominal at the ends of the substeps, (N, count, nx), by the function of the transcription where it divides."""
+    """The nominal at the ends of the substeps, (N, count, nx), by the steps of the mesh where these divide them."""
     n, own = mesh.intervals, mesh.substeps if count % mesh.substeps == 0 else count
     advance, parts = Matrices(nominal_interval(statement, own, mesh.step).map(n)), count // own
     values, x = [], starts.T
@@ -114,7 +115,7 @@ def _entries(statement: Statement, index: int, step: StepKind) -> tuple[ca.Funct
     function = gauss_points(statement, index, step)
     one, two = (function.sparsity_out(i) for i in range(2))
     if one != two:
-        symbols = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+        symbols: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
         outputs = [ca.project(value, one + two) for value in function.call(symbols)]
         function = ca.Function(function.name(), symbols, outputs)
     rows, columns = function.sparsity_out(0).get_triplet()
