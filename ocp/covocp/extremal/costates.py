@@ -161,8 +161,7 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     weights = jumps[:, nx:].copy()
     weights[-1] = last_e
     weights[-1, behind] = direct
-    given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
-    by_x, by_u, by_duration, kicks = (v.T for v in passage_slopes(st, mesh).evaluated(*given))
+    by_x, by_u, by_duration, kicks = _through_passages(extremal, weights)
     kicks[-1, behind] -= direct
     kicks[:, behind] *= -1.0
     last_x, by_x[-1] = last_x + by_x[-1], 0.0  # x(T) also acts through the matrices that start there
@@ -184,9 +183,15 @@ def without_passage(extremal: Extremal) -> Extremal:
     weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)
     weights[-1, behind] -= m.final_matrices[behind]
-    given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T)
-    through = passage_slopes(st, fine.mesh).evaluated(*given)[0][:, -1]
+    through = _through_passages(fine, weights)[0][-1]
     return replace(extremal, multipliers=replace(m, final=m.final - through))
+
+
+def _through_passages(extremal: Extremal, weights: Array) -> tuple[Array, ...]:
+    """What `passage_slopes` gives along an extremal for weights of the half-vectors (N + 1, ne), the node first."""
+    t = extremal.trajectory
+    given = (t.x.T, t.u.T, t.duration, extremal.parameters, t.e[0], weights.T, np.zeros_like(weights.T))
+    return tuple(v.T for v in passage_slopes(extremal.statement, extremal.mesh).evaluated(*given))
 
 
 def passage_end(extremal: Extremal, given: Array) -> tuple[Array, float, Array]:
@@ -214,8 +219,8 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> Matrices:
 
     Returns:
         (states at the nodes, controls, T, parameters, half-vectors at the start, weights of the half-vectors at the
-        nodes) -> slopes of int L dt + weights . half-vectors by the states at the nodes, the controls, T, and by kicks
-        at the nodes.
+        nodes, kicks there) -> slopes of int L dt + weights . half-vectors by the states at the nodes, the controls, T,
+        and by the kicks. These are zero: they stand for what the slopes are taken by.
     """
     n = mesh.intervals
     x, u = ca.MX.sym("x", statement.nx, n + 1), ca.MX.sym("u", statement.nu, mesh.control_nodes)
@@ -227,9 +232,7 @@ def passage_slopes(statement: Statement, mesh: Mesh) -> Matrices:
     e, matrix_cost = matrices_along(statement, mesh, x, states, common, p, e0, kicks, passage=passed_by)
     value = ca.sum2(cost + matrix_cost) + ca.dot(weights, e)
     slopes = slopes_by(value, (x, u, duration, kicks))
-    inner = ca.Function("inner", [x, u, duration, p, e0, weights, kicks], slopes)
-    values: Any = inner(x, u, duration, p, e0, weights, ca.DM.zeros(*kicks.shape))
-    return Matrices(ca.Function("passage_slopes", [x, u, duration, p, e0, weights], list(values)))
+    return Matrices(ca.Function("passage_slopes", [x, u, duration, p, e0, weights, kicks], slopes))
 
 
 def backward_pair(statement: Statement, *, cost: bool = True, matrices: bool = True) -> ca.Function:
