@@ -89,6 +89,17 @@ def test_a_saddle_that_a_run_ended_at_is_left_and_told(made, best, method):
 
 @pytest.mark.usefixtures("from_guesses")
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("made", "best"), [(decided, -2.4), (begun, best_start())])
+def test_a_saddle_that_the_best_of_several_starts_ended_at_is_left_and_told(made, best, method):
+    options = {"method": method, "guess": "multistart", "starts": 0, "progress": False}
+    with pytest.warns(co.CovocpWarning, match="ended at a saddle"):
+        solution = co.solve(made(), **options)
+    assert solution.cost == pytest.approx(REGULATED + best, abs=1e-5)
+    assert len(solution.stats["starts"]) == 1  # what is told of the starts is kept
+
+
+@pytest.mark.usefixtures("from_guesses")
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("made", [decided, begun])
 def test_a_saddle_that_is_not_left_is_told(made, method, monkeypatch):
     monkeypatch.setattr(other_minima, "CHEAPER", np.inf)  # no other end is cheap enough

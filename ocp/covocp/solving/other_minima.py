@@ -43,13 +43,17 @@ CHEAPER = 1e-9
 # at a node, where the cost is concave in it.
 HARDLY = 1e-5
 
+# Among the counts of a run what is told of several starts.
+OF_STARTS = ("starts", "asked")
 # What is looked for.
 SADDLE, TURNS = "the run ended at a saddle", "angles turn full circle between its nodes"
 
 Looked = TypeVar("Looked", Outcome, ChainOutcome)
 
 
-def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
+def away_from_saddle(
+    prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess | None
+) -> Outcome:
     """Where a run ended as soon, or where, it began, or saw a negative curvature, look at it; leave a saddle along it.
 
     The look takes no longer than what else is looked at after a run, nor than a limit of the time leaves. Where it
@@ -60,7 +64,7 @@ def away_from_saddle(prepared: Prepared, outcome: Outcome, values: Array, report
         outcome: of it.
         values: of the parameters.
         reporter: of iterations.
-        start: of the run.
+        start: of the run; None: of the best of several, which is looked at however it ended.
     """
     return unless_it_fails(outcome, SADDLE, lambda: _off_saddle(prepared, outcome, values, reporter, start))
 
@@ -83,14 +87,11 @@ def unless_it_fails(outcome: Looked, what: str, look: Callable[[], Looked]) -> L
         return outcome
 
 
-def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess) -> Outcome:
+def _off_saddle(
+    prepared: Prepared, outcome: Outcome, values: Array, reporter: Progress, start: Guess | None
+) -> Outcome:
     """What `away_from_saddle` returns."""
-    iterations = outcome.stats.get("iterations", -1)
-    exact = outcome.stats.get("hessian") == "exact"
-    few = iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0)
-    suspicious = few or bool(outcome.stats.get("concave")) or _stayed(start.trajectory, outcome.extremal)
-    suspicious = suspicious or _start_stayed(start, outcome.extremal)
-    if not outcome.converged or not suspicious or reporter.stop:
+    if not outcome.converged or reporter.stop or not (start is None or _suspicious(outcome, start)):
         return outcome
     left, longer = reporter.left[0], longest(outcome.stats)
     seconds = longer if left is None else min(left, longer)
@@ -115,7 +116,7 @@ def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: P
             mention_saddle(curvature.value / curvature.largest)
         return outcome
     best = min(better, key=cost_of)
-    together = counted(outcome, best)
+    together = counted(outcome, best) | {name: outcome.stats[name] for name in OF_STARTS if name in outcome.stats}
     if cost_of(outcome) - cost_of(best) <= HARDLY * abs(cost_of(outcome)):
         if curvature.start.any():
             _mention_left(best, seconds)
@@ -124,6 +125,17 @@ def _off_saddle(prepared: Prepared, outcome: Outcome, values: Array, reporter: P
         "The run ended at a saddle (negative curvature of the reduced Hessian); it was left along that direction."
     )
     return with_stats(best, **together, left_saddle=True)
+
+
+def _suspicious(outcome: Outcome, start: Guess) -> bool:
+    """Whether a run ended as soon, or where, it began, or saw a negative curvature."""
+    iterations = outcome.stats.get("iterations", -1)
+    exact = outcome.stats.get("hessian") == "exact"
+    if iterations <= SUSPICIOUS_ITERATIONS and (start.warm or not exact or iterations <= 0):
+        return True
+    if outcome.stats.get("concave") or _stayed(start.trajectory, outcome.extremal):
+        return True
+    return _start_stayed(start, outcome.extremal)
 
 
 def _mention_left(outcome: Outcome, seconds: float) -> None:

@@ -238,6 +238,8 @@ class Solver:
                 if isinstance(guess, str):
                     guesses = random_guesses(self._solved, self._prepared.mesh, values, starts, seed)
                     outcome, first = best_of(self._prepared, values, guesses, starts + 1, reporter), None
+                    if assess:
+                        outcome = away_from_saddle(self._prepared, outcome, values, reporter, None)
                 else:
                     best, own = self._best, self._problem
                     started = partial(
