@@ -152,7 +152,7 @@ def _costates_of_passages(extremal: Extremal) -> tuple[Costates, Array, float]:
     The costates of the matrices are the slopes of the Lagrangian by kicks at the nodes, had in one reverse sweep over
     both passages; what they say of the nominal enters its own adjoint as impulses at the nodes.
     """
-    st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
+    st, t = extremal.statement, extremal.trajectory
     nx = st.nx
     jumps = impulses(extremal)
     last_x, last_e = terminal_costates(extremal)
@@ -178,7 +178,6 @@ def without_passage(extremal: Extremal) -> Extremal:
     if st.matrix_end is None or not st.matrix_end.jac_sparsity(0, 0).nnz():
         return extremal
     fine = refined(extremal)
-    t = fine.trajectory
     weights = impulses(fine)[:, st.nx :]
     weights[-1] = terminal_costates(fine)[1]
     behind = st.entries(st.behind)

@@ -37,6 +37,7 @@ from covocp.solving.elsewhere import Elsewhere
 from covocp.solving.elsewhere import later as later_of
 from covocp.solving.exact_rows import made_ready
 from covocp.solving.failure import failure
+from covocp.solving.farther import in_larger_units
 from covocp.solving.gain_start import GainStart, beyond, gain_first, with_best_gain_problems, with_gain_told
 from covocp.solving.loosened import PATIENCE, tightened
 from covocp.solving.methods import check_method, divided_options, method_options
@@ -283,6 +284,11 @@ class Solver:
                 raise
             mention_left(error)
             return self._from_given(values, gain_start, None, reporter, assess=assess)
+        outcome, prepared = in_larger_units(
+            lambda: self._ready(self._options), self._prepared, outcome, values, reporter, start
+        )
+        if prepared is not self._prepared:
+            self._keep(self._options, prepared)
         return away_from_saddle(self._prepared, outcome, values, reporter, start) if assess else outcome, first
 
     def _from_start(

@@ -36,6 +36,7 @@ from covocp.transcription.first_guess import (
 )
 from covocp.transcription.held import Held, aim, excited, in_moving_units, preferred, too_dear
 from covocp.transcription.mesh import Mesh, Options, explicit_substeps
+from covocp.transcription.noticed import looks_wrong, noticed_units
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
 from covocp.transcription.steering import Run, resampled, steer, track
@@ -277,7 +278,7 @@ def _held(statement: Statement, mesh: Mesh, values: tuple[float, ...]) -> Held |
     if aimed is None:
         return None
     run = in_moving_units(run, line, flat)
-    bend = (bent - flat) * np.where(_untold(statement, flat), run.units, 1.0)
+    bend = (bent - flat) * np.where(untold_controls(statement, flat), run.units, 1.0)
     return excited(run, line, aimed, flat, bend)
 
 
@@ -324,7 +325,7 @@ def _bent(run: Run, bent: Array, flat: Array, units: Array) -> tuple[Array, bool
 
 def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Array) -> Array:
     """Units of the controls (nu,) of which neither scale, bounds nor guess say any, by what they move; 1 of others."""
-    untold = _untold(statement, flat)
+    untold = untold_controls(statement, flat)
     start, e0 = starts(statement, mesh, parameters)
     if not untold.any() or statement.coupled or not np.isfinite(start).all():
         return np.ones(statement.nu)
@@ -336,10 +337,13 @@ def untold_units(statement: Statement, mesh: Mesh, parameters: Array, flat: Arra
     )
     units = moving_units(statement, mesh, still, parameters)
     far = (units > FAR_UNIT) | (units < 1.0 / FAR_UNIT)
-    return np.where(untold & far, units, 1.0)
+    units = np.where(untold & far, units, 1.0)
+    if looks_wrong(statement, start, e0, flat[0], units[untold], parameters):
+        units = noticed_units(base_run(statement, mesh, parameters, start, flat), flat, units, untold)
+    return units
 
 
-def _untold(statement: Statement, flat: Array) -> NDArray[np.bool_]:
+def untold_controls(statement: Statement, flat: Array) -> NDArray[np.bool_]:
     """Controls of which neither scale, bounds nor guess say a unit, (nu,)."""
     untold = np.zeros(statement.nu, dtype=bool)
     for block in statement.controls:
