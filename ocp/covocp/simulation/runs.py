@@ -33,6 +33,7 @@ from covocp.simulation.stretch import (
     tell_missing,
     true_cost,
 )
+from covocp.simulation.unseen import seeing
 from covocp.simulation.workers import simulate_batches
 from covocp.solution.phases import PhasesSolution, check_begins
 from covocp.solution.solution import Solution
@@ -132,6 +133,7 @@ def simulate(
     if truth is not None:
         check_truth(solution.extremal, actual.statement, actual.parameters, actual.variance)
     base = base_grid(solution, store, step, None if flown is None else flown.times)
+    base = seeing(solution, design, actual, base, runs)
     expected = predict(solution, design, design, base)
     true = expected if truth is None else predict(solution, design, actual, base)
     setting = Setting(
