@@ -22,6 +22,9 @@ from covocp.statement.names import name_of
 from covocp.statement.statement import Statement
 
 Reading = Literal["end", "mean"]
+# Share of the noise of a mean that is in what is expected of it: neither this nor the rest is singular then, as the
+# information form needs them. Their sum alone counts.
+AVERAGED = 0.5
 # Values of decisions by symbol or name.
 Decided = Mapping[Any, Any] | None
 
@@ -115,7 +118,8 @@ def _sampled(
     value, density = system.measured(own, t, u)
     read, variance = system.read(own, t, u)
     y = type(x).sym("y", value.shape[0] + read.shape[0])
-    expected = (ca.vertcat(mean if means else value, read), ca.diagcat(density / step, variance))
+    noise_left = ca.diagcat((1.0 - AVERAGED if means else 1.0) * density / step, variance)
+    expected = (ca.vertcat(mean if means else value, read), noise_left)
     after = corrected_by(z, S, y, expected, form, missing, geometry) if y.shape[0] else [z, S]
     after = [ca.vertsplit(after[0], [0, x.shape[0], z.shape[0]])[0], after[1][:n, :n]]
     return (
@@ -234,14 +238,15 @@ class _System:
         return value, variance
 
     def averaging(self, count: int, step: float) -> tuple[ca.Function, ca.Function]:
-        """Rate and process noise with the means of so many measured values over a step below the state."""
+        """Rate and process noise with the means of measured values below, `AVERAGED` of their noise in them."""
         if not count:
             return self.rate, self.noise
         x, _, u, t = self.symbols
         z = type(x).sym("x", x.shape[0] + count)
         own = ca.vertsplit(z, [0, x.shape[0], z.shape[0]])[0]
-        rate = ca.vertcat(self.rate(own, t, u), self.measured(own, t, u)[0] / step)
-        noise = ca.diagcat(self.noise(own, t, u), type(x)(count, count))
+        value, density = self.measured(own, t, u)
+        rate = ca.vertcat(self.rate(own, t, u), value / step)
+        noise = ca.diagcat(self.noise(own, t, u), AVERAGED * density / step**2)
         functions = [ca.Function(name, [z, t, u], [ca.densify(v)]) for name, v in (("rate", rate), ("noise", noise))]
         return functions[0], functions[1]
 

@@ -99,8 +99,8 @@ def simulate(
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
         filter: "perturbation" (gains of the design, about the nominal) or "extended" (relinearised at the estimate);
             a law has its own.
-        step: longest integration step [s]; None: halved until the terminal second moments change by less than a fifth
-            of their sampling error.
+        step: longest integration step [s], shorter where loop, filter or the model with the time are faster; None:
+            halved until the terminal second moments change by less than a fifth of their sampling error.
         limits: what the actual control can do: None (no limits: the bounds of the problem are those of the nominal),
             "bounds" (those of the problem), or a dict of control to (lower, upper), the others without limits. The
             share of runs that ask for more is reported in each case.
