@@ -39,7 +39,7 @@ def seeing_steps(control: ca.Function, start: Array, times: Array, steps: int) -
     if blind:
         warn_user(
             f"The law changes with the time faster than steps of {times[1] / steps:.2g} s see: runs with noise may "
-            "take one place of its period for all. Put its mean in its place, or give step=, shorter than a quarter of it."
+            "take one place of its period for all. Put its mean in its place, or give step=, below a quarter of it."
         )
     return steps if steps == given or blind else steps * MARGIN
 
