@@ -133,3 +133,41 @@ def test_what_has_no_filter():
         extended_filter(ocp)
     with pytest.raises(co.ProblemError, match="step is not positive"):
         extended_filter(lag(), step=0.0)
+
+
+def test_a_mean_is_compared_with_the_mean():
+    """dx = u + n, exactly: x moves by u h, its mean is half of that behind; their covariances by integrals of h - s."""
+    p, Q, U, h, u, reading = 0.5, 0.3, 0.02, 0.4, 2.0, 1.7
+    ocp = co.Problem(1.0)
+    x, control = ocp.state("x", initial=1.0, variance=p), ocp.control("u")
+    ocp.dynamics(x, control, noise=Q)
+    ocp.measurement("m", x, noise=U)
+    ocp.minimize(running=control**2)
+    predict, update = extended_filter(ocp, step=h, reading="mean")
+    x, P = update(*predict(1.0, p, u, 0.0), reading, u, h)
+    own, across, mean = p + Q * h, p + Q * h / 2, p + Q * h / 3 + U / h
+    assert float(x) == pytest.approx(1.0 + u * h + across / mean * (reading - 1.0 - u * h / 2), rel=1e-12)
+    assert float(P) == pytest.approx(own - across**2 / mean, rel=1e-12)
+    _, update = extended_filter(ocp, step=h)
+    x, _ = update(1.0 + u * h, own, reading, u, h)
+    assert float(x) == pytest.approx(1.0 + u * h + own / (own + U / h) * (reading - 1.0 - u * h), rel=1e-12)
+
+
+@pytest.mark.parametrize("form", ["joseph", "standard", "sequential", "information"])
+def test_means_of_a_motion_as_predicted_leave_the_estimate_on_it(form):
+    """The means along the nominal itself, by quadrature: what is expected at the end is half a step ahead of them."""
+    problem, u, h = lag(), 0.8, 0.1
+    start, covariance = initial_estimate(problem)
+    end, decay = u / start[1], np.exp(-start[1] * h)
+    moved = end + (start[0] - end) * decay
+    mean = end + (start[0] - end) * (1 - decay) / (start[1] * h)
+    predict, update = extended_filter(problem, step=h, substeps=4, reading="mean", form=form)
+    x, P = update(*predict(start, covariance, u, 0.0), [mean, start[1] * mean + u], u, h)
+    np.testing.assert_allclose(x.full().ravel(), [moved, start[1]], atol=1e-7)
+    assert (np.linalg.eigvalsh(P.full()) > 0).all()
+
+
+def test_what_a_reading_is_fits():
+    for given in ({"reading": "mean"}, {"step": 0.1, "reading": "middle"}):
+        with pytest.raises(co.ProblemError, match="reading"):
+            extended_filter(lag(), **given)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import mapped
@@ -42,19 +43,32 @@ def changes_within_steps(extremal: Extremal) -> bool:
 @lru_cache(maxsize=4)
 def _changes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
-        values = _held(statement, mesh, trajectory, np.array(parameters))
-        values = values[np.isfinite(values).all(axis=(1, 2))]  # a model without a value there: the steps tell
+        return bool(turning(_held(statement, mesh, trajectory, np.array(parameters))).any())
+
+
+def turning(values: Array, least: Array | float = 0.0) -> NDArray[np.bool_]:
+    """Which rows of a model rise and fall and rise again in which steps, or the reverse, (steps, rows).
+
+    Args:
+        values: at the places in each step, (steps, places, rows); a step without a value there turns nothing.
+        least: change of each row in a step below which it is no turn, (rows,), beside what is little anyway.
+    """
+    turned = np.zeros((values.shape[0], values.shape[2]), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        known = np.isfinite(values).all(axis=(1, 2))  # a model without a value there: the steps tell
+        values = values[known]
         if not values.size:
-            return False
+            return turned
         change = np.ptp(values, axis=1)
-        least = np.maximum(COUNTS * change.max(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
+        little = np.maximum(COUNTS * change.max(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
         steps = np.diff(values, axis=1)
         moves = np.sign(np.where(np.abs(steps) > TURN * change[:, None], steps, 0.0))
     turns, last = np.zeros(change.shape), np.zeros(change.shape)
     for move in moves.swapaxes(0, 1):
         turns += move * last < 0
         last = np.where(move != 0, move, last)
-    return bool(((turns >= TURNS) & (change > least)).any())
+    turned[known] = (turns >= TURNS) & (change > np.maximum(little, least))
+    return turned
 
 
 def _held(statement: Statement, mesh: Mesh, t: Trajectory, parameters: Array) -> Array:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, overload
+from typing import Any, Literal, get_args, overload
 
 import casadi as ca
 import numpy as np
 
 from covocp.base.checks import check_kind, column
 from covocp.base.errors import ProblemError
+from covocp.base.geometry import Geometry
 from covocp.base.matrices import Array, unpack
 from covocp.blocks.bucy import time_step
 from covocp.blocks.extended import Estimated, bucy_slopes, corrected_by, propagated
@@ -20,6 +21,10 @@ from covocp.problem.rates import process_noise
 from covocp.statement.names import name_of
 from covocp.statement.statement import Statement
 
+Reading = Literal["end", "mean"]
+# Share of the noise of a mean that is in what is expected of it: neither this nor the rest is singular then, as the
+# information form needs them. Their sum alone counts.
+AVERAGED = 0.5
 # Values of decisions by symbol or name.
 Decided = Mapping[Any, Any] | None
 
@@ -36,6 +41,7 @@ def extended_filter(
     substeps: int = 1,
     form: Form = "joseph",
     missing: Missing = "raise",
+    reading: Reading = "end",
     duration: float | None = None,
     decisions: Decided = None,
 ) -> tuple[ca.Function, ca.Function]: ...
@@ -46,6 +52,7 @@ def extended_filter(
     substeps: int = 1,
     form: Form = "joseph",
     missing: Missing = "raise",
+    reading: Reading = "end",
     duration: float | None = None,
     decisions: Decided = None,
 ) -> ca.Function | tuple[ca.Function, ca.Function]:
@@ -54,7 +61,10 @@ def extended_filter(
     The estimate of an attitude is its quaternion, which is corrected by rotations (the multiplicative filter).
 
     Continuous: the Kalman-Bucy filter with slopes at the estimate [Schmidt 2.5-3]. Discrete: the same model sampled
-    (item 8); a reading is the mean of the measurement over a step, so its noise has the covariance density / step.
+    (item 8); the noise of a reading, that of the measurement averaged over a step, has the covariance density / step.
+    What else a reading is has to be said: by default the value that is measured at the end of the step, else the mean
+    over the step, as `simulate` tells it to a law. Half a step of the motion lies between the two, which the filter
+    would take for an error of its estimate.
     What is measured at instants is read at the end of a step, with its variance, in the rows below the others; NaN
     where nothing is. What is read at time zero is an update before the first step.
 
@@ -64,12 +74,15 @@ def extended_filter(
         substeps: of a step.
         form: of the update, see `kalman.update`.
         missing: "raise": readings are trusted, "skip": a row that is NaN is no measurement.
+        reading: what a reading is compared with: "end": the value expected at the end of the step, "mean": the mean
+            expected over the step. Estimate and covariance between predict and update then have rows for that mean
+            below the others: each prediction is followed by an update, all NaN where nothing was measured.
         duration: T [s], where it is free and the system depends on it; None: its guess.
         decisions: their values by symbol or name; needed where there are any.
 
     Returns:
         Continuous: (x, P, u, y, t) -> dx/dt, dP/dt. Discrete: predict (x, P, u, t) -> x, P a step later, with t at the
-        start of it, and update (x, P, y, u, t) -> x, P after the reading.
+        start of it, and update (x, P, y, u, t) -> x, P after the reading, with t at the end.
 
     Raises:
         ProblemError: no `Problem` or an incomplete one, dynamics that depend on matrices, a step that is not positive,
@@ -77,25 +90,53 @@ def extended_filter(
     """
     system = _System(problem, duration, decisions)
     _check_instants(problem, step, missing)
+    _check_reading(reading, step)
     x, P, u, t = system.symbols
-    none = (type(x)(0, 1), type(x)(0, 0))
-    value, density = none if system.measurement is None else system.measurement(x, t, u)
-    read, variance = none if system.samples is None else system.samples(x, t, u)
-    readings = value.shape[0] + read.shape[0]
-    y = type(x).sym("y", readings)
-    names = ["estimate", "covariance"]
     if step is None:
+        value, density = system.measured(x, t, u)
+        y = type(x).sym("y", value.shape[0])
         process = (system.rate(x, t, u), system.noise(x, t, u))
         slopes = bucy_slopes(x, P, y, process, (value, density), system.geometry)
         return ca.Function("rate", [x, P, u, y, t], slopes, ["x", "P", "u", "y", "t"], ["dx", "dP"])
-    length = time_step(step)
-    ahead = propagated(system.rate, system.noise, Estimated(x, P, t, u), length, substeps, system.geometry)
-    reading = (ca.vertcat(value, read), ca.diagcat(density / length, variance))
-    after = corrected_by(x, P, y, reading, form, missing, system.geometry) if readings else [x, P]
+    return _sampled(system, time_step(step), substeps, form, missing, means=reading == "mean")
+
+
+def _sampled(
+    system: _System, step: float, substeps: int, form: Form, missing: Missing, *, means: bool
+) -> tuple[ca.Function, ca.Function]:
+    """Prediction and update; with means the measurement is integrated beside the state, as another one of its rows."""
+    x, P, u, t = system.symbols
+    names = ["estimate", "covariance"]
+    count, n = system.measured(x, t, u)[0].shape[0] if means else 0, P.shape[0]
+    start = Estimated(ca.vertcat(x, type(x).zeros(count)), ca.diagcat(P, type(x)(count, count)), t, u)
+    geometry = Geometry.stacked(system.geometry, count) if count else system.geometry
+    rate, noise = system.averaging(count, step)
+    ahead = propagated(rate, noise, start, step, substeps, geometry)
+    # between prediction and update
+    z, S = type(x).sym("x", x.shape[0] + count), type(x).sym("P", n + count, n + count)
+    own, mean = ca.vertsplit(z, [0, x.shape[0], z.shape[0]])
+    value, density = system.measured(own, t, u)
+    read, variance = system.read(own, t, u)
+    y = type(x).sym("y", value.shape[0] + read.shape[0])
+    noise_left = ca.diagcat((1.0 - AVERAGED if means else 1.0) * density / step, variance)
+    expected = (ca.vertcat(mean if means else value, read), noise_left)
+    after = corrected_by(z, S, y, expected, form, missing, geometry) if y.shape[0] else [z, S]
+    after = [ca.vertsplit(after[0], [0, x.shape[0], z.shape[0]])[0], after[1][:n, :n]]
     return (
         ca.Function("predict", [x, P, u, t], ahead, ["x", "P", "u", "t"], names),
-        ca.Function("update", [x, P, y, u, t], after, ["x", "P", "y", "u", "t"], names),
+        ca.Function("update", [z, S, y, u, t], after, ["x", "P", "y", "u", "t"], names),
     )
+
+
+def _check_reading(reading: Reading, step: float | None) -> None:
+    """What a reading is has a meaning where there are steps."""
+    if reading not in get_args(Reading) or (reading == "mean" and step is None):
+        raise ProblemError(
+            "What a reading is does not fit.",
+            expected="reading='end', or 'mean' with a step",
+            received=f"reading={reading!r}, step={step}",
+            remedy="leave reading= out for the continuous filter, or give step=",
+        )
 
 
 def _check_instants(problem: Problem, step: float | None, missing: Missing) -> None:
@@ -181,6 +222,33 @@ class _System:
         if statement.samples is not None:
             read, _, variance = statement.samples.measurement(*at)
             self.samples = ca.Function("samples", [x, t, u], [read, variance])
+
+    def measured(self, x: Any, t: Any, u: Any) -> tuple[Any, Any]:
+        """What is measured all the time, and the density of its noise; there may be nothing."""
+        if self.measurement is None:
+            return type(x)(0, 1), type(x)(0, 0)
+        value, density = self.measurement(x, t, u)
+        return value, density
+
+    def read(self, x: Any, t: Any, u: Any) -> tuple[Any, Any]:
+        """What is read at instants, and its variance; there may be nothing."""
+        if self.samples is None:
+            return type(x)(0, 1), type(x)(0, 0)
+        value, variance = self.samples(x, t, u)
+        return value, variance
+
+    def averaging(self, count: int, step: float) -> tuple[ca.Function, ca.Function]:
+        """Rate and process noise with the means of measured values below, `AVERAGED` of their noise in them."""
+        if not count:
+            return self.rate, self.noise
+        x, _, u, t = self.symbols
+        z = type(x).sym("x", x.shape[0] + count)
+        own = ca.vertsplit(z, [0, x.shape[0], z.shape[0]])[0]
+        value, density = self.measured(own, t, u)
+        rate = ca.vertcat(self.rate(own, t, u), value / step)
+        noise = ca.diagcat(self.noise(own, t, u), AVERAGED * density / step**2)
+        functions = [ca.Function(name, [z, t, u], [ca.densify(v)]) for name, v in (("rate", rate), ("noise", noise))]
+        return functions[0], functions[1]
 
 
 def _statement(problem: Problem) -> Statement:

@@ -5,10 +5,9 @@ For laws that are functions of an estimate and of time, as the blocks make them;
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -26,20 +25,13 @@ from covocp.base.threads import one_at_a_time
 from covocp.blocks import kalman, values
 from covocp.blocks.algebraic import root
 from covocp.simulation.divergence import farthest, in_range
+from covocp.simulation.integrated import TURNED, Piece, integrated
+from covocp.simulation.law_steps import Lost, seeing_steps
 from covocp.simulation.vectorised import Columns, padded, vectorise
 
 Array = NDArray[np.float64]
 # A casadi.Function, or a Python function of arrays that returns an array.
 LawFunction = Callable[..., Any]
-
-# Error of a step without noise, relative and, for entries near zero, absolute.
-TOLERANCE = 1e-9
-# After so many steps in a row that do not move the time, it is moved by its rounding: a jump of the law lies there, or
-# a finite escape. So often at most, which a law that always jumps would go on for ever.
-STALLED, MOVED = 100, 100
-# A rate that changes by this share over the rounding of the time cannot be followed; it belongs to a finite escape
-# where the state grows by this share over it.
-TURNED, ESCAPING = 0.5, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +116,8 @@ def simulate_law(
 
     Without `runs` there is no noise, and scipy integrates with an error of 1e-9 a step. With `runs` all the functions
     must be casadi.Functions: white noise is held over steps of classical Runge-Kutta, all runs at once.
+    A run ends before its time, with a warning, where the loop has no value any more or where a law chatters: switches
+    back and forth without end.
 
     Args:
         plant: (x, u) -> dx/dt, shape (n,).
@@ -135,7 +129,7 @@ def simulate_law(
         samples: K, number of times, from 0 to the duration.
         breaks: times at which the law or its derivatives jump [s].
         runs: number of runs; None: one without noise.
-        step: of the runs with noise, at most [s].
+        step: of the runs with noise, at most [s]; shorter where the law changes with the time faster.
         process_noise: power spectral density, (n, n), or a number times the identity.
         measurement_noise: power spectral density, (p, p), or a number times the identity.
         seed: of the noise.
@@ -316,7 +310,9 @@ def _accurate(loop: _Loop, initial: Array, times: Array, breaks: list[float]) ->
     for begin, end in pairwise([0.0, *breaks, float(times[-1])]):
         inside = np.flatnonzero((times > begin) & (times <= end))
         grid = np.unique(np.append(times[inside], end))
-        found = _integrated(slope, begin, state, grid, lambda state: bool(in_range(state, loop.size, limit)))
+        piece = integrated(slope, begin, state, grid, lambda state: bool(in_range(state, loop.size, limit)))
+        _tell_end(loop, control, piece)
+        found = piece.states
         reached = min(len(found), inside.size)
         states[inside[:reached]] = found[:reached]
         if len(found) < grid.size:
@@ -329,45 +325,43 @@ def _accurate(loop: _Loop, initial: Array, times: Array, breaks: list[float]) ->
     return loop.simulation(times, states, controls)
 
 
-def _integrated(
-    slope: Callable[[float, Array], Array], begin: float, state: Array, grid: Array, goes_on: Callable[[Array], bool]
-) -> Array:
-    """States at the times of a grid, (K, total), by LSODA; fewer rows where the run ends before."""
-    from scipy.integrate import LSODA
-
-    end = float(grid[-1])
-    solver = LSODA(slope, begin, state, end, rtol=TOLERANCE, atol=TOLERANCE)
-    found: list[Array] = []
-    stalled, moved, failed = 0, 0, False
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "lsoda", UserWarning)  # told below, with the time
-        while solver.status == "running" and not failed:
-            failed = solver.step() is not None  # a message
-            if failed or not np.isfinite(solver.y).all():
-                break
-            due = grid[len(found) :]
-            due = due[due <= solver.t]
-            rows = list(solver.dense_output()(due).T) if due.size else []
-            found += takewhile(goes_on, rows)
-            if not goes_on(solver.y):
-                break
-            stalled = stalled + 1 if solver.t == solver.t_old else 0
-            if stalled == STALLED:
-                after = float(np.nextafter(solver.t, end))
-                rate = slope(after, solver.y)
-                start = solver.y + (after - solver.t) * rate
-                if not np.abs(slope(after, start) - rate).max() <= TURNED * np.abs(rate).max():
-                    failed = not np.abs(start).max() > (1.0 + ESCAPING) * np.abs(solver.y).max()
-                    break
-                solver = LSODA(slope, after, start, end, rtol=TOLERANCE, atol=TOLERANCE)
-                stalled, moved = 0, moved + 1
-                failed = moved == MOVED
-    if failed:
+def _tell_end(loop: _Loop, control: LawFunction, piece: Piece) -> None:
+    """Warn of a run that ends before its time: where, of what, and what helps."""
+    rest = "The rest is NaN and counts as diverged"
+    if piece.ended == "stalled":
         warn_user(
-            f"The run ends at {solver.t:.6g} s: no step is small enough for the loop that follows. The rest is NaN and "
-            "counts as diverged; call the functions of the loop near that time, or name its jumps in 'breaks'."
+            f"The run ends at {piece.time:.6g} s: no step is small enough for the loop that follows. {rest}; call the "
+            "functions of the loop near that time, or name its jumps in 'breaks'."
         )
-    return np.array(found).reshape(-1, state.size)
+    elif piece.ended == "chatters":
+        before, after = (np.ravel(_value(control, state, t)) for t, state in piece.around)
+        k = int(np.argmax(np.abs(after - before)))
+        jump = f"u[{k}] jumps between {before[k]:.4g} and {after[k]:.4g} and back"
+        if not np.abs(after - before).max() > TURNED * np.abs(after).max():
+            jump = "a rate of the plant or the filter jumps and jumps back"
+        warn_user(
+            f"The run ends at {piece.time:.6g} s: the loop chatters, {jump} faster than the steps follow. {rest}; make "
+            "the jump a steep slope, such as tanh(x / width) for sign(x), or simulate with runs=, whose steps have a "
+            "length."
+        )
+    elif piece.ended == "undefined":
+        (t, state), *_ = piece.around
+        warn_user(
+            f"The run ends at {piece.time:.6g} s: beyond it {_undefined(loop, state, t)}. {rest}; keep what it depends "
+            "on where it has a value, or end the run before (duration=)."
+        )
+
+
+def _undefined(loop: _Loop, state: Array, t: float) -> str:
+    """What of the loop has no value at a state, in words."""
+    u = np.ravel(_value(loop.control, state, t))
+    rate = np.ravel(loop.rate(state, t))
+    names = [f"the rate of x[{i}] (plant)" for i in range(loop.size)]
+    names += [f"the rate of entry {i} of the filter" for i in range(rate.size - loop.size - 1)] + ["the running cost"]
+    values = [(f"u[{i}] (law)", value) for i, value in enumerate(u)] + list(zip(names, rate, strict=True))
+    name, value = next(((name, value) for name, value in values if not np.isfinite(value)), ("the rate", np.nan))
+    where = ", ".join(f"{entry:.4g}" for entry in state[: loop.size][:6])
+    return f"{name} is {value:g} (x = [{where}{', ...' if loop.size > 6 else ''}])"
 
 
 def _noisy(
@@ -380,7 +374,7 @@ def _noisy(
             "law", "casadi.Functions, also in the filter, for runs with noise", "a Python function"
         )
     runs = state.shape[1]
-    steps = int(np.ceil(times[1] / step))
+    steps = seeing_steps(control, state[:, 0], times, int(np.ceil(times[1] / step)))
     h = float(times[1]) / steps
     sizes = [rate.size1_in(i) for i in range(4)]
     advance = vectorise(_function(_runge_kutta(rate, h), sizes), padded(runs), (1,))
@@ -389,14 +383,22 @@ def _noisy(
     first = rate(state[:, 0], 0.0, *(np.zeros(size) for size in sizes[2:])).full().ravel()[: loop.size]
     paces = np.append(first, noises[0].ravel() / np.sqrt(times[-1]))  # of the drift and of the noise
     limit = farthest(state[: loop.size, 0], paces, times[-1])
-    states, given = [state], [_columns(controls, state, times[0])]
+    states, given, lost = [state], [_columns(controls, state, times[0])], Lost(runs)
     for start in times[:-1]:
         for i in range(steps):
             shocks = [root @ generator.standard_normal((len(root), runs)) / np.sqrt(h) for root in noises]
-            state = _columns(advance, state, start + i * h, *shocks)
+            before, state = state, _columns(advance, state, start + i * h, *shocks)
+            lost.look(in_range(before, loop.size, limit) & ~np.isfinite(state).all(axis=0), start + i * h, before)
         state[:, ~in_range(state, loop.size, limit)] = np.nan
         states.append(state)
         given.append(_columns(controls, state, start + steps * h))
+    if lost.count:
+        found = (_undefined(loop, z, t) for z, t in lost.ahead(lambda z, t: np.ravel(loop.rate(z, t)), h))
+        warn_user(
+            f"{lost.count} of {runs} runs become NaN or inf in one step, the first at {lost.time:.6g} s: "
+            f"{next(found, 'the loop has no value there')}. The rest of these runs is NaN and counts as diverged; keep "
+            "what it depends on where it has a value."
+        )
     return loop.simulation(times, np.array(states).transpose(2, 0, 1), np.array(given).transpose(2, 0, 1))
 
 

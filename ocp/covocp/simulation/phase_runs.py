@@ -32,6 +32,7 @@ from covocp.simulation.stretch import (
     sample_of,
     tell_missing,
 )
+from covocp.simulation.unseen import seeing
 from covocp.simulation.workers import Harvest, simulate_batches
 from covocp.solution.phases import PhasesSolution
 
@@ -138,6 +139,7 @@ def _leg(
     """
     solution, design, actual, law = flown.solution[k], flown.designs[k], flown.actual.systems[k], flown.flown[k]
     base = base_grid(solution, request.store, request.step, None if law is None else law.times)
+    base = seeing(solution, design, actual, base, int(request.runs))
     expected = predict(solution, design, design, base, starts[0])
     true = expected if actual is design else predict(solution, design, actual, base, starts[1])
     setting = Setting(

@@ -116,10 +116,14 @@ def predict(
     """
     n = design.size
     joint = _joint(design, actual)
-    rates, step_rates = _fastest_rates(solution, joint, grid, actual, n)
+    parts = grid.parts(np.inf)
+    resolving = grid.divided(parts)
+    rates, step_rates = _fastest_rates(solution, joint, resolving, actual, n)
     fine, resolved = _graded(
-        grid, rates, lambda t, interval: _fastest(_evaluate(solution, joint, t, interval, actual, n)[0])
+        resolving, rates, lambda t, interval: _fastest(_evaluate(solution, joint, t, interval, actual, n)[0])
     )
+    first = np.cumsum(parts) - parts  # of the parts of each step of the grid
+    rates, step_rates = (np.maximum.reduceat(values, first) for values in (rates, step_rates))
     parts = fine.parts(STEP_PER_RATE / np.maximum(resolved, 1e-300), MOST_PARTS)
     fine = fine.divided(parts)
     stiff = fine.h * np.repeat(resolved, parts) > STABLE

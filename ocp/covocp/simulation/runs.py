@@ -33,6 +33,7 @@ from covocp.simulation.stretch import (
     tell_missing,
     true_cost,
 )
+from covocp.simulation.unseen import seeing
 from covocp.simulation.workers import simulate_batches
 from covocp.solution.phases import PhasesSolution, check_begins
 from covocp.solution.solution import Solution
@@ -98,8 +99,8 @@ def simulate(
             None: this process. Runs of a task that fails are named in a warning and in `.failed`; the rest is kept.
         filter: "perturbation" (gains of the design, about the nominal) or "extended" (relinearised at the estimate);
             a law has its own.
-        step: longest integration step [s]; None: halved until the terminal second moments change by less than a fifth
-            of their sampling error.
+        step: longest integration step [s], shorter where loop, filter or the model with the time are faster; None:
+            halved until the terminal second moments change by less than a fifth of their sampling error.
         limits: what the actual control can do: None (no limits: the bounds of the problem are those of the nominal),
             "bounds" (those of the problem), or a dict of control to (lower, upper), the others without limits. The
             share of runs that ask for more is reported in each case.
@@ -132,6 +133,7 @@ def simulate(
     if truth is not None:
         check_truth(solution.extremal, actual.statement, actual.parameters, actual.variance)
     base = base_grid(solution, store, step, None if flown is None else flown.times)
+    base = seeing(solution, design, actual, base, runs)
     expected = predict(solution, design, design, base)
     true = expected if truth is None else predict(solution, design, actual, base)
     setting = Setting(

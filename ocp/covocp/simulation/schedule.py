@@ -37,12 +37,14 @@ class Grid:
     """Steps within the intervals of a mesh.
 
     t: times, (N + 1,); interval: of the mesh, for each step, (N,). share: what a step of no length takes of what is
-        read at its instant, if anything is, (N,); of the others zero.
+        read at its instant, if anything is, (N,); of the others zero. seen: longest step in each that still sees how
+        the model changes with the time [s], (N,); inf where any does.
     """
 
     t: Array
     interval: Any
     share: Array
+    seen: Array
 
     __repr__ = short_repr
 
@@ -63,15 +65,16 @@ class Grid:
         inside = np.arange(step.size) - np.repeat(np.cumsum(counts) - counts, counts)
         starts = self.t[step] + self.h[step] * (inside / counts[step])
         share = self.share[step] / counts[step]
-        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step], share=share)
+        return Grid(t=np.append(starts, self.t[-1]), interval=self.interval[step], share=share, seen=self.seen[step])
 
     def parts(self, length: Given, most: int | None = None) -> Any:
-        """Into how many parts each step must be divided so that none is longer than `length`; into `most` at most.
+        """Into how many parts each step must be divided so that none is longer than `length` or than what sees the
+        model; into `most` at most.
 
         Raises:
             ProblemError: without `most`, too many in all.
         """
-        needed = np.maximum(1.0, np.ceil(self.h / length - WHOLE))
+        needed = np.maximum(1.0, np.ceil(self.h / np.minimum(length, self.seen) - WHOLE))
         if most is not None:
             return np.fmin(needed, most).astype(int)
         if not float(np.sum(needed)) <= MOST_STEPS:
@@ -96,7 +99,7 @@ def base_grid(solution: Solution, points: int, step: float | None = None, sample
     read = np.diff(t) == 0.0
     follow = np.searchsorted(t, t[:-1], side="right") - 1 - np.arange(t.size - 1)  # at the same time
     interval = np.searchsorted(nodes, t[:-1], side="right") - 1 - follow
-    mesh = Grid(t=t, interval=interval, share=read.astype(float))
+    mesh = Grid(t=t, interval=interval, share=read.astype(float), seen=np.full(interval.shape, np.inf))
     parts = mesh.parts(solution.duration / max(1, points - 1))
     return mesh.divided(parts if step is None else np.minimum(parts, mesh.parts(step)))
 

@@ -69,20 +69,22 @@ class StepChoice:
             return "NOT SETTLED: runs leave the domain, and what is fastest takes shorter steps"
         words = f"halving it changes the terminal second moments by {self.change:.2g} of their sampling error"
         if self.given:
-            own = "as given" + (", shorter where loop or filter are faster" if self.shortened else "")
+            own = "as given" + (", shorter where loop, filter or model are faster" if self.shortened else "")
             return own if np.isnan(self.change) else f"{own}; {words}"
         return words if self.settled else f"NOT SETTLED: {words}"
 
 
 def given_step(base: Grid, step: float, rates: Array) -> StepChoice:
-    """Steps of at most the given length, shorter where one would be longer than a time constant.
+    """Steps of at most the given length, shorter where one would be longer than a time constant, or would not see the
+    model change with the time.
 
     Args:
         base: intervals that the steps divide.
         step: [s].
         rates: fastest rate in each of them [1/s].
     """
-    parts, needed = base.parts(step), base.parts(STABLE / np.maximum(rates, np.finfo(float).tiny), MOST_STEPS + 1)
+    parts = replace(base, seen=np.full(base.steps, np.inf)).parts(step)
+    needed = base.parts(STABLE / np.maximum(rates, np.finfo(float).tiny), MOST_STEPS + 1)
     shortened = bool((needed > parts).any())
     parts = np.minimum(np.maximum(parts, needed), np.maximum(parts, MOST_STEPS // base.steps))
     return StepChoice(grid=base.divided(parts), change=np.nan, settled=True, given=True, shortened=shortened)
