@@ -62,7 +62,7 @@ def limit_units(lower: Array, upper: Array) -> Array:
 
 
 def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> Array:
-    """Units of the rows of conditions: those of their limits; where all of these are zero what the variables make of them.
+    """Units of the rows of conditions: those of their limits; where these are zero what the variables make of them.
 
     That is what a row varies by, to first order, if all variables change by their magnitudes: it counts where it is so
     many times, `SILENT`, less or more than one.

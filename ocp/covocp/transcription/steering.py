@@ -34,8 +34,8 @@ SHORT = 50_000
 NO_TIME = 1e-3
 # Smallest singular value, relative to the largest, of directions in which the controls move what is aimed at.
 RANK = 1e-8
-# Where nothing tells the unit of a control, or of a final value, it is one, unless what it moves or is moved by tells so
-# many times more or less. A bend of one would be none where a control is counted in grains, and far away in tons.
+# Where nothing tells the unit of a control, or of a final value, it is one, unless what it moves, or is moved by, tells
+# so many times more or less. A bend of one would be none where a control is counted in grains, and far away in tons.
 FAR_UNIT = 100.0
 
 
