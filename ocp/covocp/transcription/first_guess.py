@@ -313,6 +313,18 @@ def simulate_states(
     statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
 ) -> Array:
     """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
+    values = simulated(statement, mesh, start, e0, u, duration, parameters)
+    if values is not None:
+        return values
+    final = statement.boundary_values(parameters)[1]
+    final = np.where(np.isnan(final), start, final)
+    return np.asarray(start + mesh.nodes[:, None] * (final - start))
+
+
+def simulated(
+    statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
+) -> Array | None:
+    """States at the nodes (N+1, nx) from the controls, within their bounds; None where they diverge."""
     if statement.coupled:
         advance = moving_interval(statement, mesh.substeps, mesh.step)
         columns = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
@@ -322,9 +334,7 @@ def simulate_states(
     if np.isfinite(values).all() and not _diverges(values, statement.boundary_values(parameters)[1]):
         lower, upper = statement.state_bounds
         return np.asarray(np.clip(values, lower, upper))
-    final = statement.boundary_values(parameters)[1]
-    final = np.where(np.isnan(final), start, final)
-    return np.asarray(start + mesh.nodes[:, None] * (final - start))
+    return None
 
 
 def _diverges(values: Array, final: Array) -> bool:

@@ -13,7 +13,7 @@ from covocp.base.matrices import Array, half_indices, unpack
 from covocp.statement.interval import model_symbols
 from covocp.statement.statement import Block, Conditions, Statement
 from covocp.transcription.covariance_steps import KEPT
-from covocp.transcription.first_guess import evaluate_guess, simulate_states
+from covocp.transcription.first_guess import evaluate_guess, simulated
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
 from covocp.transcription.resolution import estimated_rows, resolutions
@@ -242,13 +242,17 @@ def evened(scales: Scales, mesh: Mesh) -> Scales:
 def needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
     """Constant changes of each control that move some state by its scale, to first order; 0 where none does."""
     needed = np.zeros(statement.nu)
-    base = simulate_states(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
+    base = simulated(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
+    if base is None:
+        return needed
 
     def share(i: int, step: float) -> float:
-        """Which part of its scale a step of one control moves some state by, at most."""
+        """Which part of its scale a step of one control moves some state by, at most; inf where that diverges."""
         changed = guess.u.copy()
         changed[:, i] += step
-        moved = simulate_states(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
+        moved = simulated(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
+        if moved is None:
+            return np.inf
         return float((np.abs(moved - base).max(axis=0, initial=0.0) / scale).max(initial=0.0))
 
     for i, size in enumerate(_known_controls(statement, guess).tolist()):
