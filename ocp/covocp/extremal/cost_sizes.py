@@ -20,11 +20,6 @@ ZERO_COST = 1e-30
 # Least share of its size that counts as variable. Solvers compare costs, whose sums are known to some 1e-13: so much is
 # below a residual of 1e-4 of a tenth of it.
 RESOLVED = 1e-8
-# Costs below this share of what changes them, or this, count as zero: a tracking cost whose optimum is zero is known to
-# roundoff only, and no share of it.
-NO_COST = 1e-12
-# From so many times that on nothing else is asked.
-CLEARLY = 1e3
 
 
 @lru_cache(maxsize=4)
@@ -43,22 +38,6 @@ def variable_cost(extremal: Extremal) -> float:
     A constant is no part of it, so that none hides what a wrong decision costs. No more than the size itself: what is
     far from zero, as an altitude above the centre of a planet, would change the cost by more than there is of it.
     """
-    size = absolute_cost(extremal)
-    # its size where it has no second derivative
-    return float(np.fmin(size, max(_changed(extremal), RESOLVED * size)))
-
-
-def negligible_cost(extremal: Extremal, cost: float) -> float:
-    """A cost below which there is none, in the unit of small costs too; `cost`: that which is compared with it."""
-    if abs(cost) > CLEARLY * NO_COST:
-        return NO_COST
-    changed = _changed(extremal)
-    return NO_COST * min(1.0, changed) if changed > 0.0 else NO_COST
-
-
-@lru_cache(maxsize=KEPT)
-def _changed(extremal: Extremal) -> float:
-    """By how much the cost changes, to second order, if all that is in it changes by its magnitude."""
     st, t, p = extremal.statement, extremal.trajectory, extremal.parameters
     scales, count = magnitudes(st, t, p), extremal.mesh.intervals + 1
     units = np.concatenate([scales.x, scales.u, scales.e, [t.duration if st.duration.free else 0.0]])
@@ -68,7 +47,9 @@ def _changed(extremal: Extremal) -> float:
         np.asarray(function.map(count)(moved, time, parameters, np.tile(units[:, None], count)).full()).ravel()
         for function in _changes(st)
     )
-    return float(np.trapezoid(running, extremal.time)) + float(terminal[-1])
+    size = absolute_cost(extremal)
+    changed = float(np.trapezoid(running, extremal.time)) + float(terminal[-1])
+    return float(np.fmin(size, max(changed, RESOLVED * size)))  # its size where it has no second derivative
 
 
 @lru_cache(maxsize=KEPT)

@@ -16,7 +16,6 @@ import numpy as np
 
 from covocp.base.errors import CovocpError
 from covocp.base.matrices import Array
-from covocp.extremal.cost_sizes import negligible_cost
 from covocp.extremal.dense_output import dense_output
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.links import Within
@@ -52,6 +51,8 @@ SETTINGS: dict[str, Any] = {
 # Scaled residual at which an iterate meets all constraints; slope, in the same units, of an optimum: Ipopt passes over
 # it where multipliers are large; a gain, relative, that is large whatever is left of it.
 MET, LEVEL, LARGE = 1e-6, 1e-3, 1e-3
+# Costs below this count as zero.
+NO_COST = 1e-12
 
 
 def change_on_finer_mesh(extremal: Extremal, size: float, within: Within | None) -> float | None:
@@ -72,7 +73,7 @@ def change_on_finer_mesh(extremal: Extremal, size: float, within: Within | None)
         return None
     try:
         with np.errstate(all="ignore"):
-            return _change(extremal, max(size, negligible_cost(extremal, size)), within)
+            return _change(extremal, max(size, NO_COST), within)
     except (CovocpError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
         return None  # a step that cannot be differentiated, a start without a value
 

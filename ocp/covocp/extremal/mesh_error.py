@@ -10,7 +10,6 @@ import numpy as np
 
 from covocp.base.matrices import Array
 from covocp.base.short_repr import short_repr
-from covocp.extremal.cost_sizes import negligible_cost
 from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
@@ -26,6 +25,8 @@ from covocp.transcription.trajectory import Multipliers, Trajectory
 
 # Relative error of the cost, estimated by halving the steps, above which a mesh counts as too coarse.
 COARSE_MESH = 2e-4
+# Costs below this count as zero: a tracking cost whose optimum is zero is known to roundoff only, and no share of it.
+NO_COST = 1e-12
 # Relative change from which on halving the steps does not tell how far they are off: they are divided in more parts.
 FAR, MANY_PARTS = 0.05, 16
 # Roundoff of a step, relative: an unstable nominal that makes more of it than the change it suffers tells nothing.
@@ -78,24 +79,22 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             later ones, at best and along their controls.
 
     Returns:
-        |change| / max(|changed cost|, what counts as none), or the share of the states' ranges; nan where the run is
-        not finite.
+        |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
     st = extremal.statement
     cost = _cost_of_all(extremal, running, within)
-    none = negligible_cost(extremal, cost)
     change, missed, moved = _change(extremal, running, 2, within)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
             further = _change(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
-    error = _share(change, missed, cost, none)
+    error = _share(change, missed, cost)
     if st.autonomous or not np.isfinite(moved):
         return error
     error = max(error, moved)
     hidden = 0.0
     for further in _unlike_halves(extremal, running, within):
-        hidden = max(hidden, _share(*further[:2], cost, none), further[2])
+        hidden = max(hidden, _share(*further[:2], cost), further[2])
     return hidden if hidden > MORE_THAN_HALVES * error else error
 
 
@@ -106,9 +105,9 @@ def _cost_of_all(extremal: Extremal, running: float, within: Within | None) -> f
     return cost if within is None else cost + within.others
 
 
-def _share(change: float, missed: float, cost: float, none: float) -> float:
-    """A change of the cost, with or without what is missed at the end, in the changed one, which is `none` at least."""
-    return max(abs(change), abs(change - missed)) / max(abs(cost + change), none)
+def _share(change: float, missed: float, cost: float) -> float:
+    """A change of the cost, with or without what is missed at the end, in the changed cost."""
+    return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
 
 
 def _unlike_halves(extremal: Extremal, running: float, within: Within | None) -> list[tuple[float, float, float]]:
@@ -151,15 +150,13 @@ def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
         return None
     st, running = extremal.statement, _parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, within)
-    none = negligible_cost(extremal, cost)
     with np.errstate(over="ignore", invalid="ignore"):
-        told = _share(*_change(extremal, running, 2, within)[:2], cost, none)
-        hidden = _unlike_halves(extremal, running, within)
-        paid = max((_share(*changes[:2], cost, none) for changes in hidden), default=0.0)
+        told = _share(*_change(extremal, running, 2, within)[:2], cost)
+        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running, within)), default=0.0)
         (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
-    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > none else 0.0
+    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
     worst = int(np.argmax(moved))
     if not moved[worst] and not paid:
         return None
@@ -369,7 +366,7 @@ def _error_of_one(extremal: Extremal) -> float:
     """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
     running = _parted(extremal, 1).running
     cost = _cost_of_all(extremal, running, None)
-    return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > negligible_cost(extremal, cost) else 0.0
+    return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
 
 
 def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, margin: float, order: int) -> float:

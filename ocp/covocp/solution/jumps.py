@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from covocp.base.errors import warn_user
-from covocp.extremal.cost_sizes import negligible_cost
 from covocp.extremal.jumps import Jump, met_jumps
 from covocp.extremal.local_errors import errors_of_steps
-from covocp.extremal.mesh_error import COARSE_MESH
+from covocp.extremal.mesh_error import COARSE_MESH, NO_COST
 from covocp.solution.origin import Origin
 from covocp.solution.solution import Solution
 
@@ -41,8 +40,7 @@ def coarse_elsewhere(solution: Solution, jumps: tuple[Jump, ...]) -> bool:
     """Whether integration steps are too long also where no jump is met."""
     changes = np.abs(errors_of_steps(solution.extremal)[1])
     changes[[k for jump in jumps for k in jump.intervals]] = 0.0
-    size = max(abs(solution.cost), negligible_cost(solution.extremal, solution.cost))
-    return bool(changes.sum() > COARSE_MESH * size)
+    return bool(changes.sum() > COARSE_MESH * max(abs(solution.cost), NO_COST))
 
 
 def _scatters(solution: Solution, jump: Jump) -> bool:

@@ -18,7 +18,7 @@ from covocp.base.later import later
 from covocp.base.pages import Section, Sentence, Table, as_html, as_text, number
 from covocp.base.short_repr import short_repr
 from covocp.base.threads import methods_one_at_a_time, one_at_a_time
-from covocp.extremal.cost_sizes import NO_COST
+from covocp.extremal.mesh_error import NO_COST
 from covocp.problem.phases import Phases
 from covocp.solution.phases import PhasesSolution
 from covocp.solution.solution import Solution

@@ -17,9 +17,9 @@ from covocp.base.errors import CovocpError, warn_user
 from covocp.base.matrices import Array, distinct
 from covocp.base.progress import Progress
 from covocp.base.short_repr import short_repr
-from covocp.extremal.cost_sizes import NO_COST
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.local_errors import local_errors
+from covocp.extremal.mesh_error import NO_COST
 from covocp.extremal.readings import stretches
 from covocp.solving.attempts import AnyOutcome
 from covocp.solving.between_nodes import mention_between, more_points, worst_between

@@ -77,7 +77,7 @@ def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> A
     silent = ~(np.isfinite(lower) & (lower != 0)) & ~(np.isfinite(upper) & (upper != 0))
     if not silent.any():
         return units
-    sizes = scales.x, scales.u.reshape(-1, statement.nu).max(axis=0, initial=0.0), scales.e
+    sizes = scales.x, np.atleast_2d(scales.u).max(axis=0), scales.e
     varied = np.zeros(silent.size)
     with np.errstate(all="ignore"):
         for side in (1.0, 0.0, -1.0):
@@ -269,7 +269,7 @@ def needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: 
 
 def _known_controls(statement: Statement, guess: Trajectory) -> Array:
     """What is known of the sizes of the controls, (nu,): along a guess, their scales, half their ranges; else 1."""
-    known = np.abs(guess.u).max(axis=0, initial=0.0)
+    known: Array = np.asarray(np.abs(guess.u).max(axis=0, initial=0.0))
     for block in statement.controls:
         given, half = statement.scales.get(block.name), _half_range(statement, block)
         told = np.where(np.isfinite(half), half, 1.0) if given is None else np.broadcast_to(given, half.shape)
