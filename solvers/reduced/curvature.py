@@ -38,6 +38,7 @@ def first_curvature(
     trajectory: Trajectory,
     parameters: Array,
     slope_at: Callable[[Array], Array],
+    cost_scale: float,
 ) -> Curvature:
     """A first Hessian in the chosen variables: of the running cost by the controls, elsewhere from differences.
 
@@ -47,10 +48,11 @@ def first_curvature(
         w: the point.
         trajectory: the same point.
         parameters: of the statement.
-        slope_at: the slope of the cost by all variables at a point.
+        slope_at: the slope of the cost by all variables at a point, in its unit.
+        cost_scale: this unit.
 
     Returns:
-        Positive definite, of the cost itself.
+        Positive definite, of the cost in its unit.
     """
     st, nodes, nu = nlp.statement, nlp.mesh.control_nodes, nlp.statement.nu
     size = w.size
@@ -60,11 +62,11 @@ def first_curvature(
     own = np.zeros(size, dtype=bool)
     own[chosen] = True
     metric = np.ones(size)
-    metric[first : first + nodes * nu] = weights.ravel()
+    metric[first : first + nodes * nu] = (weights / weights.mean(axis=0)).ravel()  # beside others: in no unit
     result = np.zeros((size, size))
     for k in range(nodes):
         span = slice(first + k * nu, first + (k + 1) * nu)
-        result[span, span] = blocks[k]
+        result[span, span] = blocks[k] / cost_scale
     diagonal = np.einsum("ii->i", result)
     flat = own & (diagonal <= FLAT * metric * (diagonal / metric)[own].max(initial=0.0))
     if flat.any():

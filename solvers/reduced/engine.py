@@ -131,6 +131,7 @@ class Engine:
                 trajectory,
                 p[:-1],
                 lambda w: self._slope(w, p),
+                float(p[-1]),
             )
 
         return first

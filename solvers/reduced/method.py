@@ -11,6 +11,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from covocp.base.arguments import checked, positive, whole
 from covocp.base.errors import ProblemError
 from covocp.base.matrices import Array
@@ -120,6 +122,7 @@ class ReducedRuns(Runs):
         super().__init__(build, "reduced", {}, True, max(LIMIT, LIMIT_PER_TOLERANCE * tolerance))
         self._open = True
         self._tolerance, self._most = tolerance, most
+        self._unit: float | None = None
 
     def _make(self, functions: dict[str, Any], kind: Kind = "cold") -> Engine:
         """The sequence on the present program; it needs no functions of another."""
@@ -146,9 +149,21 @@ class ReducedRuns(Runs):
         if isinstance(engine, Engine) and engine.stats()["iter_count"] == 0:
             engine.forget()
 
+    def _transcribe(self, scales: Magnitudes | None, trajectories: Trajectories, parameters: Arrays) -> None:
+        """The program in these scales; its cost gets a unit at the first run."""
+        super()._transcribe(scales, trajectories, parameters)
+        self._unit = None
+
     def _cost_scale(self, w0: Array, parameters: Arrays) -> float:
-        """The Hessian has a magnitude of its own."""
-        return 1.0
+        """A unit of the cost in which its curvature is of the order of one: what is learnt of it, and what is compared.
+
+        The same for all runs of a program, whose Hessian is kept; a power of two, which rounds nothing.
+        """
+        if self._unit is None:
+            with np.errstate(all="ignore"):
+                size = self._curvature_along(self._first_order(), w0, parameters)
+            self._unit = float(np.exp2(np.rint(np.log2(size)))) if size > 0.0 and np.isfinite(size) else 1.0
+        return self._unit
 
     def _ending(self, name: str) -> Ending | None:
         """The ending in these words."""

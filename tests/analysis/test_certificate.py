@@ -649,3 +649,21 @@ def test_a_nonlinear_chain_does_not_apply() -> None:
     assert not certificate.certified
     assert certificate.smallest_eigenvalue is None
     assert str(certificate) == "does not apply: the rate of 'v' is not affine in state and control"
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+@pytest.mark.parametrize("method", ["ipopt", "reduced"])
+@pytest.mark.parametrize("unit", [1e-9])
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse")  # a share of nothing as well
+def test_nothing_is_the_global_minimum_where_nothing_costs_nothing(weight: float, method: str, unit: float) -> None:
+    """What a solver leaves of u = 0 costs a share of nothing, but no more than controls that do nothing."""
+    ocp = co.Problem(10.0)
+    x, b = ocp.state("x", initial=0.0, variance=1.0), ocp.unknown("b", mean=1.0, variance=5.0)
+    u = ocp.control("u")
+    ocp.dynamics(x, -b * x + u / unit, noise=1.0)
+    ocp.measurement("position", x, noise=1.0)
+    ocp.estimation_covariance()
+    ocp.minimize(running=0.5 * (u / unit) ** 2 + weight * x**2)
+    certificate = co.certify(co.solve(ocp, method, intervals=20, progress=False), progress=False)
+    assert certificate.certified, str(certificate)
+    assert certificate.gap < 1e-9

@@ -109,3 +109,55 @@ def test_a_jump_of_costates_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     before, after, link = seen[0]
     broken = replace(before, within=replace(before.within, end=before.within.end + 0.01))
     assert residual(broken, after, link) == pytest.approx(0.01, rel=1e-4)
+
+
+GROWTH = 4.0  # of the first phase, along which 4 intervals of one step are coarse
+
+
+def later_pays(terminal, *, estimated: bool = False, running=0.0, final: float | None = None) -> co.Phases:
+    """x grows by e^4 in the first phase, which costs nothing; in the second one x' = u."""
+    first, second = co.Problem(1.0, name="grows"), co.Problem(1.0, name="pays")
+    for k, ocp in enumerate((first, second)):
+        x, u = ocp.state("x", initial=None if k else 0.1, final=final if k else None), ocp.control("u")
+        ocp.dynamics(x, u if k else GROWTH * x)
+        E = None
+        if estimated:
+            b = ocp.unknown("b", mean=1.0, variance=1.0)
+            ocp.measurement("product", b * x, noise=2.0)
+            E = ocp.estimation_covariance()[b, b]
+        costs = {"running": 0.5 * u**2 + running * x, "terminal": terminal(x, E)} if k else {"running": 0.5 * u**2}
+        ocp.minimize(**costs)
+    return co.Phases([first, second])
+
+
+@pytest.mark.parametrize(
+    ("terminal", "estimated", "exact"),
+    [
+        (lambda x, _: 3.0 * x, False, 0.3 * np.exp(GROWTH)),
+        (
+            lambda _, E: E,
+            True,
+            1.0 / (1.0 + 0.01 * np.expm1(2 * GROWTH) / (2 * GROWTH) / 2.0 + 0.01 * np.exp(2 * GROWTH) / 2.0),
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse", "ignore:The integration steps are long")
+def test_mesh_error_of_a_phase_tells_what_its_end_costs_later(terminal, estimated, exact):
+    """The phase with the long steps costs nothing itself; along the given controls x and E_bb have a closed form."""
+    still = [{"u": np.zeros(5)}, {"u": np.zeros(41)}]
+    phases = later_pays(terminal, estimated=estimated)
+    found = co.evaluate(phases, nominal=still, intervals=[4, 40], substeps=1)
+    true = abs(found.cost / exact - 1.0)
+    assert true > 1e-2
+    assert found[0].optimality.mesh_error == pytest.approx(true, rel=0.3)
+
+
+@pytest.mark.filterwarnings("ignore:The mesh is too coarse", "ignore:The integration steps are long")
+def test_mesh_error_of_a_phase_counts_what_later_ones_miss_along_their_controls():
+    """With u(0) = 0 in the second phase its start costs nothing at best; along the controls x is off as it starts."""
+    step = sum((GROWTH / 4) ** k / f for k, f in enumerate((1, 1, 2, 6, 24)))  # of Runge and Kutta, in a quarter
+    phases = later_pays(lambda x, _: 0.0, running=2.0, final=0.1 * step**4 + 1.0)
+    found = co.solve(phases, intervals=[4, 40], substeps=1, progress=False)
+    assert abs(found[1]["u"][0]) < 1e-6  # the costate where the phases meet
+    missed = 2.0 * 0.1 * (np.exp(GROWTH) - step**4)  # of int 2 x dt
+    assert found[0].optimality.mesh_error == pytest.approx(missed / (found.cost + missed), rel=0.1)

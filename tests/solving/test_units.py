@@ -13,6 +13,10 @@ from covocp.base.progress import Progress
 from covocp.extremal.extremal import Guess
 from covocp.models import unknown_lag
 from covocp.solving.other_minima import away_from_saddle
+from covocp.transcription.mesh import Options
+from covocp.transcription.scales import needed_controls
+from covocp.transcription.stiffness import resolve_mesh
+from covocp.transcription.trajectory import Trajectory
 
 # One unit of state, control and time of the lag, in those of the problem.
 UNITS = [
@@ -94,3 +98,56 @@ def test_saddle_that_is_cheaper_by_roundoff_has_not_been_left():
     with pytest.warns(co.CovocpWarning, match="no minimum"):
         found = away_from_saddle(ComesBack(), outcome, still.parameters, Progress("", False), start)
     assert found is outcome
+
+
+def rest_to_rest(time: float, length: float, control: float, cost: float, *, kind: str) -> co.Problem:
+    """A double integrator in units: the least energy and time, the least time, or the problem of Bryson and Denham."""
+    free = kind != "limited"
+    ocp = co.Problem(co.Free(2.5 * time) if free else time)
+    speed = 0.0 if free else length / time
+    x = ocp.state("x", initial=0.0, final=length if free else 0.0)
+    v = ocp.state("v", initial=speed, final=-speed)
+    bound = control if kind == "quick" else np.inf
+    u = ocp.control("u", lower=-bound, upper=bound)
+    ocp.dynamics(x, v)
+    ocp.dynamics(v, u * (length / control / time**2))
+    if kind == "limited":
+        ocp.subject_to(x - 0.12 * length)
+    running = 0.0 if kind == "quick" else 0.5 * (u / control) ** 2 * cost / time
+    ocp.minimize(running=running, terminal=ocp.duration * cost / time if free else 0.0)
+    return ocp
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+@pytest.mark.parametrize(
+    "units",
+    [
+        (1e-6, 1e6, 1e-6, 1e6),
+        (1.0, 1e-6, 1.0, 1.0),
+        (1.0, 1.0, 1e-9, 1.0),
+        (1.0, 1.0, 1.0, 1e-12),
+    ],
+)
+@pytest.mark.parametrize(
+    ("kind", "exact"), [("energy", 18**0.25 * 4 / 3), ("quick", 2.0), ("limited", 4.0 / (9.0 * 0.12))]
+)
+def test_speeds_from_rest_to_rest_and_limits_of_zero_have_no_unit_of_their_own(kind, exact, units, method):
+    """Nothing tells the size of v; that of the row x - 0.12 m is nothing but what x makes of it."""
+    solution = solve(rest_to_rest(*units, kind=kind), method=method, intervals=24)
+    assert solution.cost / units[3] == pytest.approx(exact, rel=2e-3)
+    assert solution.stats["iterations"] < (200 if method == "gradient" else 80)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("bound", [1.0, np.inf])
+def test_what_a_control_is_needed_for_is_measured_in_its_own_unit(unit, bound):
+    """x(1) = exp(u + u^3) - 1 in this unit: to first order one unit moves x by one."""
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0, final=1.0), ocp.control("u", lower=-bound * unit, upper=bound * unit)
+    ocp.dynamics(x, (u / unit + (u / unit) ** 3) * (1.0 + x))
+    ocp.minimize(running=u**2)
+    st = ocp.statement()
+    mesh = resolve_mesh(st, Options(intervals=20), st.values)
+    still = Trajectory(x=np.zeros((21, 1)), u=np.zeros((21, 1)), e=np.zeros((21, 0)), duration=1.0)
+    needed = needed_controls(st, mesh, still, np.ones(1), st.values)
+    assert needed[0] / unit == pytest.approx(1.0, rel=1e-2)

@@ -60,6 +60,9 @@ LARGEST_FALL = 1e-3
 LARGEST_GAP = 1e-3
 LARGEST_VIOLATION = 1e-6
 LEFT_AT_ZERO = 1e-7
+# Controls that move no state by more than this share of its standard deviation do nothing: what they cost is no gap
+# either, so that a cost which is zero but for what the solver leaves of it has a size.
+NOTHING_MOVES = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +184,8 @@ def _certified(solution: Solution, reporter: Progress) -> Certificate:
     information = Reduction(extremal.statement, mesh, extremal.parameters).covariance(extremal.trajectory.u)[2]
     consistency = float(np.abs(np.linalg.inv(information) - covariance).max() / np.abs(covariance).max())
     least = max(ROUNDOFF * bounds[-1].magnitude, float(np.finfo(float).tiny))
-    verdict, reason = _judge(eigenvalue, gap, mesh_gap, LARGEST_GAP * abs(cost) + least)
+    allowed = LARGEST_GAP * abs(cost) + max(least, _cost_of_nothing(solution.extremal))
+    verdict, reason = _judge(eigenvalue, gap, mesh_gap, allowed)
     return Certificate(
         verdict=verdict,
         reason=reason,
@@ -268,12 +272,7 @@ def _units(extremal: Extremal, cost: float) -> tuple[Array, Array]:
     magnitude where that is less; states have the response to these, or their magnitude.
     """
     st, t, p = extremal.statement, extremal.trajectory, extremal.parameters
-    given = parts(st, p)
-    diagonal = ca.diag(ca.hessian(given.running, given.z)[0][st.nx :, st.nx :])
-    at_zero = ca.densify(ca.substitute(diagonal, given.z, ca.DM.zeros(given.z.shape)))
-    times = extremal.time
-    energies = ca.Function("energies", [given.time], [at_zero]).map(times.size)(times.reshape(1, -1)).full()
-    energy = t.duration * energies.mean(axis=1)
+    energy = _energies(extremal)
     u = np.sqrt(2 * cost / np.where(energy > 0, energy, np.inf))
     magnitudes = unvanishing(st, extremal.mesh, t, p)
     needed = needed_controls(st, extremal.mesh, t, magnitudes, p)
@@ -287,6 +286,26 @@ def _units(extremal: Extremal, cost: float) -> tuple[Array, Array]:
         for row in np.diag(u)
     ]
     return np.minimum(np.max(moved, axis=0, initial=0.0), magnitudes), u
+
+
+def _energies(extremal: Extremal) -> Array:
+    """int L_uu dt of each control, (nu,): twice what it costs where it is one all the time."""
+    st, times = extremal.statement, extremal.time
+    given = parts(st, extremal.parameters)
+    diagonal = ca.diag(ca.hessian(given.running, given.z)[0][st.nx :, st.nx :])
+    at_zero = ca.densify(ca.substitute(diagonal, given.z, ca.DM.zeros(given.z.shape)))
+    energies = ca.Function("energies", [given.time], [at_zero]).map(times.size)(times.reshape(1, -1)).full()
+    return np.asarray(extremal.trajectory.duration * energies.mean(axis=1))
+
+
+def _cost_of_nothing(extremal: Extremal) -> float:
+    """The least cost of a constant control that moves some state by `NOTHING_MOVES` of its deviation; 0 without one."""
+    st, t = extremal.statement, extremal.trajectory
+    deviations = standard_deviations(unpack(t.e, st.matrices[0].size))[:, : st.nx].max(axis=0)
+    units = np.where(deviations > 0, deviations, np.inf)
+    needed = needed_controls(st, extremal.mesh, t, units, extremal.parameters)
+    costs = 0.5 * _energies(extremal) * (NOTHING_MOVES * needed) ** 2
+    return float(min(costs[costs > 0], default=0.0))
 
 
 def _terms(extremal: Extremal, conditions: Conditions, sizes: Array) -> Array:

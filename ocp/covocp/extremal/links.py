@@ -23,6 +23,7 @@ from covocp.statement.chain import Link
 from covocp.transcription.covariance_steps import KEPT
 from covocp.transcription.nlp import terminal_slopes
 from covocp.transcription.scales import magnitudes
+from covocp.transcription.trajectory import Multipliers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +81,8 @@ class Within:
         end_matrices: by the half-vectors there, (ne,).
         deviations: [E Z; Z' Xhat] of the closed loop at the start, (2n, 2n); empty without one.
         handed: 1/2 tr S Xhat there, less that where the next one starts: what the statement's form of the cost lacks.
+        flown: slopes as `end` where the later ones keep their controls, and miss what is prescribed, (nx,).
+        flown_matrices: as `end_matrices`, (ne,). Both are empty in files that were written before.
     """
 
     others: float
@@ -91,8 +94,16 @@ class Within:
     end_matrices: Annotated[Array, "e"]
     deviations: Array = field(default_factory=lambda: np.zeros((0, 0)))
     handed: float = 0.0
+    flown: Annotated[Array, "x or none"] = field(default_factory=lambda: np.zeros(0))
+    flown_matrices: Annotated[Array, "e or none"] = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
+
+    @property
+    def along_controls(self) -> tuple[Array, Array]:
+        """`flown` and `flown_matrices`, in place of which, where these are not known, stand those with what is held."""
+        known = self.flown.size == self.end.size and self.flown_matrices.size == self.end_matrices.size
+        return (self.flown, self.flown_matrices) if known else (self.end, self.end_matrices)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,13 +140,16 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
     variable = [variable_cost(extremal) for extremal in outcome.extremals]
     extremals = _with_weights(outcome, links)
     result: list[Passed] = []
+    flown: Passed | None = None
     for i in range(len(extremals) - 1, -1, -1):
         extremal = extremals[i]
         st = extremal.statement
         slopes = LinkSlopes(state=np.zeros(st.nx), matrices=np.zeros(st.ne), duration=0.0)
-        if result:
+        along = slopes
+        if result and flown:
             later = result[-1]
             slopes = link_slopes(links[i], extremal, later)
+            along = link_slopes(links[i], extremal, flown)
             m = extremal.multipliers
             if extremal.mesh.eliminated and st.matrices:
                 m = replace(m, final_matrices=m.final_matrices + slopes.matrices)
@@ -157,9 +171,27 @@ def completed(outcome: ChainOutcome, links: tuple[Link, ...]) -> tuple[Passed, .
             by_duration=slopes.duration,
             end=slopes.state,
             end_matrices=slopes.matrices,
+            flown=along.state,
+            flown_matrices=along.matrices,
         )
         result.append(Passed(extremal=extremal, costates=costates, within=within, bounds=outcome.bounds_at_ends[i]))
+        flown = _along_controls(result[-1]) if i else None
     return tuple(result[::-1])
+
+
+def _along_controls(passed: Passed) -> Passed:
+    """What a later statement costs by its start along its controls: nothing holds what is prescribed or limited."""
+    extremal, within, none = passed.extremal, passed.within, np.zeros(passed.extremal.statement.nx)
+    st = extremal.statement
+    free = Multipliers.zero(st, extremal.mesh)
+    backward = free.matrices.copy()
+    behind = st.entries(st.behind)
+    backward[0, behind] = extremal.multipliers.matrices[0, behind] if behind else 0.0
+    free = replace(free, final=within.flown, final_matrices=within.flown_matrices, matrices=backward)
+    alone = replace(extremal, multipliers=free)
+    with np.errstate(over="ignore", invalid="ignore"):
+        costates = discrete_costates(alone)[0]
+    return Passed(extremal=alone, costates=costates, within=within, bounds=(none, none))
 
 
 def _with_weights(outcome: ChainOutcome, links: tuple[Link, ...]) -> list[Extremal]:

@@ -14,7 +14,7 @@ from covocp.extremal.costates import discrete_costates
 from covocp.extremal.extremal import Extremal
 from covocp.extremal.inside import instant_change
 from covocp.extremal.links import Within
-from covocp.extremal.open_loop import Departure, departure, nominal_along
+from covocp.extremal.open_loop import Departure, departure, matrices_along_controls, nominal_along
 from covocp.extremal.unseen import changes_within_steps
 from covocp.statement.statement import Statement
 from covocp.transcription.halved_steps import Refined, refined_run
@@ -75,37 +75,34 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
     Args:
         extremal: trajectory and multipliers.
         running: its running cost.
-        within: what the rest of a chain says of it: the cost is then that of all, and what the later statements cost by
-            its end is no part of what is missed there.
+        within: what the rest of a chain says of it: the cost is then that of all, with what its end changes of the
+            later ones, at best and along their controls.
 
     Returns:
         |change| / max(|changed cost|, NO_COST), or the share of the states' ranges; nan where the run is not finite.
     """
     st = extremal.statement
-    extremal, cost = _of_all(extremal, running, within)
-    change, missed, moved = _change(extremal, running, 2)
+    cost = _cost_of_all(extremal, running, within)
+    change, missed, moved = _change(extremal, running, 2, within)
     if abs(change) > FAR * abs(cost):
         with np.errstate(over="ignore", invalid="ignore"):
-            further = _change(extremal, running, MANY_PARTS)
+            further = _change(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
     if st.autonomous or not np.isfinite(moved):
         return error
     error = max(error, moved)
     hidden = 0.0
-    for further in _unlike_halves(extremal, running):
+    for further in _unlike_halves(extremal, running, within):
         hidden = max(hidden, _share(*further[:2], cost), further[2])
     return hidden if hidden > MORE_THAN_HALVES * error else error
 
 
-def _of_all(extremal: Extremal, running: float, within: Within | None) -> tuple[Extremal, float]:
-    """The extremal with multipliers of what is missed at its end by itself, and the cost of the whole chain."""
+def _cost_of_all(extremal: Extremal, running: float, within: Within | None) -> float:
+    """The cost of the whole chain of which an extremal is part, of itself where it is none."""
     t = extremal.trajectory
     cost = running + float(extremal.statement.terminal(t.x[-1], t.e[-1], t.duration, extremal.parameters))
-    if within is None:
-        return extremal, cost
-    own = replace(extremal.multipliers, final=extremal.multipliers.final - within.end)
-    return replace(extremal, multipliers=own), cost + within.others
+    return cost if within is None else cost + within.others
 
 
 def _share(change: float, missed: float, cost: float) -> float:
@@ -113,12 +110,12 @@ def _share(change: float, missed: float, cost: float) -> float:
     return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
 
 
-def _unlike_halves(extremal: Extremal, running: float) -> list[tuple[float, float, float]]:
+def _unlike_halves(extremal: Extremal, running: float, within: Within | None) -> list[tuple[float, float, float]]:
     """`_change` by parts of a step that see what its halves do not, where there may be such; those that are finite."""
     if not changes_within_steps(extremal):
         return []
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_change(extremal, running, parts) for parts in UNLIKE_HALVES]
+        found = [_change(extremal, running, parts, within) for parts in UNLIKE_HALVES]
     return [changes for changes in found if np.isfinite(changes).all()]
 
 
@@ -152,10 +149,10 @@ def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
     if not changes_within_steps(extremal):
         return None
     st, running = extremal.statement, _parted(extremal, 1).running
-    extremal, cost = _of_all(extremal, running, within)
+    cost = _cost_of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
-        told = _share(*_change(extremal, running, 2)[:2], cost)
-        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running)), default=0.0)
+        told = _share(*_change(extremal, running, 2, within)[:2], cost)
+        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running, within)), default=0.0)
         (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
@@ -174,7 +171,7 @@ def _entry(statement: Statement, row: int) -> str:
     return next((b.name for b in blocks if b.span.start <= row - statement.nx < b.span.stop), "")
 
 
-def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, float, float]:
+def _change(extremal: Extremal, running: float, parts: int, within: Within | None = None) -> tuple[float, float, float]:
     """Changes by shorter steps: of the optimal cost, its part that stands for missed terminal conditions, of states."""
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
     finer = _parted(extremal, parts)
@@ -190,7 +187,7 @@ def _change(extremal: Extremal, running: float, parts: int) -> tuple[float, floa
         behind = st.entries(st.behind)
         change += float(extremal.multipliers.matrices[0, behind] @ (finer.matrices[0] - t.e[0])[behind])
     least = LEAST_RANGE * _magnitudes(st, t, tuple(extremal.parameters.tolist())).x
-    return change, _missed(extremal, jumps, parts), _moved(jumps[:, : st.nx], t.x, least)
+    return change, _missed(extremal, finer, parts, within), _moved(jumps[:, : st.nx], t.x, least)
 
 
 def _halved(extremal: Extremal) -> Refined:
@@ -368,7 +365,7 @@ def _divided(
 def _error_of_one(extremal: Extremal) -> float:
     """`mesh_error` of a statement by itself; 0 where it costs nothing, or where that is no number."""
     running = _parted(extremal, 1).running
-    cost = _of_all(extremal, running, None)[1]
+    cost = _cost_of_all(extremal, running, None)
     return float(np.nan_to_num(mesh_error(extremal, running))) if abs(cost) > NO_COST else 0.0
 
 
@@ -431,21 +428,29 @@ def _moved(jumps: Array, x: Array, least: Array) -> float:
     return float((np.abs(jumps).max(axis=0) / np.maximum(np.ptp(x, axis=0), least)).max(initial=0.0))
 
 
-def _missed(extremal: Extremal, jumps: Array, parts: int) -> float:
+def _missed(extremal: Extremal, finer: Refined, parts: int, within: Within | None) -> float:
     """Multipliers of the final values times what one run along the controls misses of them.
 
-    Zero where the nominal is so unstable that roundoff alone would miss as much.
+    Within a chain those of the later statements too, which begin where this one ends: they are in what these cost by
+    its end, less what they cost along their controls. Zero where the nominal is so unstable that roundoff alone would
+    miss as much.
     """
     st, mesh, t = extremal.statement, extremal.mesh, extremal.trajectory
-    multipliers = extremal.multipliers.final
-    if st.coupled or not multipliers.any():
+    held, held_matrices = extremal.multipliers.final, np.zeros(st.ne)
+    if within is not None:
+        flown, flown_matrices = within.along_controls
+        held, held_matrices = held - flown, within.end_matrices - flown_matrices
+    if st.coupled or not (held.any() or held_matrices.any()):
         return 0.0
+    along = finer.matrices[-1] - t.e[-1]
     if len(mesh.segments) == 1:
-        return float(multipliers @ jumps[-1, : st.nx])
+        return float(held @ finer.jumps[-1, : st.nx] + held_matrices @ along)
     drift = nominal_along(extremal, parts)[-1] - t.x[-1]
     if is_lost(extremal, np.abs(drift)):
         return 0.0
-    return float(multipliers @ drift)
+    if held_matrices.any():
+        along = matrices_along_controls(extremal)[-1] - t.e[-1]
+    return float(held @ drift + held_matrices @ along)
 
 
 def _at_the_end(extremal: Extremal, matrices: Array) -> float:

@@ -83,6 +83,11 @@ def _nominal(
     return refined_states(statement, mesh, trajectory, np.array(parameters), parts)
 
 
+def matrices_along_controls(extremal: Extremal) -> Array:
+    """Half-vectors at the nodes of one run along the controls with half the steps, (N + 1, ne)."""
+    return _whole(extremal.statement, extremal.mesh, extremal.trajectory, tuple(extremal.parameters.tolist())).matrices
+
+
 @lru_cache(maxsize=2)
 def _whole(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> Refined:
     return refined_run(statement, in_one_segment(mesh), trajectory, np.array(parameters))

@@ -37,7 +37,7 @@ T = TypeVar("T")
 FORMAT = "covocp solution"
 VERSION = 3
 # Fields with a default that files of this version may lack.
-ADDED = ("readings", "words", "aspects")
+ADDED = ("readings", "words", "aspects", "flown", "flown_matrices")
 SUFFIXES = (".npz", ".json")
 REASON = 160  # letters of a reason that an error quotes
 # Fields: of the problem, which is not kept; of the candidate, whose own fields are entries of the file.

@@ -29,6 +29,8 @@ BENDING = 1.0
 BESIDE = 0.01
 # Where a decision has no bound its initial covariance is tried at so many times its magnitude.
 FAR = 10.0
+# A simulated state that grows to so many times what is known of it (1 where that is less) diverges.
+DIVERGED = 1e12
 
 
 def controls_guess(statement: Statement, nodes: Array, control: str, sign: float = 1.0) -> Array:
@@ -311,18 +313,40 @@ def simulate_states(
     statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
 ) -> Array:
     """States at the nodes (N+1, nx) from the controls; where that diverges, a straight line to the final values."""
+    values = simulated(statement, mesh, start, e0, u, duration, parameters)
+    if values is not None:
+        return values
+    final = statement.boundary_values(parameters)[1]
+    final = np.where(np.isnan(final), start, final)
+    return np.asarray(start + mesh.nodes[:, None] * (final - start))
+
+
+def simulated(
+    statement: Statement, mesh: Mesh, start: Array, e0: Array, u: Array, duration: float, parameters: Array
+) -> Array | None:
+    """States at the nodes (N+1, nx) from the controls, within their bounds; None where they diverge."""
     if statement.coupled:
         advance = moving_interval(statement, mesh.substeps, mesh.step)
         columns = interval_columns(mesh, ca.DM(u.T), duration, ca.DM(parameters))
         values = np.vstack([start, swept(advance, np.concatenate([start, e0]), *columns)[0][:, : statement.nx]])
     else:
         values = nominal_states(statement, mesh, start, u, duration, parameters)
-    if np.isfinite(values).all() and np.abs(values).max(initial=0.0) < 1e12:
+    if np.isfinite(values).all() and not _diverges(values, statement.boundary_values(parameters)[1]):
         lower, upper = statement.state_bounds
         return np.asarray(np.clip(values, lower, upper))
-    final = statement.boundary_values(parameters)[1]
-    final = np.where(np.isnan(final), start, final)
-    return np.asarray(start + mesh.nodes[:, None] * (final - start))
+    return None
+
+
+def _diverges(values: Array, final: Array) -> bool:
+    """Whether some state grows beyond all that is known of it: its values at the ends, and where it moves at first.
+
+    In a small unit of length or a large one of time a number may be large that is not.
+    """
+    size = np.abs(values)
+    moved = np.where(size > 0, size, np.inf)
+    first = np.take_along_axis(size, np.argmax(np.isfinite(moved), axis=0)[None], axis=0)[0]
+    known = np.maximum(np.maximum(first, np.abs(np.nan_to_num(final))), 1.0)
+    return bool((size.max(axis=0, initial=0.0) > DIVERGED * known).any())
 
 
 def simulate_matrices(

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from covocp.base.matrices import Array, half_indices, unpack
-from covocp.statement.statement import Block, Statement
-from covocp.transcription.first_guess import evaluate_guess, simulate_states
+from covocp.statement.interval import model_symbols
+from covocp.statement.statement import Block, Conditions, Statement
+from covocp.transcription.covariance_steps import KEPT
+from covocp.transcription.first_guess import evaluate_guess, simulated
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import Scales
 from covocp.transcription.resolution import estimated_rows, resolutions
 from covocp.transcription.steering import quadrature_weights
 from covocp.transcription.trajectory import Trajectory
 
+# Step by which the response to a control is measured: a share of its size, then of what it moves a state by. That says
+# how much it moves where it is within these; else it is tried again, up to so many times, each so many times longer or
+# shorter at most. So no unit of a control matters, whose size nothing tells.
 RESPONSE_STEP = 1e-3
+RESPONDS, RESPONSES, FURTHER = (1e-6, 1.0), 4, 1e9
 # Shooting states are scaled by more than their magnitude where the Hessian is of limited memory: it then learns the
 # curvature along the controls first (chain of 9 masses: 15 iterations instead of 21).
 STRETCH = 10.0
@@ -36,6 +45,8 @@ NOTHING = 1e-50
 ROUNDOFF = 1e-24
 # Limits below the first and above the second are the units of their rows: solvers meet rows to an absolute tolerance.
 SMALL, LARGE = 0.1, 1e3
+# Limits of zero tell no unit: it is one, unless the rows vary by so many times less or more.
+SILENT = 1e3
 
 
 def limit_units(lower: Array, upper: Array) -> Array:
@@ -48,6 +59,44 @@ def limit_units(lower: Array, upper: Array) -> Array:
     largest = np.where(limits <= LARGE, limits, 0.0).max(axis=0)
     large = np.isfinite(nearest) & (nearest > LARGE)
     return np.where((largest > 0) & (largest < SMALL), largest, np.where(large, nearest, 1.0))
+
+
+def row_units(statement: Statement, conditions: Conditions, scales: Scales) -> Array:
+    """Units of the rows of conditions: those of their limits; where these are zero what the variables make of them.
+
+    That is what a row varies by, to first order, if all variables change by their magnitudes: it counts where it is so
+    many times, `SILENT`, less or more than one.
+
+    Args:
+        statement: the problem.
+        conditions: of it.
+        scales: magnitudes of its variables.
+    """
+    lower, upper = conditions.lower, conditions.upper
+    units = limit_units(lower, upper)
+    silent = ~(np.isfinite(lower) & (lower != 0)) & ~(np.isfinite(upper) & (upper != 0))
+    if not silent.any():
+        return units
+    sizes = scales.x, np.atleast_2d(scales.u).max(axis=0), scales.e
+    varied = np.zeros(silent.size)
+    with np.errstate(all="ignore"):
+        for side in (1.0, 0.0, -1.0):
+            at = [side * size for size in sizes]
+            time = 0.5 * (1.0 + side) * scales.duration
+            found = _variation(statement, conditions.function)(*at, time, scales.duration, statement.values, *sizes)
+            varied = np.fmax(varied, np.where(np.isfinite(own := np.asarray(found.full()).ravel()), own, 0.0))
+    far = silent & (varied > 0) & ((varied < 1.0 / SILENT) | (varied > SILENT))
+    return np.where(far, varied, units)
+
+
+@lru_cache(maxsize=KEPT)
+def _variation(statement: Statement, function: ca.Function) -> ca.Function:
+    """(arguments of conditions, magnitudes of x, u and e) -> what each row varies by if all change by these."""
+    symbols = model_symbols(statement)
+    kind: Any = statement.symbolic
+    sizes = [kind.sym(name, size) for name, size in (("dx", statement.nx), ("du", statement.nu), ("de", statement.ne))]
+    varied = ca.fabs(ca.jacobian(function(*symbols), ca.vertcat(*symbols[:3]))) @ ca.vertcat(*sizes)
+    return ca.Function("variation", [*symbols, *sizes], [ca.densify(varied)])
 
 
 def magnitudes(
@@ -193,15 +242,40 @@ def evened(scales: Scales, mesh: Mesh) -> Scales:
 def needed_controls(statement: Statement, mesh: Mesh, guess: Trajectory, scale: Array, parameters: Array) -> Array:
     """Constant changes of each control that move some state by its scale, to first order; 0 where none does."""
     needed = np.zeros(statement.nu)
-    base = simulate_states(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
-    for i in range(statement.nu):
+    base = simulated(statement, mesh, guess.x[0], guess.e[0], guess.u, guess.duration, parameters)
+    if base is None:
+        return needed
+
+    def share(i: int, step: float) -> float:
+        """Which part of its scale a step of one control moves some state by, at most; inf where that diverges."""
         changed = guess.u.copy()
-        step = RESPONSE_STEP * max(1.0, float(np.abs(guess.u[:, i]).max(initial=0.0)))
         changed[:, i] += step
-        moved = simulate_states(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
-        response = float((np.abs(moved - base).max(axis=0, initial=0.0) / scale).max(initial=0.0)) / step
-        needed[i] = 1.0 / response if np.isfinite(response) and response > 0 else 0.0
+        moved = simulated(statement, mesh, guess.x[0], guess.e[0], changed, guess.duration, parameters)
+        if moved is None:
+            return np.inf
+        return float((np.abs(moved - base).max(axis=0, initial=0.0) / scale).max(initial=0.0))
+
+    for i, size in enumerate(_known_controls(statement, guess).tolist()):
+        step = RESPONSE_STEP * size
+        moved = share(i, step)
+        for _ in range(RESPONSES):
+            if RESPONDS[0] <= moved <= RESPONDS[1]:
+                break
+            step *= float(np.clip(RESPONSE_STEP / moved if moved > 0 else np.inf, 1.0 / FURTHER, FURTHER))
+            moved = share(i, step)
+        needed[i] = step / moved if np.isfinite(moved) and moved > 0 else 0.0
     return needed
+
+
+def _known_controls(statement: Statement, guess: Trajectory) -> Array:
+    """What is known of the sizes of the controls, (nu,): along a guess, their scales, half their ranges; else 1."""
+    known: Array = np.asarray(np.abs(guess.u).max(axis=0, initial=0.0))
+    for block in statement.controls:
+        given, half = statement.scales.get(block.name), _half_range(statement, block)
+        told = np.where(np.isfinite(half), half, 1.0) if given is None else np.broadcast_to(given, half.shape)
+        own = known[block.span]
+        known[block.span] = np.where(own > NOTHING, own, np.minimum(told, 1.0 if given is None else told))
+    return known
 
 
 def _matrix_scales(statement: Statement, e: Array) -> Array:

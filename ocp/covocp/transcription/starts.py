@@ -39,7 +39,7 @@ from covocp.transcription.mesh import Mesh, Options, explicit_substeps
 from covocp.transcription.noticed import looks_wrong, noticed_units
 from covocp.transcription.ranking import distinct, judged, shapes, unsymmetric
 from covocp.transcription.scales import choose_scales, magnitudes, needed_controls
-from covocp.transcription.steering import Run, resampled, steer, track
+from covocp.transcription.steering import FAR_UNIT, Run, resampled, steer, track
 from covocp.transcription.stiffness import stiffness
 from covocp.transcription.trajectory import Trajectory
 
@@ -56,9 +56,6 @@ WIDE = 1e3
 REACH = 4.0
 # A control that steering moved by more than so many bends is not bent.
 FAR = 5.0
-# Where nothing tells the unit of a control, one unit is bent, unless what moves a state by its scale is so many times
-# more or less: then that is. A bend of one would be none where a control is counted in grains, and far away in tons.
-FAR_UNIT = 100.0
 # States that answer to a control so many times more by the end than by half the time are unstable: six integrators in
 # a row give 2^6.
 GROWTH = 64.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -34,6 +34,9 @@ SHORT = 50_000
 NO_TIME = 1e-3
 # Smallest singular value, relative to the largest, of directions in which the controls move what is aimed at.
 RANK = 1e-8
+# Where nothing tells the unit of a control, or of a final value, it is one, unless what it moves, or is moved by, tells
+# so many times more or less. A bend of one would be none where a control is counted in grains, and far away in tons.
+FAR_UNIT = 100.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,6 +147,26 @@ def final_pull(run: Run, fixed: tuple[int, ...], target: Array, u: Array, often:
     return (np.asarray(value.full()).ravel() - target) / scale, np.asarray(slope.full()) / scale[:, None]
 
 
+def in_told_units(run: Run, fixed: tuple[int, ...], plain: Array, often: bool = True) -> Run:
+    """The run with scales of final values of which nothing tells any: what moves the others by theirs moves these so.
+
+    They are left at 1 where that is about it. A speed from rest to rest has no size of its own: in metres per
+    microsecond, or nanometres per year, steering would see nothing beside it, or nothing of it.
+    """
+    rows = list(fixed)
+    untold = run.scale[rows] == 0
+    if not untold.any() or untold.all():
+        return run
+    slope = final_pull(run, fixed, np.zeros(len(fixed)), plain, often)[1]
+    with np.errstate(all="ignore"):
+        answers = np.sqrt((slope**2) @ (1.0 / run.weights))
+        sizes = answers / answers[~untold].max()
+    far = untold & np.isfinite(sizes) & (sizes > 0) & ((sizes > FAR_UNIT) | (sizes < 1.0 / FAR_UNIT))
+    scale = run.scale.copy()
+    scale[rows] = np.where(far, sizes, scale[rows])
+    return replace(run, scale=scale)
+
+
 def steer(run: Run, fixed: tuple[int, ...], target: Array, plain: Array) -> tuple[Array, float]:
     """Add the control of least energy that brings the nominal to its final values.
 
@@ -153,6 +176,7 @@ def steer(run: Run, fixed: tuple[int, ...], target: Array, plain: Array) -> tupl
         The controls, and the share of the miss that the first step leaves where no bound stops it: 0 where the states
         answer in proportion.
     """
+    run = in_told_units(run, fixed, plain, often=False)
     best, (gap, slope) = plain, final_pull(run, fixed, target, plain, often=False)
     norm, left = float(np.linalg.norm(gap)), 0.0
     for k in range(STEERING_STEPS):
@@ -191,7 +215,7 @@ def least_energy(
     Returns:
         The controls, the miss that is left (in the scales of the states).
     """
-    weights = run.weights
+    run, weights = in_told_units(run, fixed, plain), run.weights
     u, (gap, slope) = first, final_pull(run, fixed, target, first)
     price = 0.0
     for _ in range(steps):

@@ -19,7 +19,7 @@ from covocp.transcription.chained import chains, segment_slopes
 from covocp.transcription.mesh import Mesh
 from covocp.transcription.nlp import NLP, Rows, Scales, inside_kind
 from covocp.transcription.pieces import is_separable, pieces
-from covocp.transcription.scales import limit_units
+from covocp.transcription.scales import row_units
 from covocp.transcription.sequences import Passage
 from covocp.transcription.shooting import backward_at_start, compiled_steps, interval_columns, nominal_run, shoot
 from covocp.transcription.staged import SMALLEST_ALONE, Staged, is_staged, staged
@@ -180,11 +180,12 @@ def _constraints(
             k = len(columns)
             x, u, e, t = (v[:, columns] for v in arguments)
             value = conditions.columns(Columns(x, u, e, t), variables.duration, variables.parameters)
-            rows.append(_condition_rows(kind, conditions, value, k, mesh))
+            rows.append(_condition_rows(kind, conditions, value, k, mesh, row_units(statement, conditions, scales)))
     for i, (part, k) in enumerate(zip(statement.inside.parts, statement.inside.nodes_among(mesh.nodes), strict=True)):
         at = Columns(*(v[:, k] for v in arguments))
         value = part.conditions.columns(at, variables.duration, variables.parameters)
-        rows.append(_condition_rows(inside_kind(i), part.conditions, value, 1, mesh))
+        units = row_units(statement, part.conditions, scales)
+        rows.append(_condition_rows(inside_kind(i), part.conditions, value, 1, mesh, units))
     if mesh.points > 1:
         rows += _inside_rows(statement, mesh, scales, variables, nodes)
     if mesh.eliminated and statement.matrices:
@@ -192,12 +193,11 @@ def _constraints(
     return tuple(sorted(rows, key=lambda entry: entry.dense))
 
 
-def _condition_rows(kind: str, conditions: Conditions, value: Expr, count: int, mesh: Mesh) -> Rows:
-    """Inequalities at some points, in units of their limits where these are small.
+def _condition_rows(kind: str, conditions: Conditions, value: Expr, count: int, mesh: Mesh, scale: Array) -> Rows:
+    """Inequalities at some points, in units of their own (`row_units`).
 
     Solvers meet rows to an absolute tolerance: without that a limit of 1e-12 (the square of micrometres) is none.
     """
-    scale = limit_units(conditions.lower, conditions.upper)
     return Rows(
         kind=kind,
         expression=ca.vec(value if (scale == 1.0).all() else value / ca.repmat(ca.DM(scale), 1, count)),
@@ -281,7 +281,7 @@ def _inside_rows(
         e = nodes["e_inside"] if statement.matrices else ca.DM(0, n * inner)
         places = Columns(nodes["x_inside"], points.start, e, variables.duration * points.s)
         value = path.columns(places, variables.duration, variables.parameters)
-        own = _condition_rows("path_inside", path, value, n * inner, mesh)
+        own = _condition_rows("path_inside", path, value, n * inner, mesh, row_units(statement, path, scales))
         free = np.where(np.tile(path.equations, n * inner), np.inf, 0.0)
         rows.append(replace(own, lower=own.lower - free, upper=own.upper + free))
     return rows
