@@ -48,6 +48,18 @@ def test_an_interval_is_integrated_from_its_node(seed: int) -> None:
     np.testing.assert_allclose(inside[k], exact, rtol=2e-6, atol=2e-6 * np.abs(exact).max())
 
 
+def test_a_variance_that_nothing_moves_stays() -> None:
+    ocp = co.Problem(1.0)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    b = ocp.unknown("b", mean=1.0, variance=0.5)
+    ocp.dynamics(x, u)
+    ocp.minimize(running=u**2 + b**2)
+    statement, mesh, given = started(ocp, intervals=8)
+    nodes, u_values, duration, values = given
+    inside = inside_intervals(statement, mesh, nodes, u_values, duration, values, 2)  # type: ignore[arg-type]
+    np.testing.assert_allclose(inside[:, :, statement.nx :] - nodes[0, statement.nx :], 0.0, atol=1e-12)  # type: ignore[attr-defined,index]
+
+
 PROBLEMS = {
     "chain": lambda: mass_chain.problem(masses=4),
     "gain": unknown_gain.problem,

@@ -75,7 +75,7 @@ def passed_by(
 values_by = partial(passed_by, lean=True)
 
 
-def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Pattern) -> Array:
+def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Pattern, count: int) -> Array:
     """Half-vectors of a covariance after each of some Gauss steps, the same number of them from each of many starts.
 
     Args:
@@ -84,12 +84,12 @@ def from_many(firsts: Array, points: Sequence[Array], size: int, pattern: Patter
             start first.
         size: of the covariance.
         pattern: rows and columns of the entries.
+        count: steps from each start.
 
     Returns:
         (starts, count, half).
     """
     starts = firsts.shape[0]
-    count = points[0].size // (starts * len(pattern[0]))
     sweep = _sweep(size, pattern, count, False, (), 0, True, 1)
     result = np.empty((starts, count, sweep.half))
     given = [np.ascontiguousarray(array, dtype=float) for array in (firsts, *points)]

@@ -102,7 +102,7 @@ def _pass_matrices(statement: Statement, mesh: Mesh, values: Array, common: Inte
             h = Buffered(at_columns(st, mesh, function, n * count))(*rows)
             if h is None:
                 raise RuntimeError(f"{function.name()} failed")
-            after = from_many(values[:, -1 if backward else 0, own], h, block.size, pattern)
+            after = from_many(values[:, -1 if backward else 0, own], h, block.size, pattern, count)
             if backward:
                 values[:, :-1, own] = after[:, ::-1]
             else:
