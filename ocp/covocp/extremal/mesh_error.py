@@ -48,9 +48,10 @@ UNSTABLE = 10.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
-# Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not; and how
-# many times more than these they must say: a jump of the model within a step is seen by all, up to four times as much.
-UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11), 10.0
+# Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not (all of
+# them are blind to multiples of 4004 periods in a step alone); and how many times more than these they must say: a jump
+# of the model within a step is seen by all, up to four times as much.
+UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11, 13), 4.0
 # So many steps an interval are tried then, in units of what their number is a multiple of: primes, so that no round
 # frequency meets all of them at one place of its period.
 PRIMES = (7, 13, 31, 61)
@@ -89,13 +90,14 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
-    if st.autonomous or not np.isfinite(moved):
+    if not np.isfinite(moved):
         return error
-    error = max(error, moved)
-    hidden = 0.0
+    seen, hidden = max(error, moved), 0.0
     for further in _unlike_halves(extremal, running):
         hidden = max(hidden, _share(*further[:2], cost), further[2])
-    return hidden if hidden > MORE_THAN_HALVES * error else error
+    if hidden > MORE_THAN_HALVES * seen:
+        return hidden
+    return error if st.autonomous else seen
 
 
 def _of_all(extremal: Extremal, running: float, within: Within | None) -> tuple[Extremal, float]:
