@@ -115,12 +115,14 @@ def _share(change: float, missed: float, cost: float) -> float:
     return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
 
 
-def _unlike_halves(extremal: Extremal, running: float) -> list[tuple[float, float, float]]:
+def _unlike_halves(
+    extremal: Extremal, running: float, numbers: tuple[int, ...] = UNLIKE_HALVES
+) -> list[tuple[float, float, float]]:
     """`_change` by parts of a step that see what its halves do not, where there may be such; those that are finite."""
     if not changes_within_steps(extremal):
         return []
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_change(extremal, running, parts) for parts in UNLIKE_HALVES]
+        found = [_change(extremal, running, parts) for parts in numbers]
     return [changes for changes in found if np.isfinite(changes).all()]
 
 
@@ -141,12 +143,13 @@ class Unseen:
     __repr__ = short_repr
 
 
-def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
+def unseen(extremal: Extremal, within: Within | None = None, numbers: tuple[int, ...] = UNLIKE_HALVES) -> Unseen | None:
     """What halves of the steps do not see of a model that changes with the time; to first order, as `mesh_error`.
 
     Args:
         extremal: the trajectory.
         within: what the rest of a chain says of it; where it is not known a statement that costs nothing tells no cost.
+        numbers: of parts of a step that are asked.
 
     Returns:
         None where they see it, or where it makes little of a difference beside what they tell.
@@ -157,8 +160,8 @@ def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
     extremal, cost = _of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
         told = _share(*_change(extremal, running, 2)[:2], cost)
-        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running)), default=0.0)
-        (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
+        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running, numbers)), default=0.0)
+        (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in numbers]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
     paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
@@ -324,12 +327,15 @@ def finer_steps(
 
 def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
     """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
-    found = unseen(extremal)
-    if found is None or not (found.moved > allowed or found.cost > COARSE_MESH):
-        return None
     unit = step_unit(extremal.statement, extremal.mesh)
     numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
-    return with_substeps(options, extremal.mesh, numbers[0]) if numbers else None
+    if not numbers:
+        return None
+    for parts in UNLIKE_HALVES:
+        found = unseen(extremal, numbers=(parts,))
+        if found is not None and (found.moved > allowed or found.cost > COARSE_MESH):
+            return with_substeps(options, extremal.mesh, numbers[0])
+    return None
 
 
 def _divided(

@@ -25,7 +25,8 @@ REGULAR = np.array([one_sided(0.0), 0.25, 0.5, 0.75, one_sided(1.0)])
 # Irregular places of a step, one in each of so many equal parts of it; in which share of a part follows from both
 # numbers, of the step and of the part, by irrational ones, so that it is another one in each and no period fits.
 PLACES, BY_STEP, BY_PART = 8, (np.sqrt(5.0) - 1.0) / 2.0, np.sqrt(2.0) - 1.0
-# So many steps are looked at where only states and controls change with the time (periods of these go on): 256 points.
+# So many steps are looked at, 256 points, before all of them where the model depends on the time through states and
+# controls alone: what is fast with these is seldom so for a moment.
 SAMPLED = 19
 # At so many places in all the model is something else than the parabolas through what halves of the steps meet: a jump
 # and a kink have a few, of which halves tell, a period that they do not see has nearly all.
@@ -49,30 +50,35 @@ def changes_within_steps(extremal: Extremal) -> bool:
 
 @lru_cache(maxsize=4)
 def _changes(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: tuple[float, ...]) -> bool:
-    shares = _shares(statement, mesh)
+    steps = np.arange(float(mesh.substeps * np.count_nonzero(np.diff(mesh.nodes) > 0.0)))
+    given = statement, mesh, trajectory, np.array(parameters)
+    some = steps[np.arange(SAMPLED) * steps.size // SAMPLED]
+    if statement.autonomous and steps.size > SAMPLED and not _missed(*given, some):
+        return False
+    return _missed(*given, steps) >= MISSED
+
+
+def _missed(statement: Statement, mesh: Mesh, trajectory: Trajectory, parameters: Array, steps: Array) -> int:
+    """At how many irregular places of some steps a rate or the running cost is something else: the most of one row."""
+    shares = _shares(steps)
     with np.errstate(over="ignore", invalid="ignore"):
-        values = _values(statement, mesh, trajectory, np.array(parameters), shares)
+        values = _values(statement, mesh, trajectory, parameters, shares)
         finite = np.isfinite(values).all(axis=(1, 2))  # a model without a value there: the steps tell
         values, shares = values[finite], shares[finite]
         if not values.size:
-            return False
+            return 0
         change = np.ptp(values, axis=1)
         least = np.maximum(COUNTS * change.mean(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
         known, places = values[:, : REGULAR.size], shares[:, REGULAR.size :]
         off = np.abs(values[:, REGULAR.size :] - _parabolas(known, places))
-        missed = off > np.maximum(ELSE * change, least)[:, None]
-    return bool((missed.sum(axis=(0, 1)) >= MISSED).any())
+        return int((off > np.maximum(ELSE * change, least)[:, None]).sum(axis=(0, 1)).max())
 
 
-def _shares(statement: Statement, mesh: Mesh) -> Array:
-    """Shares of each step, the number of the step before it: the regular places, then the others; (steps, places)."""
-    count = mesh.substeps * int(np.count_nonzero(np.diff(mesh.nodes) > 0.0))
+def _shares(steps: Array) -> Array:
+    """Shares of steps, the number of each before them: the regular places, then the others; (steps, places)."""
     part = np.arange(PLACES)
-    looked = np.arange(count)
-    if statement.autonomous and count > SAMPLED:
-        looked = (np.arange(SAMPLED) * count) // SAMPLED
-    places = (part + (BY_STEP * looked[:, None] + BY_PART * part) % 1.0) / PLACES
-    return looked[:, None] + np.hstack([np.tile(REGULAR, (looked.size, 1)), places])
+    places = (part + (BY_STEP * steps[:, None] + BY_PART * part) % 1.0) / PLACES
+    return np.asarray(steps[:, None] + np.hstack([np.tile(REGULAR, (steps.size, 1)), places]))
 
 
 def _parabolas(known: Array, shares: Array) -> Array:
