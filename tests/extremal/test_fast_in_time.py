@@ -204,3 +204,13 @@ def test_what_moves_smoothly_is_not_looked_at_further():
         ocp.minimize(running=u**2 + x**2)
         found = co.evaluate(ocp, nominal={"u": 0.0}, intervals=100)
         assert not changes_within_steps(found.extremal)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_what_first_steps_would_take_for_nothing_is_seen_before_they_run(method):
+    """A sine that is zero wherever they meet it: x(T) in closed form, the controls' part by the same lag unshaken."""
+    problem = lag_with(lambda ocp: ca.sin(2 * np.pi * 20.0 * ocp.time))
+    found = co.solve(problem, method, intervals=INTERVALS, progress=False)
+    a, w, T = 0.1, 2 * np.pi * 20.0, DURATION
+    shaken_alone = (a * np.sin(w * T) - w * np.cos(w * T) + w * np.exp(-a * T)) / (a**2 + w**2)
+    assert found["x"][-1] == pytest.approx(flown(found, 20.0, amplitude=0.0) + shaken_alone, abs=1e-4)

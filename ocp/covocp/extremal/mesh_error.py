@@ -90,14 +90,13 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             further = _change(extremal, running, MANY_PARTS)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
-    if not np.isfinite(moved):
+    moves = not st.autonomous
+    if moves and not np.isfinite(moved):
         return error
-    seen, hidden = max(error, moved), 0.0
+    error, hidden = (max(error, moved) if moves else error), 0.0
     for further in _unlike_halves(extremal, running):
-        hidden = max(hidden, _share(*further[:2], cost), further[2])
-    if hidden > MORE_THAN_HALVES * seen:
-        return hidden
-    return error if st.autonomous else seen
+        hidden = max(hidden, _share(*further[:2], cost), moves * further[2])
+    return hidden if hidden > MORE_THAN_HALVES * error else error
 
 
 def _of_all(extremal: Extremal, running: float, within: Within | None) -> tuple[Extremal, float]:
@@ -143,13 +142,19 @@ class Unseen:
     __repr__ = short_repr
 
 
-def unseen(extremal: Extremal, within: Within | None = None, numbers: tuple[int, ...] = UNLIKE_HALVES) -> Unseen | None:
+def unseen(
+    extremal: Extremal,
+    within: Within | None = None,
+    numbers: tuple[int, ...] = UNLIKE_HALVES,
+    gaps: Array | float = 0.0,
+) -> Unseen | None:
     """What halves of the steps do not see of a model that changes with the time; to first order, as `mesh_error`.
 
     Args:
         extremal: the trajectory.
         within: what the rest of a chain says of it; where it is not known a statement that costs nothing tells no cost.
         numbers: of parts of a step that are asked.
+        gaps: as of `node_error`; along a guess nothing is told of the cost.
 
     Returns:
         None where they see it, or where it makes little of a difference beside what they tell.
@@ -161,10 +166,10 @@ def unseen(extremal: Extremal, within: Within | None = None, numbers: tuple[int,
     with np.errstate(over="ignore", invalid="ignore"):
         told = _share(*_change(extremal, running, 2)[:2], cost)
         paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running, numbers)), default=0.0)
-        (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in numbers]
+        (halves, size), others = _by_segments(extremal, gaps), [_by_segments(extremal, gaps, n)[0] for n in numbers]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
-    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
+    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST and not np.any(gaps) else 0.0
     worst = int(np.argmax(moved))
     if not moved[worst] and not paid:
         return None
@@ -325,14 +330,14 @@ def finer_steps(
     return _unlike(extremal, options, allowed) or _divided(extremal, options, allowed, running)
 
 
-def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
+def _unlike(extremal: Extremal, options: Options, allowed: float, gaps: Array | float = 0.0) -> Options | None:
     """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
     unit = step_unit(extremal.statement, extremal.mesh)
     numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
     if not numbers:
         return None
     for parts in UNLIKE_HALVES:
-        found = unseen(extremal, numbers=(parts,))
+        found = unseen(extremal, numbers=(parts,), gaps=gaps)
         if found is not None and (found.moved > allowed or found.cost > COARSE_MESH):
             return with_substeps(options, extremal.mesh, numbers[0])
     return None
@@ -365,9 +370,11 @@ def _divided(
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
     number = max(int(np.ceil(wanted / unit)), fewest)
+    most_units = MOST_SUBSTEPS // unit
     if fast:  # a round number of steps may meet one place of a period
         number += next(more for more in range(ROUND) if gcd(number + more, ROUND) == 1)
-    substeps = min(number, MOST_SUBSTEPS // unit) * unit
+        most_units = next((n for n in range(most_units, 1, -1) if gcd(n, ROUND) == 1), most_units)
+    substeps = min(number, most_units) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)
@@ -400,35 +407,52 @@ def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, mar
 
 
 def steps_along(
-    statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array, options: Options, allowed: float
+    statement: Statement,
+    mesh: Mesh,
+    guess: Trajectory,
+    parameters: Array,
+    options: Options,
+    allowed: float,
+    *,
+    fast_alone: bool,
 ) -> Options | None:
     """`finer_steps` along a guess, whose matrices are made first: before a run that would be made again.
 
     Args:
-        statement: a problem whose matrices are eliminated.
+        statement: a problem.
         mesh: of the options.
-        guess: states where the segments start, and controls.
+        guess: states where the segments start, and controls; all states and matrices where these are no result.
         parameters: of the statement.
         options: of the mesh.
         allowed: largest change, relative to the range of each entry.
+        fast_alone: whether only what changes within the steps is looked for: a run that misses it may find no way.
 
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
+    without = Multipliers.zero(statement, mesh)
+    start = Extremal(stated=statement, mesh=mesh, trajectory=guess, parameters=parameters, multipliers=without)
+    if fast_alone:
+        along, gaps = _by_own_steps(start) if changes_within_steps(start) else (start, None)
+        return None if gaps is None else _unlike(along, options, allowed, gaps)
     found, margin = None, 1.0
     allowed /= BEFORE
     while True:
-        own = refined_run(statement, mesh, guess, parameters, parts=1)
-        trajectory = replace(guess, x=own.states, e=own.matrices)
-        without = Multipliers.zero(statement, mesh)
-        along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=without)
-        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=own.jumps)
+        along, gaps = _by_own_steps(start)
+        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=gaps)
         if finer is None:
             return found
-        found, times = finer, int(finer.substeps) / mesh.substeps
+        found, times = finer, int(finer.substeps) / start.mesh.substeps
         if times < LOOKED_AGAIN or int(finer.substeps) >= MOST_SUBSTEPS // 2:
             return found
-        options, mesh, margin = finer, replace(mesh, substeps=int(finer.substeps)), 1.0 / BEFORE
+        options, margin = finer, 1.0 / BEFORE
+        start = replace(start, mesh=replace(start.mesh, substeps=int(finer.substeps)))
+
+
+def _by_own_steps(start: Extremal) -> tuple[Extremal, Array]:
+    """A guess with what its own steps make of its states and matrices, and the gaps at the ends of the segments."""
+    own = refined_run(start.statement, start.mesh, start.trajectory, start.parameters, parts=1)
+    return replace(start, trajectory=replace(start.trajectory, x=own.states, e=own.matrices)), own.jumps
 
 
 def _moved(jumps: Array, x: Array, least: Array) -> float:
