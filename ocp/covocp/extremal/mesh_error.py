@@ -370,11 +370,9 @@ def _divided(
     wanted = mesh.substeps * min((margin * times) ** (1 / order), most)
     fewest = mesh.substeps // unit + 1
     number = max(int(np.ceil(wanted / unit)), fewest)
-    most_units = MOST_SUBSTEPS // unit
     if fast:  # a round number of steps may meet one place of a period
         number += next(more for more in range(ROUND) if gcd(number + more, ROUND) == 1)
-        most_units = next((n for n in range(most_units, 1, -1) if gcd(n, ROUND) == 1), most_units)
-    substeps = min(number, most_units) * unit
+    substeps = min(number, MOST_SUBSTEPS // unit) * unit
     if substeps <= mesh.substeps:
         return None
     return with_substeps(options, mesh, substeps)

@@ -355,7 +355,7 @@ class Solver:
         self._first, self._borne = (options, self._prepared), borne
 
     def _look_at_steps(self, values: Array) -> None:
-        """Take shorter steps from the first run on where a large covariance or what is fast needs them, by the guess."""
+        """Take shorter steps from the first run on where a large covariance or what is fast needs them, by a guess."""
         mesh = self._prepared.mesh
         large = mesh.eliminated and max((one.size for one in self._solved.matrices), default=0) >= LARGE
         if self._looked or not self._own_steps:
