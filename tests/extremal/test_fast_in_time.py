@@ -1,4 +1,4 @@
-"""Models that oscillate with the time as often as the steps meet them, or a multiple of it, against closed forms."""
+"""Models that oscillate as often as the steps meet them, or a multiple of it, against closed forms and quadrature."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import covocp as co
+from covocp.extremal.mesh_error import node_error
+from covocp.extremal.unseen import changes_within_steps
 
 DURATION, INTERVALS = 10.0, 50
 
@@ -101,3 +103,114 @@ def test_what_steps_see_is_not_told():
             found = co.solve(problem, intervals=INTERVALS, substeps=substeps, progress=False)
             off = abs(found["x"][-1] - flown(found, frequency, amplitude))
             assert off < 1e-2 * np.ptp(found["x"])
+
+
+def lag_with(shake):
+    """A lag that is shaken by what a function of the problem gives."""
+    ocp = co.Problem(DURATION)
+    x, u = ocp.state("x", initial=0.0), ocp.control("u")
+    ocp.dynamics(x, u - 0.1 * x + shake(ocp))
+    ocp.minimize(running=u**2 + 0.1 * (x - 1) ** 2)
+    return ocp
+
+
+def by_quadrature(values):
+    """x(T) of the lag along a control of 0.1: the integral of exp(-(T - t)/10) times that and the shaking."""
+    t = (np.arange(800_000) + 0.5) * (DURATION / 800_000)
+    return float(np.mean(np.exp(-0.1 * (DURATION - t)) * (0.1 + values(t))) * DURATION)
+
+
+def clocked(rate, frequency):
+    """The same shaking by a state that moves at some rate, which is one too: a clock, the angle of a rotor."""
+
+    def shake(ocp):
+        angle = ocp.state("angle", initial=0.0)
+        speed = ocp.state("speed", initial=rate)
+        ocp.dynamics(speed, 0.0 * speed)
+        ocp.dynamics(angle, speed)
+        return ca.cos(2 * np.pi * frequency / rate * angle)
+
+    return lag_with(shake)
+
+
+@pytest.mark.parametrize("rate", [1.0, 2 * np.pi * 20.0])
+def test_a_clock_or_a_rotor_shakes_as_the_time_does(rate):
+    problem = clocked(rate, 20.0)
+    found = co.evaluate(problem, nominal={"u": 0.0}, intervals=INTERVALS)
+    assert found["x"][-1] == pytest.approx(flown(found, 20.0), abs=1e-4)
+    with pytest.warns(co.CovocpWarning, match="faster than the integration steps see"):
+        given = co.evaluate(problem, nominal={"u": 0.0}, intervals=INTERVALS, substeps=1)
+    assert given.mesh_error > 0.5
+
+
+def test_an_optimum_with_a_clock_is_that_with_the_time():
+    found = co.solve(clocked(1.0, 20.0), intervals=INTERVALS, progress=False)
+    by_time = co.solve(shaken(20.0), intervals=INTERVALS, progress=False)
+    assert found.cost == pytest.approx(by_time.cost, rel=1e-6)
+    assert abs(found["x"][-1] - flown(found, 20.0)) < 1e-3 * np.ptp(found["x"])
+
+
+KNOTS = np.linspace(0.0, DURATION, 801)
+SHAPES = {
+    "triangle": (
+        lambda ocp: ocp.data("d", KNOTS, np.cos(40 * np.pi * KNOTS), kind="linear"),
+        lambda t: np.interp(t, KNOTS, np.cos(40 * np.pi * KNOTS)),
+    ),
+    "rectified": (
+        lambda ocp: ca.fabs(ca.cos(20 * np.pi * ocp.time)),
+        lambda t: np.abs(np.cos(20 * np.pi * t)),
+    ),
+    "smooth": (
+        lambda ocp: ca.exp(3 * ca.cos(40 * np.pi * ocp.time)) / 5,
+        lambda t: np.exp(3 * np.cos(40 * np.pi * t)) / 5,
+    ),
+    "one pulse a step": (
+        lambda ocp: ca.exp(-(((ca.fmod(ocp.time, 0.2) - 0.074) / 0.006) ** 2)),
+        lambda t: np.exp(-(((np.mod(t, 0.2) - 0.074) / 0.006) ** 2)),
+    ),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_harmonics_and_pulses_are_seen_or_told(shape):
+    """Steps that see a period need not see its harmonics: what is told of the end of the run is of their size."""
+    symbols, numbers = SHAPES[shape]
+    truth = by_quadrature(numbers)
+    for substeps in ("auto", 7):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found = co.evaluate(lag_with(symbols), nominal={"u": 0.1}, intervals=INTERVALS, substeps=substeps)
+        off = abs(found["x"][-1] - truth) / np.ptp(found["x"])
+        assert off < 1e-4 or off < 4 * node_error(found.extremal)
+        assert off < 1e-2 or told
+        assert off < 3e-3 or substeps == 7
+
+
+def test_many_periods_a_step_are_told():
+    """308 periods are whole numbers in quarters, sevenths and elevenths of a step."""
+    with pytest.warns(co.CovocpWarning, match="faster than the integration steps see"):
+        found = co.evaluate(shaken(1540.0), nominal={"u": 0.0}, intervals=INTERVALS, substeps=1)
+    assert abs(found["x"][-1] - flown(found, 1540.0)) > 1.0
+    assert found.mesh_error > 0.5
+
+
+def test_what_moves_smoothly_is_not_looked_at_further():
+    """Stiff, unstable, oscillating, jumping at nodes: what halves of the steps see needs no other parts."""
+    for poles, speed in ((-50.0, 1.0), (1.0, 1.0), (-0.1, 6.0)):
+        ocp = co.Problem(2.0)
+        x, y, u = ocp.state("x", initial=1.0), ocp.state("y", initial=0.0), ocp.control("u")
+        ocp.dynamics(x, poles * x + ca.sin(x) + u + ca.sign(ca.sin(np.pi * 5.0 * ocp.time)))
+        ocp.dynamics(y, speed * x * ca.cos(y))
+        ocp.minimize(running=u**2 + x**2)
+        found = co.evaluate(ocp, nominal={"u": 0.0}, intervals=100)
+        assert not changes_within_steps(found.extremal)
+
+
+@pytest.mark.parametrize("method", ["ipopt", "reduced", "gradient"])
+def test_what_first_steps_would_take_for_nothing_is_seen_before_they_run(method):
+    """A sine that is zero wherever they meet it: x(T) in closed form, the controls' part by the same lag unshaken."""
+    problem = lag_with(lambda ocp: ca.sin(2 * np.pi * 20.0 * ocp.time))
+    found = co.solve(problem, method, intervals=INTERVALS, progress=False)
+    a, w, T = 0.1, 2 * np.pi * 20.0, DURATION
+    shaken_alone = (a * np.sin(w * T) - w * np.cos(w * T) + w * np.exp(-a * T)) / (a**2 + w**2)
+    assert found["x"][-1] == pytest.approx(flown(found, 20.0, amplitude=0.0) + shaken_alone, abs=1e-4)

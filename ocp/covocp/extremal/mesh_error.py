@@ -48,9 +48,10 @@ UNSTABLE = 10.0
 # By how much the change shall be smaller than allowed: it is an estimate; along a guess, which hardly moves yet, it is
 # less than it will be unless the steps are far too long there.
 MARGIN, BEFORE = 1.5, 2.0
-# Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not; and how
-# many times more than these they must say: a jump of the model within a step is seen by all, up to four times as much.
-UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11), 10.0
+# Parts of a step, without a common divisor with each other or with halves, that see what halves of it do not (all of
+# them are blind to multiples of 4004 periods in a step alone); and how many times more than these they must say: a jump
+# of the model within a step is seen by all, up to four times as much.
+UNLIKE_HALVES, MORE_THAN_HALVES = (7, 11, 13), 4.0
 # So many steps an interval are tried then, in units of what their number is a multiple of: primes, so that no round
 # frequency meets all of them at one place of its period.
 PRIMES = (7, 13, 31, 61)
@@ -89,12 +90,12 @@ def mesh_error(extremal: Extremal, running: float, within: Within | None = None)
             further = _change(extremal, running, MANY_PARTS, within)
         change, missed, moved = further if np.isfinite(further).all() else (change, missed, moved)
     error = _share(change, missed, cost)
-    if st.autonomous or not np.isfinite(moved):
+    moves = not st.autonomous
+    if moves and not np.isfinite(moved):
         return error
-    error = max(error, moved)
-    hidden = 0.0
+    error, hidden = (max(error, moved) if moves else error), 0.0
     for further in _unlike_halves(extremal, running, within):
-        hidden = max(hidden, _share(*further[:2], cost), further[2])
+        hidden = max(hidden, _share(*further[:2], cost), moves * further[2])
     return hidden if hidden > MORE_THAN_HALVES * error else error
 
 
@@ -110,12 +111,14 @@ def _share(change: float, missed: float, cost: float) -> float:
     return max(abs(change), abs(change - missed)) / max(abs(cost + change), NO_COST)
 
 
-def _unlike_halves(extremal: Extremal, running: float, within: Within | None) -> list[tuple[float, float, float]]:
+def _unlike_halves(
+    extremal: Extremal, running: float, within: Within | None, numbers: tuple[int, ...] = UNLIKE_HALVES
+) -> list[tuple[float, float, float]]:
     """`_change` by parts of a step that see what its halves do not, where there may be such; those that are finite."""
     if not changes_within_steps(extremal):
         return []
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_change(extremal, running, parts, within) for parts in UNLIKE_HALVES]
+        found = [_change(extremal, running, parts, within) for parts in numbers]
     return [changes for changes in found if np.isfinite(changes).all()]
 
 
@@ -136,12 +139,19 @@ class Unseen:
     __repr__ = short_repr
 
 
-def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
+def unseen(
+    extremal: Extremal,
+    within: Within | None = None,
+    numbers: tuple[int, ...] = UNLIKE_HALVES,
+    gaps: Array | float = 0.0,
+) -> Unseen | None:
     """What halves of the steps do not see of a model that changes with the time; to first order, as `mesh_error`.
 
     Args:
         extremal: the trajectory.
         within: what the rest of a chain says of it; where it is not known a statement that costs nothing tells no cost.
+        numbers: of parts of a step that are asked.
+        gaps: as of `node_error`; along a guess nothing is told of the cost.
 
     Returns:
         None where they see it, or where it makes little of a difference beside what they tell.
@@ -152,11 +162,12 @@ def unseen(extremal: Extremal, within: Within | None = None) -> Unseen | None:
     cost = _cost_of_all(extremal, running, within)
     with np.errstate(over="ignore", invalid="ignore"):
         told = _share(*_change(extremal, running, 2, within)[:2], cost)
-        paid = max((_share(*changes[:2], cost) for changes in _unlike_halves(extremal, running, within)), default=0.0)
-        (halves, size), others = _by_segments(extremal, 0.0), [_by_segments(extremal, 0.0, n)[0] for n in UNLIKE_HALVES]
+        others_say = _unlike_halves(extremal, running, within, numbers)
+        paid = max((_share(*changes[:2], cost) for changes in others_say), default=0.0)
+        (halves, size), others = _by_segments(extremal, gaps), [_by_segments(extremal, gaps, n)[0] for n in numbers]
         moved = np.max(others, axis=0) / size
     moved = np.where(np.isfinite(moved) & (moved > MORE_THAN_HALVES * (halves / size).max()), moved, 0.0)
-    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST else 0.0
+    paid = paid if paid > MORE_THAN_HALVES * told and abs(cost) > NO_COST and not np.any(gaps) else 0.0
     worst = int(np.argmax(moved))
     if not moved[worst] and not paid:
         return None
@@ -317,14 +328,17 @@ def finer_steps(
     return _unlike(extremal, options, allowed) or _divided(extremal, options, allowed, running)
 
 
-def _unlike(extremal: Extremal, options: Options, allowed: float) -> Options | None:
+def _unlike(extremal: Extremal, options: Options, allowed: float, gaps: Array | float = 0.0) -> Options | None:
     """The options with a number of steps that no round frequency is a multiple of, where these do not see the model."""
-    found = unseen(extremal)
-    if found is None or not (found.moved > allowed or found.cost > COARSE_MESH):
-        return None
     unit = step_unit(extremal.statement, extremal.mesh)
     numbers = [unit * prime for prime in PRIMES if extremal.mesh.substeps < unit * prime <= MOST_SUBSTEPS]
-    return with_substeps(options, extremal.mesh, numbers[0]) if numbers else None
+    if not numbers:
+        return None
+    for parts in UNLIKE_HALVES:
+        found = unseen(extremal, numbers=(parts,), gaps=gaps)
+        if found is not None and (found.moved > allowed or found.cost > COARSE_MESH):
+            return with_substeps(options, extremal.mesh, numbers[0])
+    return None
 
 
 def _divided(
@@ -389,35 +403,52 @@ def _against_growth(extremal: Extremal, gaps: Array | float, allowed: float, mar
 
 
 def steps_along(
-    statement: Statement, mesh: Mesh, guess: Trajectory, parameters: Array, options: Options, allowed: float
+    statement: Statement,
+    mesh: Mesh,
+    guess: Trajectory,
+    parameters: Array,
+    options: Options,
+    allowed: float,
+    *,
+    fast_alone: bool,
 ) -> Options | None:
     """`finer_steps` along a guess, whose matrices are made first: before a run that would be made again.
 
     Args:
-        statement: a problem whose matrices are eliminated.
+        statement: a problem.
         mesh: of the options.
-        guess: states where the segments start, and controls.
+        guess: states where the segments start, and controls; all states and matrices where these are no result.
         parameters: of the statement.
         options: of the mesh.
         allowed: largest change, relative to the range of each entry.
+        fast_alone: whether only what changes within the steps is looked for: a run that misses it may find no way.
 
     Returns:
         None where the steps are short enough, or cannot be shorter.
     """
+    without = Multipliers.zero(statement, mesh)
+    start = Extremal(stated=statement, mesh=mesh, trajectory=guess, parameters=parameters, multipliers=without)
+    if fast_alone:
+        along, gaps = _by_own_steps(start) if changes_within_steps(start) else (start, None)
+        return None if gaps is None else _unlike(along, options, allowed, gaps)
     found, margin = None, 1.0
     allowed /= BEFORE
     while True:
-        own = refined_run(statement, mesh, guess, parameters, parts=1)
-        trajectory = replace(guess, x=own.states, e=own.matrices)
-        without = Multipliers.zero(statement, mesh)
-        along = Extremal(stated=statement, mesh=mesh, trajectory=trajectory, parameters=parameters, multipliers=without)
-        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=own.jumps)
+        along, gaps = _by_own_steps(start)
+        finer = _divided(along, options, allowed, most=LOOKED_AGAIN, margin=margin, gaps=gaps)
         if finer is None:
             return found
-        found, times = finer, int(finer.substeps) / mesh.substeps
+        found, times = finer, int(finer.substeps) / start.mesh.substeps
         if times < LOOKED_AGAIN or int(finer.substeps) >= MOST_SUBSTEPS // 2:
             return found
-        options, mesh, margin = finer, replace(mesh, substeps=int(finer.substeps)), 1.0 / BEFORE
+        options, margin = finer, 1.0 / BEFORE
+        start = replace(start, mesh=replace(start.mesh, substeps=int(finer.substeps)))
+
+
+def _by_own_steps(start: Extremal) -> tuple[Extremal, Array]:
+    """A guess with what its own steps make of its states and matrices, and the gaps at the ends of the segments."""
+    own = refined_run(start.statement, start.mesh, start.trajectory, start.parameters, parts=1)
+    return replace(start, trajectory=replace(start.trajectory, x=own.states, e=own.matrices)), own.jumps
 
 
 def _moved(jumps: Array, x: Array, least: Array) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from covocp.base.errors import warn_user
 from covocp.base.matrices import Array
 from covocp.extremal.dense_output import mapped
-from covocp.extremal.unseen import PLACES, turning
+from covocp.simulation.unseen import PLACES, turning
 
 # A law is looked at in so many steps on end, in so many such windows at most, and the steps are divided once more.
 WINDOW, WINDOWS, MARGIN = 2.0, 1024, 2

@@ -1,8 +1,8 @@
 """Where the models change with the time within the steps of a simulation faster than these see.
 
 Heun's steps and their halves, and those of the prediction, meet the time at regular places: an oscillation with whole
-periods in each of them is a constant to all. Here the models are looked at in irregular places (`extremal.unseen`), and
-the steps are divided until none of them holds more than half a period.
+periods in each of them is a constant to all. Here the models are looked at in irregular places as well, and the steps
+are divided until none of them holds more than half a period.
 """
 
 from __future__ import annotations
@@ -13,16 +13,22 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from covocp.base.errors import warn_user
 from covocp.base.matrices import Array, unpack
 from covocp.base.short_repr import short_repr
 from covocp.extremal.dense_output import mapped
-from covocp.extremal.unseen import PLACES, turning
 from covocp.simulation.actual import System
 from covocp.simulation.schedule import WHOLE, Grid, nominal_at
 from covocp.solution.solution import Solution
 
+# Places in a step that no period has in common, fractions of square roots of primes: from one of them to the next what
+# has up to 3000 periods in a step turns at least twice, but for a few numbers and phases.
+PLACES = np.sort(np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 31.0, 37.0]) % 1.0)
+# Turns from which on a step is said to be passed too fast: a kink of a table is one, a jump none, and halves see these.
+# Less than the second share of what changes in the step, of the third in any step, and roundoff are no turns.
+TURNS, TURN, COUNTS, ROUNDOFF = 2, 0.02, 1e-3, 1e-9
 # Share of the sampling error of a mean, and of a variance, that an oscillation may do at most to be left as it is.
 SHARE = 0.2
 # Turns are looked for in so many steps on end: one that holds more than half a period then has two of them for certain.
@@ -90,6 +96,31 @@ def _blind(values: _Values, least: Array, base: Grid, parts: Any, among: Any) ->
         turns = turning(values(times, where, step), least).any(axis=1)
         result[some] = np.logical_or.reduceat(turns, first)
     return result
+
+
+def turning(values: Array, least: Array | float = 0.0) -> NDArray[np.bool_]:
+    """Which rows of a model rise and fall and rise again in which steps, or the reverse, (steps, rows).
+
+    Args:
+        values: at the places in each step, (steps, places, rows); a step without a value there turns nothing.
+        least: change of each row in a step below which it is no turn, (rows,), beside what is little anyway.
+    """
+    turned = np.zeros((values.shape[0], values.shape[2]), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        known = np.isfinite(values).all(axis=(1, 2))  # a model without a value there: the steps tell
+        values = values[known]
+        if not values.size:
+            return turned
+        change = np.ptp(values, axis=1)
+        little = np.maximum(COUNTS * change.max(axis=0), ROUNDOFF * np.abs(values).max(axis=(0, 1)))
+        steps = np.diff(values, axis=1)
+        moves = np.sign(np.where(np.abs(steps) > TURN * change[:, None], steps, 0.0))
+    turns, last = np.zeros(change.shape), np.zeros(change.shape)
+    for move in moves.swapaxes(0, 1):
+        turns += move * last < 0
+        last = np.where(move != 0, move, last)
+    turned[known] = (turns >= TURNS) & (change > np.maximum(little, least))
+    return turned
 
 
 def _rows(

@@ -38,7 +38,7 @@ def mention_doubts(solution: Solution) -> None:
         warn_user(alone)
     if not np.isfinite(error):
         warn_user(_unknown_error(solution))
-    elif depends_on_time and (hidden := _hidden(solution)) is not None:
+    elif solution.statement is not None and (hidden := _hidden(solution)) is not None:
         warn_user(_too_fast(solution, hidden))
     elif jumps and not coarse_elsewhere(solution, jumps):
         pass  # the steps are long where it jumps, and no others are right there

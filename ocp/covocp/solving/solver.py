@@ -363,15 +363,15 @@ class Solver:
         self._first, self._borne = (options, self._prepared), borne
 
     def _look_at_steps(self, values: Array) -> None:
-        """Take shorter steps from the first run on where a large covariance needs them along the guess."""
+        """Take shorter steps from the first run on where a large covariance or what is fast needs them, by a guess."""
         mesh = self._prepared.mesh
         large = mesh.eliminated and max((one.size for one in self._solved.matrices), default=0) >= LARGE
-        if self._looked or not self._own_steps or not large:
+        if self._looked or not self._own_steps:
             return
         self._looked = True
         guess = own_start(self._solved, mesh, values).trajectory
         try:
-            finer = steps_along(self._solved, mesh, guess, values, self._options, OPTIMISED)
+            finer = steps_along(self._solved, mesh, guess, values, self._options, OPTIMISED, fast_alone=not large)
         except RuntimeError:  # CasADi's, of a linear system that is singular there: the run tells
             return
         if finer is not None:
